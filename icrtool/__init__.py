@@ -1,0 +1,75 @@
+"""Learn the track ICRs of a skid-steer robot from its field logs, and say how far it can go blind.
+
+The charter: every name, frame, sign and unit in this package means what stands here.
+
+Frames and signs
+    World: local plane, north and east [m] about a datum, z down. Body: x forward, y right, z down.
+    Heading psi [rad] is clockwise from north. A faster *left* side turns the robot clockwise.
+    Track ICRs are body coordinates [m]: ``y_icr_right > 0 > y_icr_left`` and ``x_icr`` (both tracks share it).
+    ROS logs are ENU/FLU (REP-103); they are converted once, in ``icrtool.logio``, where a message becomes columns.
+Units
+    SI and radians inside. At every boundary (column, option, configuration key) the unit is the suffix of the name:
+    ``_s _ns _m _mps _rad _radps _deg _pct``.
+Time
+    ``stamp_ns``: int64 nanoseconds of the log's clock. ``t_s``: float64 seconds since the first recorded state.
+    A speed stamped k holds over [k, k+1).
+Tables
+    ``RobotLog``: what was measured (wheels, position, heading), in this frame, by stamp.
+    ``FilterRun``: what the filter made of it, one recorded state per wheel sample.
+    ``DropoutReport``: open-loop errors over distance, from every recorded state.
+Source of the method
+    Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of
+    Track Instantaneous Centers of Rotation", J. Field Robotics 31(3), 2014. Equation numbers in the code are this paper's.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from icrtool.analysis.dropout import DropoutReport, dropout
+    from icrtool.analysis.fit import FilterRun, fit
+    from icrtool.config import Config, load_config
+    from icrtool.errors import IcrToolError
+    from icrtool.logio import read_log
+    from icrtool.tables import RobotLog
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Config",
+    "DropoutReport",
+    "FilterRun",
+    "IcrToolError",
+    "RobotLog",
+    "__version__",
+    "dropout",
+    "fit",
+    "load_config",
+    "read_log",
+]
+
+_HOMES = {
+    "Config": "icrtool.config",
+    "DropoutReport": "icrtool.analysis.dropout",
+    "FilterRun": "icrtool.analysis.fit",
+    "IcrToolError": "icrtool.errors",
+    "RobotLog": "icrtool.tables",
+    "dropout": "icrtool.analysis.dropout",
+    "fit": "icrtool.analysis.fit",
+    "load_config": "icrtool.config",
+    "read_log": "icrtool.logio",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that ``icrtool --help`` loads no numba."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'icrtool' has no attribute {name!r}")
+    return getattr(importlib.import_module(home), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

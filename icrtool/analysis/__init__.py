@@ -1,0 +1,1 @@
+"""Tables to results: knows time and meaning, never files, never pictures."""

@@ -1,0 +1,223 @@
+"""From a log and a configuration to what the kernel needs: times, noises, the start, the presets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from icrtool.config import Config, FilterConfig
+from icrtool.core.ekf import FilterParameters, Measurements
+from icrtool.errors import DataError
+from icrtool.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+
+PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
+PAPER_INITIAL_ICR_STD_M = 1.0
+"""Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
+
+DEFAULT_HALF_WIDTH_M = 0.3
+"""Start of the ICRs when the robot's width is not known: half of a small field robot."""
+
+LARGEST_SANE_GNSS_STD_M = 100.0
+LARGEST_SANE_HEADING_STD_RAD = math.radians(60.0)
+"""What a message claims beyond this says nothing about its noise (1000 or 1e6 stand for "unknown")."""
+
+GAP_SPEED_STD_MPS = 2.0
+GAP_TURN_STD_RADPS = 1.0
+"""How the pose may move through a gap in the wheel data, as a random walk over one second."""
+
+GAP_IN_INTERVALS = 2.5
+"""Slow wheel streams: an interval is a gap only when it is this many times the usual one."""
+
+RECOVERY_COUNT = 10
+RECOVERY_S = 1.0
+"""Rejected measurements that agree with each other for this long are believed."""
+
+ICR_INFLATION_M2 = 100.0
+"""Pentzer 2014, Section 5.2: ICR variance after a change of terrain."""
+
+
+@dataclass(frozen=True, slots=True)
+class FilterSetup:
+    """One run, ready for the kernel.
+
+    Attributes
+    ----------
+    epoch_ns : stamp of time 0 in `data`
+    t0 : time of the start [s]; x0 (6,), P0 (6, 6) : state and covariance there
+    gnss_index : (m,) rows of the log's fixes that `data` holds; heading_index likewise
+    """
+
+    data: Measurements
+    parameters: FilterParameters
+    epoch_ns: int
+    t0: float
+    x0: Floats
+    P0: Floats
+    gnss_index: Ints
+    heading_index: Ints
+
+
+def set_up_filter(
+    log: RobotLog,
+    config: Config,
+    *,
+    heading_offset_rad: float = 0.0,
+    heading_std_at_least_rad: float = 0.0,
+    change_stamps_ns: tuple[int, ...] = (),
+    outages_ns: tuple[tuple[int, int], ...] = (),
+) -> FilterSetup:
+    """Prepare a filter run.
+
+    Parameters
+    ----------
+    heading_offset_rad : subtracted from every heading sample
+    heading_std_at_least_rad : raises the noise of the heading samples
+    change_stamps_ns : terrain changes, where the ICR covariance is inflated
+    outages_ns : half-open spans in which GNSS and heading are taken away
+
+    Raises
+    ------
+    DataError
+        Streams that do not overlap, or hold fewer than two usable samples.
+    """
+    _check_streams(log)
+    epoch = int(log.wheels.stamp_ns[0])
+    gnss_index, heading_index = _kept(log.gnss.stamp_ns, outages_ns), _kept(log.heading.stamp_ns, outages_ns)
+    paper = config.filter.preset == "paper"
+    heading_r = _heading_variance(log.heading, config.filter, heading_std_at_least_rad, paper=paper)
+    data = Measurements(
+        wheel_t=_seconds(log.wheels.stamp_ns, epoch),
+        v_left=log.wheels.v_left_mps,
+        v_right=log.wheels.v_right_mps,
+        gnss_t=_seconds(log.gnss.stamp_ns[gnss_index], epoch),
+        gnss_z=np.column_stack([log.gnss.north_m, log.gnss.east_m])[gnss_index],
+        gnss_r=_gnss_variance(log.gnss, config.filter, paper=paper)[gnss_index],
+        heading_t=_seconds(log.heading.stamp_ns[heading_index], epoch),
+        heading_z=log.heading.heading_rad[heading_index] - heading_offset_rad,
+        heading_r=heading_r[heading_index],
+        change_t=_seconds(np.array(sorted(change_stamps_ns), np.int64), epoch),
+    )
+    t0 = _start_time(log, data)
+    parameters = _parameters(config, data.wheel_t)
+    x0, P0 = _start_state(data, t0, config, parameters)
+    return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
+
+
+def half_width_m(config: Config) -> float:
+    """Return b/2, or what stands for it when the width is not known."""
+    width = config.robot.track_width_m
+    return width / 2 if width is not None else DEFAULT_HALF_WIDTH_M
+
+
+def chi2_gate(probability: float, degrees: int) -> float:
+    """Return the quantile of the chi-squared distribution with 1 or 2 degrees of freedom."""
+    if degrees == 2:  # noqa: PLR2004 - closed form
+        return -2.0 * math.log(1.0 - probability)
+    return NormalDist().inv_cdf((1.0 + probability) / 2.0) ** 2
+
+
+def _check_streams(log: RobotLog) -> None:
+    needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
+    for what, stamps in needed.items():
+        if len(stamps) < 2:  # noqa: PLR2004 - an interval needs two ends
+            raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
+    begin = max(int(stamps[0]) for stamps in needed.values())
+    end = min(int(stamps[-1]) for stamps in needed.values())
+    if begin >= end:
+        spans = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in needed.items())
+        raise DataError(log.name, "wheels, position and heading do not overlap in time", spans)
+
+
+def _seconds(stamps_ns: Ints, epoch_ns: int) -> Floats:
+    return (stamps_ns - epoch_ns) / 1e9
+
+
+def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
+    kept = np.ones(len(stamps_ns), np.bool_)
+    for begin, end in outages_ns:
+        kept &= (stamps_ns < begin) | (stamps_ns >= end)
+    return np.flatnonzero(kept)
+
+
+def _gnss_variance(gnss: PositionFixes, config: FilterConfig, *, paper: bool) -> Floats:
+    """Return the variances of north and east (m, 2): the message's where sane, else the configured."""
+    default = config.gnss_std_m**2
+    if paper:
+        return np.full((len(gnss.stamp_ns), 2), default)
+    # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
+    correlated = np.nan_to_num(np.abs(gnss.cov_north_east_m2))
+    said = np.column_stack([gnss.var_north_m2 + correlated, gnss.var_east_m2 + correlated])
+    sane = np.isfinite(said) & (said > 0) & (said < LARGEST_SANE_GNSS_STD_M**2)
+    return np.maximum(np.where(sane, said, default), config.gnss_std_floor_m**2)
+
+
+def _heading_variance(heading: HeadingSamples, config: FilterConfig, at_least_rad: float, *, paper: bool) -> Floats:
+    default = math.radians(config.heading_std_deg) ** 2
+    if paper:
+        return np.full(len(heading.stamp_ns), default)
+    said = heading.var_rad2
+    sane = np.isfinite(said) & (said > 0) & (said < LARGEST_SANE_HEADING_STD_RAD**2)
+    floor = max(math.radians(config.heading_std_floor_deg), at_least_rad)
+    return np.maximum(np.where(sane, said, default), floor**2)
+
+
+def _start_time(log: RobotLog, data: Measurements) -> float:
+    """Return the first stamp by which wheel, GNSS and heading have each been seen."""
+    if not (len(data.gnss_t) and len(data.heading_t)):
+        raise DataError(log.name, "the outages leave no fix or no heading", "take away less")
+    t0 = max(float(data.wheel_t[0]), float(data.gnss_t[0]), float(data.heading_t[0]))
+    if t0 >= data.wheel_t[-1]:
+        raise DataError(log.name, "no wheel sample after the first fix and the first heading", "check the streams' clocks")
+    return t0
+
+
+def _start_state(data: Measurements, t0: float, config: Config, parameters: FilterParameters) -> tuple[Floats, Floats]:
+    fix = int(np.searchsorted(data.gnss_t, t0, side="right")) - 1
+    sample = int(np.searchsorted(data.heading_t, t0, side="right")) - 1
+    psi = math.remainder(float(data.heading_z[sample]), 2 * math.pi)
+    forward, right = parameters.antenna_forward, parameters.antenna_right
+    north = data.gnss_z[fix, 0] - (forward * math.cos(psi) - right * math.sin(psi))
+    east = data.gnss_z[fix, 1] - (forward * math.sin(psi) + right * math.cos(psi))
+    icrs, icr_std = _initial_icrs(config)
+    x0 = np.array([north, east, psi, *icrs])
+    P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], icr_std**2, icr_std**2, icr_std**2])
+    return x0, P0
+
+
+def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
+    """Return the ICRs at the start and their standard deviation [m]."""
+    settings, half = config.filter, half_width_m(config)
+    paper = settings.preset == "paper"
+    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
+    given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
+    right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
+    default_std = PAPER_INITIAL_ICR_STD_M if paper else half
+    return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
+
+
+def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
+    """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
+    return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
+
+
+def _parameters(config: Config, wheel_t: Floats) -> FilterParameters:
+    settings = config.filter
+    paper = settings.preset == "paper"
+    position, icr = settings.process_position_mps**2, settings.process_icr_mps**2
+    return FilterParameters(
+        process_variance=(position, position, math.radians(settings.process_heading_degps) ** 2, icr, icr, icr),
+        rate_invariant=not paper,
+        gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
+        heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
+        antenna_forward=0.0 if paper else config.frames.antenna_forward_m,
+        antenna_right=0.0 if paper else config.frames.antenna_right_m,
+        wheel_gap_s=math.inf if paper else wheel_gap_s(config, wheel_t),
+        gap_speed_variance=GAP_SPEED_STD_MPS**2,
+        gap_turn_variance=GAP_TURN_STD_RADPS**2,
+        recovery_count=RECOVERY_COUNT,
+        recovery_s=RECOVERY_S,
+        icr_inflation_m2=ICR_INFLATION_M2,
+    )

@@ -1,0 +1,215 @@
+"""Fit: run the filter over a log and say what it learned (Pentzer 2014, Sections 3 and 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrtool import __version__
+from icrtool.analysis.filter_setup import FilterSetup, set_up_filter, wheel_gap_s
+from icrtool.analysis.heading_check import HeadingCheck, check_heading
+from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary
+from icrtool.config import Config
+from icrtool.core.ekf import UNSEEN, FilterOutput, run_filter
+from icrtool.tables import Bools, Floats, Ints, RobotLog, States
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RUN_SCHEMA = "icrtool/run/1"
+
+OUTAGE_S = 2.0
+"""Longer than this without a usable fix is a GNSS outage."""
+
+OUTAGE_IN_INTERVALS = 5.0
+"""... and at least this many times the usual interval between fixes."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementOutcome:
+    """What became of the fixes or headings of a log.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
+    nis : (m,) normalised innovation squared, NaN where unseen
+    code : uint8 (m,), see `icrtool.core.ekf`: UNSEEN, USED, GATED, RECOVERED
+    difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
+    """
+
+    stamp_ns: Ints
+    t_s: Floats
+    nis: Floats
+    code: Any
+    difference: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class FilterRun:
+    """One finished run.
+
+    Attributes
+    ----------
+    table : the recorded states; `states` is the same as a DataFrame
+    in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
+    outages_ns : half-open spans without usable GNSS, (k, 2)
+    gnss, heading : what became of the measurements
+    covariance : (6, 6) at the end
+    convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
+    """
+
+    log: RobotLog
+    config: Config
+    table: States
+    in_gap: Bools
+    outages_ns: Ints
+    gnss: MeasurementOutcome
+    heading: MeasurementOutcome
+    heading_check: HeadingCheck
+    covariance: Floats
+    convergence: dict[str, tuple[float, float] | None]
+    warnings: tuple[str, ...]
+    summary: dict[str, Any] = field(repr=False)
+
+    @property
+    def states(self) -> pd.DataFrame:
+        """The recorded states, equal to states.csv."""
+        return self.table.frame()
+
+
+def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
+    """Learn a robot's track ICRs from a log.
+
+    Parameters
+    ----------
+    log : as `icrtool.read_log` returns it
+    config : default: all defaults
+
+    Returns
+    -------
+    FilterRun
+        No file is touched.
+
+    Raises
+    ------
+    DataError
+        Streams that cannot be used together.
+
+    Notes
+    -----
+    The EKF of Pentzer 2014, Eqs. 13-25, event by event; ``filter.preset`` chooses between the paper's constants and
+    start (``paper``) and those made for field logs (``field``).
+    """
+    config = config if config is not None else Config()
+    check = check_heading(log, config)
+    setup = set_up_filter(
+        log, config, heading_offset_rad=check.applied_offset_rad, heading_std_at_least_rad=check.applied_std_rad
+    )
+    output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    table = _states(log, setup, output)
+    gnss = _outcome(
+        log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
+    )
+    heading = _outcome(
+        log.heading.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
+        output.heading_innovation,
+    )  # fmt: skip
+    gap = wheel_gap_s(config, setup.data.wheel_t)
+    in_gap = np.append(np.diff(table.t_s) > gap, False)  # noqa: FBT003 - the last state has no interval after it
+    convergence = converge(table)
+    warnings = (*log.warnings, *check.warnings, *_doubts(table, gnss))
+    summary = {
+        "schema": RUN_SCHEMA,
+        "tool_version": __version__,
+        "log": log.name,
+        "inputs": [asdict(file) for file in log.inputs],
+        "config": config.effective(),
+        "streams": [asdict(stream) for stream in log.streams],
+        "warnings": list(warnings),
+        "drive": drive_summary(table),
+        "icr": icr_summary(table, convergence),
+        "gnss": gnss_summary(log, gnss),
+        "heading": check.summary(),
+        "filter": {"preset": config.filter.preset, "states": len(table), **nis_summary(gnss, heading)},
+    }
+    return FilterRun(
+        log=log,
+        config=config,
+        table=table,
+        in_gap=in_gap,
+        outages_ns=_outages(table, gnss),
+        gnss=gnss,
+        heading=heading,
+        heading_check=check,
+        covariance=_square(output.P),
+        convergence=convergence,
+        warnings=warnings,
+        summary=summary,
+    )
+
+
+def _states(log: RobotLog, setup: FilterSetup, output: FilterOutput) -> States:
+    first = len(log.wheels.stamp_ns) - len(output.x)
+    stamps = log.wheels.stamp_ns[first:]
+    std = np.sqrt(np.maximum(output.variance, 0.0))
+    return States(
+        stamps,
+        (stamps - stamps[0]) / 1e9,
+        *(np.ascontiguousarray(column) for column in output.x.T),
+        *(np.ascontiguousarray(column) for column in std.T),
+        log.wheels.v_left_mps[first:],
+        log.wheels.v_right_mps[first:],
+        output.distance,
+    )
+
+
+def _outcome(
+    stamps: Ints, index: Ints, table: States, nis: Floats, code: Any, difference: Floats
+) -> MeasurementOutcome:
+    """Put what the kernel said of the measurements it was given back in the rows of the log."""
+    all_nis, all_code, all_difference = np.full(len(stamps), np.nan), np.zeros(len(stamps), np.uint8), np.full(len(stamps), np.nan)
+    all_nis[index], all_code[index], all_difference[index] = nis, code, difference
+    return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
+
+
+def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
+    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns]."""
+    used = gnss.stamp_ns[gnss.code > UNSEEN]
+    if len(used) < 2:  # noqa: PLR2004 - an interval needs two ends
+        return np.empty((0, 2), np.int64)
+    interval = np.diff(used)
+    longest = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
+    edges = np.flatnonzero(interval > longest)
+    spans = [(int(used[i]), int(used[i + 1])) for i in edges]
+    if table.stamp_ns[-1] - used[-1] > longest:
+        spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
+    return np.array(spans, np.int64).reshape(-1, 2)
+
+
+def _doubts(table: States, gnss: MeasurementOutcome) -> list[str]:
+    """Return what a user should know before trusting the numbers."""
+    doubts = []
+    distance = float(table.distance_m[-1])
+    if distance < 1.0:
+        doubts.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
+    elif float(np.ptp(table.heading_rad)) < math.radians(20):
+        doubts.append("the robot hardly turned: the ICRs are not observable on a straight drive")
+    if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
+        doubts.append("the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels")
+    seen = int(np.count_nonzero(gnss.code > UNSEEN))
+    gated = int(np.count_nonzero(gnss.code == 2))  # noqa: PLR2004 - GATED
+    if seen and gated > 0.1 * seen:
+        doubts.append(
+            f"{100 * gated / seen:.0f} % of the fixes were rejected: clocks, antenna place or fix quality do not fit the wheels"
+        )
+    return doubts
+
+
+def _square(upper: Floats) -> Floats:
+    """Return the symmetric (6, 6) matrix of an upper triangle."""
+    P = np.zeros((6, 6))
+    P[np.triu_indices(6)] = upper
+    return P + np.triu(P, 1).T

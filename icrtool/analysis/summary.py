@@ -1,0 +1,112 @@
+"""The numbers of a run: distance and speed, ICR means, convergence, GNSS difference, NIS (Pentzer 2014, Tables I-III)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrtool.core.ekf import GATED, RECOVERED, UNSEEN
+from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.tables import Floats, RobotLog, States
+
+if TYPE_CHECKING:
+    from icrtool.analysis.fit import MeasurementOutcome
+
+ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+
+SMALLEST_CHANGE_M = 0.01
+"""An ICR whose estimate moved less than this from its start has no rise to time."""
+
+
+def converge(table: States) -> dict[str, tuple[float, float] | None]:
+    """Time the rise of each ICR estimate.
+
+    Returns
+    -------
+    dict
+        By column: seconds at which the estimate has gone 10 % and 90 % of the way from its start to its settled
+        value (median over the second half of the run), or None where it hardly moved.
+
+    Notes
+    -----
+    Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
+    """
+    rises: dict[str, tuple[float, float] | None] = {}
+    for column in ICR_COLUMNS:
+        estimate: Floats = getattr(table, column)
+        settled = float(np.median(estimate[len(estimate) // 2 :]))
+        change = settled - float(estimate[0])
+        if abs(change) < SMALLEST_CHANGE_M:
+            rises[column] = None
+            continue
+        gone = (estimate - estimate[0]) / change
+        first = int(np.argmax(gone >= 0.1))
+        last = first + int(np.argmax(gone[first:] >= 0.9))
+        rises[column] = (float(table.t_s[first]), float(table.t_s[last]))
+    return rises
+
+
+def path_speed(table: States) -> Floats:
+    """Return the speed over each interval between states (n - 1,) [m/s]; NaN where no time passes."""
+    interval = np.diff(table.t_s)
+    return np.divide(np.diff(table.distance_m), interval, out=np.full(len(interval), np.nan), where=interval > 0)
+
+
+def drive_summary(table: States) -> dict[str, float]:
+    """Return duration, distance, and mean and standard deviation of the speed over time."""
+    weight = np.diff(table.t_s)
+    duration, distance = float(table.t_s[-1]), float(table.distance_m[-1])
+    mean = distance / duration if duration > 0 else 0.0
+    deviation = np.nan_to_num(path_speed(table)) - mean
+    spread = float(np.sqrt(np.average(deviation**2, weights=weight))) if duration > 0 else 0.0
+    return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
+
+
+def icr_summary(table: States, convergence: dict[str, tuple[float, float] | None]) -> dict[str, dict[str, float | None]]:
+    """Return the ICRs: final, mean and standard deviation over the states after convergence, and rise times."""
+    settled = max((rise[1] for rise in convergence.values() if rise is not None), default=0.0)
+    after = table.t_s >= settled
+    columns: dict[str, Floats] = {column: getattr(table, column) for column in ICR_COLUMNS}
+    return {
+        "final": {column: float(values[-1]) for column, values in columns.items()},
+        "final_std": {column: float(getattr(table, f"std_{column}")[-1]) for column in columns},
+        "mean": {column: float(values[after].mean()) for column, values in columns.items()},
+        "std": {column: float(values[after].std()) for column, values in columns.items()},
+        "convergence_s": {
+            column: rise[1] - rise[0] if rise is not None else None for column, rise in convergence.items()
+        },
+    }
+
+
+def separation_multiplier(table: States, track_width_m: float) -> float:
+    """Return (y_r - y_l)/b of the final estimates: the wheel_separation_multiplier of a ROS diff-drive controller."""
+    separation = abs(float(table.y_icr_right_m[-1]) - float(table.y_icr_left_m[-1]))
+    return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
+
+
+def gnss_summary(log: RobotLog, gnss: MeasurementOutcome) -> dict[str, Any]:
+    """Return how many fixes were used and rejected, and how far the filter stays from those it used."""
+    used = (gnss.code > UNSEEN) & (gnss.code != GATED)
+    difference = gnss.difference[used]
+    datum = log.datum
+    return {
+        "used": int(np.count_nonzero(used)),
+        "rejected": int(np.count_nonzero(gnss.code == GATED)) + sum(log.rejected_fixes.values()),
+        "rejected_by_gate": int(np.count_nonzero(gnss.code == GATED)),
+        "rejected_by_reason": dict(log.rejected_fixes),
+        "recoveries": int(np.count_nonzero(gnss.code == RECOVERED)),
+        "mean_difference_m": float(difference.mean()) if len(difference) else None,
+        "max_difference_m": float(difference.max()) if len(difference) else None,
+        "datum": [datum.latitude_deg, datum.longitude_deg, datum.height_m] if datum is not None else None,
+    }
+
+
+def nis_summary(gnss: MeasurementOutcome, heading: MeasurementOutcome) -> dict[str, Any]:
+    """Return mean NIS (2 and 1 expected where the noise is right) and rejections, over measurements not gated."""
+    summary: dict[str, Any] = {}
+    for name, outcome in (("gnss", gnss), ("heading", heading)):
+        used = (outcome.code > UNSEEN) & (outcome.code != GATED)
+        summary[f"nis_{name}_mean"] = float(outcome.nis[used].mean()) if used.any() else None
+        summary[f"{name}_rejected"] = int(np.count_nonzero(outcome.code == GATED))
+    return summary

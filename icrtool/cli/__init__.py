@@ -1,0 +1,23 @@
+"""Words to calls: one file a command; the only room with click, and the one error boundary."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line; the one place where errors become text and an exit code."""
+    from icrtool.cli.commands import icrtool
+    from icrtool.errors import IcrToolError
+
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that cannot show a degree sign gets a question mark, not a traceback.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    try:
+        icrtool()
+    except IcrToolError as err:
+        print(f"Error: {err}", file=sys.stderr)
+        sys.exit(1)

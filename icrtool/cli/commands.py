@@ -1,0 +1,43 @@
+"""The command group; a command's module is imported when it is called, so that ``--help`` is instant."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+from icrtool import __version__
+
+_COMMANDS = {
+    "fit": "Learn the track ICRs of a robot from its logs.",
+    "info": "Say what logs hold, which topics would be used, and what is wrong with them.",
+}
+
+
+class _Commands(click.Group):
+    """Finds command NAME in module ``icrtool.cli.NAME``."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module = importlib.import_module(f"icrtool.cli.{cmd_name.replace('-', '_')}")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
+
+
+@click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="icrtool")
+def icrtool() -> None:
+    """Learn the track ICRs of a skid-steer robot from its field logs, and say how far it can go blind.
+
+    A log is an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a bare .db3. Results go to standard output,
+    warnings and errors to standard error. Exit status: 0 done, 1 the log, configuration or request cannot be used,
+    2 wrong usage, 3 a gate failed.
+    """

@@ -1,0 +1,104 @@
+"""``icrtool fit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+
+if TYPE_CHECKING:
+    from icrtool.config import Config
+
+RUNS = Path("icrtool-runs")
+
+
+@click.command("fit")
+@options.LOGS
+@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory (several logs: its parent).")
+@click.option("--states", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True, help="Format of the states.")
+@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.configuration
+@options.verbosity
+def command(
+    logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    """Learn the track ICRs of a robot from its logs, and write a run directory per log.
+
+    Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
+    robot.wheel_radius_m=… tell what the messages do not.
+
+    \b
+    Example:
+      icrtool fit field.mcap --robot husky-a200
+      icrtool fit log.bag --set topics.gnss=/rtk/fix -o runs/today
+    """
+    from icrtool.errors import IcrToolError
+
+    config = options.load(config_file, robot, sets)
+    formats = plot_formats(plots)
+    directories = run_directories(logs, output)
+    failed: list[IcrToolError] = []
+    for log, directory in zip(logs, directories, strict=True):
+        try:
+            _fit_one(log, directory, config, states, formats, quiet=quiet, verbose=verbose)
+        except IcrToolError as err:
+            if len(logs) == 1:
+                raise
+            failed.append(err)
+            click.echo(f"Error: {err}", err=True)
+    if failed:
+        raise IcrToolError(f"{len(failed)} of {len(logs)} logs", "could not be used", "the others were written")
+
+
+def plot_formats(text: str) -> tuple[str, ...]:
+    """Return the picture formats of ``--plots``."""
+    formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
+    if formats == ("none",):
+        return ()
+    unknown = [part for part in formats if part not in ("png", "svg", "pdf")]
+    if unknown or not formats:
+        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of png, svg, pdf, none", param_hint="--plots")
+    return formats
+
+
+def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
+    """Return where each log's run goes: ``icrtool-runs/NAME``, DIR, or ``DIR/NAME`` for several."""
+    from icrtool.errors import OutputError
+    from icrtool.logio.read_log import log_name
+
+    names = [log_name(log) for log in logs]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise OutputError(twice, "two logs have this name, their runs would be one directory", "fit them one at a time, each with its -o")
+    if output is not None and len(logs) == 1:
+        return [output]
+    return [(output or RUNS) / name for name in names]
+
+
+def _fit_one(
+    log: Path, directory: Path, config: Config, states: str, formats: tuple[str, ...], *, quiet: bool, verbose: bool
+) -> None:
+    from icrtool.report.run_directory import check_target, write_run
+
+    check_target(directory)
+    with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
+        from icrtool.logio import read_log
+
+        measured = read_log(log, config, progress)
+    from icrtool.analysis.fit import fit
+
+    run = fit(measured, config)
+    write_run(run, directory, states="parquet" if states == "parquet" else "csv", plots=formats)
+    options.warn(run.warnings, quiet=quiet)
+    if not quiet:
+        from icrtool.report.run_table import format_run
+
+        click.echo(format_run(run))
+        click.echo(f"\nwritten to {directory}")
+    if verbose:
+        for stream in measured.streams:
+            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -1,0 +1,57 @@
+"""``icrtool info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from icrtool.cli import options
+
+
+@click.command("info")
+@options.LOGS
+@options.configuration
+@options.verbosity
+def command(
+    logs: tuple[Path, ...], config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool
+) -> None:
+    """Say what each log holds, which topic would feed wheels, position and heading, and why.
+
+    Exit status 1 when `icrtool fit` could not run on a log.
+    """
+    from icrtool.errors import IcrToolError
+
+    config = options.load(config_file, robot, sets)
+    failed = 0
+    for log in logs:
+        try:
+            usable = _describe(log, config, quiet=quiet, verbose=verbose)
+        except IcrToolError as err:
+            click.echo(f"Error: {err}", err=True)
+            usable = False
+        failed += not usable
+    if failed:
+        raise SystemExit(1)
+
+
+def _describe(log: Path, config: object, *, quiet: bool, verbose: bool) -> bool:
+    """Print what a log holds; say whether it can be fitted."""
+    from icrtool.config import Config
+    from icrtool.errors import IcrToolError
+    from icrtool.logio import assemble, survey_log
+    from icrtool.logio.describe import describe_survey
+
+    assert isinstance(config, Config)
+    with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
+        survey = survey_log(log, config, progress)
+    try:
+        measured, problem = assemble(survey, config), ""
+    except IcrToolError as err:
+        measured, problem = None, str(err)
+    if not quiet:
+        click.echo(describe_survey(survey, measured, everything=verbose))
+    options.warn(list(measured.warnings) if measured is not None else list(survey.problems), quiet=quiet)
+    if problem:
+        click.echo(f"Error: {problem}", err=True)
+    return measured is not None

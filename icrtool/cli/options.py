@@ -1,0 +1,64 @@
+"""Options that commands share, and the few words they print alike."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from icrtool.config import Config
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+
+
+def configuration(command: Command) -> Command:
+    """Add --config, --robot and --set."""
+    options = (
+        click.option("--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."),
+        click.option("--robot", metavar="NAME", help="Built-in robot, for example husky-a200, jackal, warthog."),
+        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def verbosity(command: Command) -> Command:
+    """Add -q and -v."""
+    command = click.option("-v", "--verbose", is_flag=True, help="Say more.")(command)
+    return click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings.")(command)
+
+
+def load(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> Config:
+    """Load the configuration the options describe."""
+    from icrtool.config import load_config
+
+    return load_config(config_file, robot, sets)
+
+
+def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
+    """Print warnings on standard error."""
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"Warning: {warning}", err=True)
+
+
+@contextmanager
+def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
+    """Give a function that moves a bar on a terminal; None where there is no terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
+
+        def move(share: float) -> None:
+            bar.update(int(1000 * min(share, 1.0)) - bar.pos)
+
+        yield move

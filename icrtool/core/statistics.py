@@ -1,0 +1,237 @@
+"""What open-loop errors say: percentiles and mean per horizon, how far to trust them, and histograms.
+
+Errors are float64 (n_starts, n_horizons) [m] with NaN where there was no trial, as `icrtool.core.open_loop_fast` makes
+them. Trials from neighbouring starts share most of their path and are anything but independent: intervals come from
+resampling stretches of path, not trials.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.core.compiled import njit
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+TAIL = 0.05
+"""Share of trials above the 95th percentile."""
+BLOCK_PARTS = 4
+"""Blocks begin at every quarter of their length."""
+MIN_BLOCKS = 3
+"""With fewer blocks of path in all, resampling them says nothing: the interval is not available (NaN)."""
+TRIALS_PER_BLOCK = 8
+"""Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
+MIN_KEPT_TRIALS = 20_000
+"""Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
+
+
+class Summary(NamedTuple):
+    """Errors of one model, per horizon; (n_horizons,) each, NaN where there was no trial.
+
+    Attributes
+    ----------
+    trials : int64
+    expected, p50, p95, largest : float64 [m]; the expected error is the mean
+    """
+
+    trials: Ints
+    expected: Floats
+    p50: Floats
+    p95: Floats
+    largest: Floats
+
+
+class Intervals(NamedTuple):
+    """Confidence intervals of the expected error and of p95, per horizon; float64 (n_horizons,) [m] each.
+
+    NaN where the path with trials is shorter than `MIN_BLOCKS` horizons.
+    """
+
+    expected_low: Floats
+    expected_high: Floats
+    p95_low: Floats
+    p95_high: Floats
+
+
+class Histogram(NamedTuple):
+    """Share of trials by error: float64 (n_bins,) each, bins ``[left, right)`` [m] from zero on, percent of all."""
+
+    left: Floats
+    right: Floats
+    percent: Floats
+
+
+def summarise(errors_m: Floats) -> Summary:
+    """Summarise the trials of every horizon; `errors_m` is (n_starts, n_horizons).
+
+    Notes
+    -----
+    Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
+    interpolate linearly between order statistics, as ``numpy.percentile`` does.
+    """
+    horizons = errors_m.shape[1]
+    trials = np.zeros(horizons, dtype=np.int64)
+    table = np.full((4, horizons), np.nan)
+    for h in range(horizons):
+        ordered = np.sort(errors_m[:, h])
+        trials[h] = len(ordered) - np.count_nonzero(np.isnan(ordered))
+        if trials[h]:
+            ordered = ordered[: trials[h]]
+            table[:, h] = ordered.mean(), _quantile(ordered, 0.5), _quantile(ordered, 1.0 - TAIL), ordered[-1]
+    return Summary(trials, *table)
+
+
+def _quantile(ordered: Floats, share: float) -> float:
+    """Return numpy's 'linear' quantile of sorted values."""
+    rank = share * (len(ordered) - 1)
+    below = math.floor(rank)
+    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
+    return float(low + (high - low) * (rank - below))
+
+
+@njit
+def resample_blocks(blocks: Floats, starts: Ints, segments: Ints, ordered: Floats, out: Floats) -> None:
+    """Fill `out` (resamples, 2) with the mean and p95 of every resample.
+
+    Parameters
+    ----------
+    blocks : (n_starts, 3), sum of errors, trials and kept trials of the block beginning at each segment
+    starts : int64 (resamples, n_drawn), first segment of every block drawn
+    segments, ordered : (n_kept,), segment and error of the kept trials, largest error first
+
+    Notes
+    -----
+    p95 of a resample is a weighted quantile, the weight of a trial being how often its segment was drawn: the trials
+    are sorted once, and each resample walks down from the largest until 5 % of the weight is behind it.
+    """
+    before = BLOCK_PARTS - 1
+    drawn = np.zeros(before + len(blocks) + before, dtype=np.int64)
+    for b in range(starts.shape[0]):
+        for s in range(len(drawn)):
+            drawn[s] = 0
+        total, count, kept = 0.0, 0.0, 0.0
+        for i in range(starts.shape[1]):
+            s = starts[b, i]
+            drawn[before + s] += 1
+            total += blocks[s, 0]
+            count += blocks[s, 1]
+            kept += blocks[s, 2]
+        above, i = 0.0, -1
+        while above <= TAIL * kept and i + 1 < len(ordered):
+            i += 1
+            for part in range(BLOCK_PARTS):
+                above += drawn[segments[i] + part]
+        out[b, 0] = total / count
+        out[b, 1] = ordered[i]
+
+
+def bootstrap_interval(
+    errors_m: Floats,
+    path_m: Floats,
+    block_m: float,
+    rng: np.random.Generator,
+    resamples: int = 300,
+    level: float = 0.95,
+) -> tuple[float, float, float, float]:
+    """Compute confidence intervals of one horizon's expected error and p95 by the moving-block bootstrap.
+
+    Parameters
+    ----------
+    errors_m : (n,) [m], NaN where there was no trial
+    path_m : (n,) [m], path length at each start, non-decreasing
+    block_m : path [m] of a block, usually the horizon
+    rng : random numbers; the same state gives the same blocks, so models can be compared on the same resamples
+    resamples, level : number of resamples, and the share of them within the interval
+
+    Returns
+    -------
+    expected_low, expected_high, p95_low, p95_high [m]; NaN where there are fewer than `MIN_BLOCKS` blocks
+
+    Notes
+    -----
+    Kuensch (1989), percentile intervals. The path is cut into segments of a quarter block, those without a trial are
+    left out, and a resample is made of as many blocks of four consecutive segments as the log has. Approximations:
+    blocks begin at segments, not at every state; p95 is resampled from evenly spaced trials, `TRIALS_PER_BLOCK` of a
+    block, and without interpolation. Both are small against the interval. The overlap of trials reaches as far as
+    the block, so the interval is rather too narrow than too wide, by about a fifth.
+    """
+    tried = np.flatnonzero(~np.isnan(errors_m))
+    if not len(tried):
+        return (math.nan,) * 4
+    rows: slice | Ints = tried
+    if tried[-1] - tried[0] + 1 == len(tried):
+        rows = slice(tried[0], tried[-1] + 1)  # the usual case, and a slice copies nothing
+    errors, path = errors_m[rows], path_m[rows]
+    edges = np.arange(path[0], path[-1] + block_m, block_m / BLOCK_PARTS)
+    first = np.searchsorted(path, edges)
+    # what lies beyond the path, and segments without a trial, begin where another one does
+    first = first[np.diff(first, append=len(path)) > 0]
+    n_starts = len(first) - BLOCK_PARTS + 1
+    if len(first) < MIN_BLOCKS * BLOCK_PARTS:
+        return (math.nan,) * 4
+    n_drawn = len(first) // BLOCK_PARTS
+    kept = np.arange(0, len(errors), max(len(errors) // max(MIN_KEPT_TRIALS, TRIALS_PER_BLOCK * n_drawn), 1))
+    segments = np.searchsorted(first, kept, side="right") - 1
+    order = np.argsort(errors[kept])[::-1]
+    per_segment = np.stack(
+        [
+            np.add.reduceat(errors, first),
+            np.diff(first, append=len(errors)),
+            np.bincount(segments, minlength=len(first)),
+        ],
+        axis=1,
+    )
+    blocks = np.sum([per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)], axis=0)
+    starts = rng.integers(0, n_starts, size=(resamples, n_drawn))
+    replicates = np.empty((resamples, 2))
+    resample_blocks(blocks, starts, segments[order], errors[kept][order], replicates)
+    low, high = np.quantile(replicates, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+def bootstrap_intervals(
+    errors_m: Floats, path_m: Floats, horizons_m: Floats, seed: int, resamples: int = 300, level: float = 0.95
+) -> Intervals:
+    """Compute `bootstrap_interval` for every horizon, with blocks as long as the horizon.
+
+    Parameters
+    ----------
+    errors_m : (n_starts, n_horizons) [m]
+    path_m : (n_starts,) [m], path length at each start
+    horizons_m : (n_horizons,) [m]
+    seed : every horizon starts from it, so that an interval does not depend on which others are asked for
+    resamples, level : as in `bootstrap_interval`
+    """
+    rows = [
+        bootstrap_interval(errors_m[:, h], path_m, float(horizons_m[h]), np.random.default_rng(seed), resamples, level)
+        for h in range(len(horizons_m))
+    ]
+    return Intervals(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
+
+
+def round_bin_width(largest_m: float, bins: int = 50) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `bins` bins reach `largest_m`."""
+    if not largest_m > 0.0:
+        return 0.01
+    least = largest_m / bins
+    power = 10.0 ** math.floor(math.log10(least))
+    return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
+
+
+def histogram(errors_m: Floats, bin_width_m: float) -> Histogram:
+    """Count the trials of one horizon in bins of `bin_width_m` from zero to the largest error (Figs. 28-30).
+
+    Parameters
+    ----------
+    errors_m : (n,) [m], NaN where there was no trial
+    bin_width_m : [m], see `round_bin_width`
+    """
+    tried = errors_m[~np.isnan(errors_m)]
+    counts = np.bincount((tried / bin_width_m).astype(np.int64))
+    edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
+    return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(tried), 1))

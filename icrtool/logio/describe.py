@@ -1,0 +1,96 @@
+"""What a surveyed log holds, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icrtool.logio.heading_sources import HeadingSource
+from icrtool.logio.position_sources import PositionSource
+from icrtool.logio.read_log import Survey
+from icrtool.logio.stamps import rate_and_jitter
+from icrtool.logio.wheel_sources import WheelMotion
+from icrtool.tables import Ints, RobotLog
+
+GAP_IN_INTERVALS = 5.0
+
+
+def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bool) -> str:
+    """Return the text of ``icrtool info``: topics, rates, gaps, stamps, candidates by role, the choice.
+
+    Parameters
+    ----------
+    measured : the assembled log, None when it cannot be used
+    everything : list the topics of types that no role can use, too
+    """
+    size = sum(file.bytes for file in survey.inputs)
+    lines = [f"{survey.path}: {len(survey.channels)} topics, {size / 1e6:.1f} MB in {len(survey.inputs)} file(s)"]
+    lines += _topics(survey, everything=everything)
+    chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
+    for role, sources in (
+        ("wheels", survey.candidates.wheels),
+        ("gnss", survey.candidates.gnss),
+        ("heading", survey.candidates.heading),
+    ):
+        lines.append(f"\n{role}:")
+        lines += _candidates(sources, chosen[role].topic if role in chosen else None)
+        if role in chosen:
+            stream = chosen[role]
+            lines.append(f"  -> {stream.topic}: {stream.why}")
+            lines.append(f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, jitter {stream.jitter_ms:.3g} ms")
+    if measured is not None:
+        spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
+        overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
+        lines.append(f"\nall three overlap for {max(overlap, 0):.1f} s")
+    return "\n".join(lines)
+
+
+def _topics(survey: Survey, *, everything: bool) -> list[str]:
+    tables = {table.topic: table for table in survey.tables}
+    lines, width = [], max((len(channel.topic) for channel in survey.channels), default=0)
+    unused = 0
+    for topic, channel in {channel.topic: channel for channel in survey.channels}.items():
+        table = tables.get(topic)
+        if table is None and not everything and topic not in survey.candidates.unread:
+            unused += 1
+            continue
+        text = f"  {topic:<{width}}  {channel.message_type}"
+        if table is not None:
+            rate, _ = rate_and_jitter(table.log_time_ns)
+            text += f"  {len(table)} messages, {rate:.4g} Hz{_gaps(table.log_time_ns)}"
+            if table.unreadable:
+                text += f", {table.unreadable} unreadable"
+        elif topic in survey.candidates.unread:
+            text += f"  not read: {survey.candidates.unread[topic]}"
+        elif channel.count is not None:
+            text += f"  {channel.count} messages, no role"
+        else:
+            text += "  no role"
+        lines.append(text)
+    if unused:
+        lines.append(f"  and {unused} of types that no role can use (-v lists them)")
+    return lines
+
+
+def _gaps(stamps: Ints) -> str:
+    """Say how many intervals are far longer than usual, and the longest."""
+    if len(stamps) < 3:  # noqa: PLR2004 - fewer have no usual interval
+        return ""
+    interval = np.diff(stamps) / 1e9
+    long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
+    if not long.any():
+        return ""
+    return f", {int(np.count_nonzero(long))} gaps up to {float(interval.max()):.1f} s"
+
+
+def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource], chosen: str | None) -> list[str]:
+    if not sources:
+        return ["  no candidate"]
+    lines = []
+    for source in sources:
+        mark = "*" if source.topic == chosen else "-"
+        clock = source.stamps.note or f"header stamps, {source.stamps.delay_ns / 1e6:.1f} ms before log time"
+        verdict = f"cannot be used: {source.problem}" if source.problem else source.why
+        lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
+    return lines

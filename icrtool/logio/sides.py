@@ -1,0 +1,59 @@
+"""Left from right by name: joints of one message, and pairs of topics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+_WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
+_OTHER_JOINTS = re.compile(
+    r"arm|gripper|flipper|finger|steer|pan|tilt|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension|lift", re.IGNORECASE
+)
+_TOKENS = re.compile(r"[a-z]+|[A-Z][a-z]*|[A-Z]+(?![a-z])|\d+")
+_LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
+_RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "rwheel", "wr"}
+
+
+def side_of(name: str) -> str:
+    """Return ``left``, ``right`` or an empty string for a joint's name."""
+    lowered = name.lower()
+    if ("left" in lowered) != ("right" in lowered):
+        return "left" if "left" in lowered else "right"
+    tokens = {token.lower() for token in _TOKENS.findall(name.replace("_", " "))}
+    left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
+    if left == right:
+        return ""
+    return "left" if left else "right"
+
+
+def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return the places of the left and of the right wheel joints among the names of a message."""
+    usable = [i for i, name in enumerate(names) if side_of(name) and not _OTHER_JOINTS.search(name)]
+    named = [i for i in usable if _WHEEL_WORDS.search(names[i])]
+    chosen = named or usable
+    return [i for i in chosen if side_of(names[i]) == "left"], [i for i in chosen if side_of(names[i]) == "right"]
+
+
+def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
+    """Return the topic whose name is `left_topic` with left turned into right; None when there is none."""
+    existing = set(topics)
+    for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
+        if old in left_topic:
+            twin = left_topic.replace(old, new)
+            return twin if twin in existing else None
+    for place, letter in enumerate(left_topic):
+        if letter not in "lL" or not _stands_alone(left_topic, place):
+            continue
+        twin = left_topic[:place] + ("r" if letter == "l" else "R") + left_topic[place + 1 :]
+        if twin in existing:
+            return twin
+    return None
+
+
+def _stands_alone(name: str, place: int) -> bool:
+    """Say whether a letter begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
+    before = name[place - 1] if place else "/"
+    after = name[place + 1] if place + 1 < len(name) else "/"
+    begins = not before.isalpha() or (before.islower() and name[place].isupper())
+    ends = not after.isalpha()
+    return begins or ends

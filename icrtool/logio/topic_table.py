@@ -1,0 +1,193 @@
+"""A topic as columns: raw messages in, block by block; one table out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import DefinitionError
+from icrtool.logio.channel import Block, Channel
+from icrtool.logio.definitions import definitions_of
+from icrtool.logio.layout import Layout, compile_layout
+from icrtool.logio.walk import walk_messages
+from icrtool.tables import Ints
+
+_FIRST_CAPACITY = 8
+_LARGEST_CAPACITY = 256
+
+
+@dataclass(frozen=True, slots=True)
+class TopicTable:
+    """All messages of one topic, in log-time order.
+
+    Attributes
+    ----------
+    log_time_ns : int64 (n,)
+    columns : by field path; float64 or int64, (n,) or, for an array field, (n, k), NaN or 0 where a message has less.
+        A text field holds indices into `texts`.
+    texts : the distinct texts of each text field
+    unreadable : messages that did not have the shape of their type
+    definition_source : where the message definition came from
+    """
+
+    topic: str
+    message_type: str
+    log_time_ns: Ints
+    columns: dict[str, NDArray[Any]]
+    texts: dict[str, list[str]]
+    unreadable: int
+    definition_source: str
+
+    def __len__(self) -> int:
+        return len(self.log_time_ns)
+
+    def floats(self, path: str) -> NDArray[np.float64]:
+        """Return a column as float64, NaN everywhere when the type has no such field."""
+        if path not in self.columns:
+            return np.full(len(self), np.nan)
+        return self.columns[path].astype(np.float64)
+
+    def text(self, path: str) -> str:
+        """Return the first text of a text field, empty when there is none."""
+        texts = self.texts.get(path)
+        return texts[0] if texts else ""
+
+
+@dataclass(slots=True)
+class TopicCollector:
+    """Gathers the columns of one topic while blocks go by."""
+
+    channel: Channel
+    wanted: tuple[str, ...]
+    _capacity: int = _FIRST_CAPACITY
+    _layout: Layout | None = None
+    _source: str = ""
+    _times: list[Ints] = field(default_factory=list)
+    _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _texts: dict[str, dict[int, str]] = field(default_factory=dict)
+    _unreadable: int = 0
+
+    def __post_init__(self) -> None:
+        self._compile()
+
+    def _compile(self) -> None:
+        definitions, self._source = definitions_of(self.channel)
+        encoding = self.channel.encoding
+        if encoding not in ("cdr", "ros1"):
+            raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
+        self._layout = compile_layout(
+            definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity
+        )
+
+    @property
+    def layout(self) -> Layout:
+        """The compiled layout."""
+        assert self._layout is not None
+        return self._layout
+
+    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
+        """Add the chosen messages of a block."""
+        start, end = block.start[chosen], block.end[chosen]
+        table, readable = walk_messages(self.layout, block.data, start, end)
+        most = max((int(self.layout.counts(table, path).max()) for path in self.layout.slots), default=0)
+        if self._capacity < most <= _LARGEST_CAPACITY:
+            self._capacity = most
+            self._compile()
+            table, readable = walk_messages(self.layout, block.data, start, end)
+        self._unreadable += len(readable) - int(np.count_nonzero(readable))
+        table = table[readable]
+        self._times.append(block.log_time_ns[chosen][readable])
+        for path, slot in self.layout.slots.items():
+            values = self._codes(path, table, block) if slot.kind == "string" else self.layout.numbers(table, path)
+            self._parts.setdefault(path, []).append(values)
+
+    def _codes(self, path: str, table: NDArray[np.uint64], block: Block) -> NDArray[np.uint64]:
+        """Return the hashes of a text field (n,) or (n, k); learn the texts that are new."""
+        slot = self.layout.slots[path]
+        texts = self._texts.setdefault(path, {})
+        columns = []
+        counts = self.layout.counts(table, path)
+        for i in range(min(slot.repeat, int(counts.max(initial=0)))):
+            at = slot.column + i * slot.stride
+            codes = np.where(counts > i, table[:, at + 2], np.uint64(0))
+            for code in np.unique(codes) if len(codes) and np.any(codes != codes[0]) else codes[:1]:
+                if code and int(code) not in texts:
+                    row = int(np.argmax(codes == code))
+                    first, length = int(table[row, at]), int(table[row, at + 1])
+                    texts[int(code)] = block.data[first : first + length].tobytes().decode("utf-8", "replace")
+            columns.append(codes)
+        if "[*]" not in path:
+            return columns[0] if columns else np.zeros(len(table), np.uint64)
+        return np.stack(columns, axis=1) if columns else np.zeros((len(table), 0), np.uint64)
+
+    def table(self) -> TopicTable:
+        """Return what was gathered, sorted by log time."""
+        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
+        order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
+        columns: dict[str, NDArray[Any]] = {}
+        texts: dict[str, list[str]] = {}
+        for path, parts in self._parts.items():
+            values = _joined(parts)
+            parts.clear()
+            if path in self._texts:
+                values, texts[path] = _indexed(values, self._texts[path])
+            columns[path] = values if order is None else values[order]
+        return TopicTable(
+            self.channel.topic,
+            self.channel.message_type,
+            times if order is None else times[order],
+            columns,
+            texts,
+            self._unreadable,
+            self._source,
+        )
+
+
+def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
+    """Join tables of one topic and type: a ROS 1 bag gives each publisher a connection of its own."""
+    groups: dict[tuple[str, str], list[TopicTable]] = {}
+    for table in tables:
+        groups.setdefault((table.topic, table.message_type), []).append(table)
+    return [_merged(group) if len(group) > 1 else group[0] for group in groups.values()]
+
+
+def _merged(group: list[TopicTable]) -> TopicTable:
+    """Join tables of one topic and type, sorted by log time."""
+    group = [table for table in group if len(table)] or group[:1]
+    times = np.concatenate([table.log_time_ns for table in group])
+    order = np.argsort(times, kind="stable")
+    columns: dict[str, NDArray[Any]] = {}
+    texts: dict[str, list[str]] = {}
+    for path in group[0].columns:
+        parts = [table.columns[path] for table in group]
+        if path in group[0].texts:
+            texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))
+            renumber = [np.array([*(texts[path].index(t) for t in table.texts[path]), -1]) for table in group]
+            parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
+        columns[path] = _joined(parts)[order]
+    unreadable = sum(table.unreadable for table in group)
+    first = group[0]
+    return TopicTable(first.topic, first.message_type, times[order], columns, texts, unreadable, first.definition_source)
+
+
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    """Concatenate parts; those with fewer columns are padded with NaN or 0."""
+    if parts[0].ndim == 2:
+        width = max(part.shape[1] for part in parts)
+        lacking = np.nan if parts[0].dtype.kind == "f" else 0
+        parts = [
+            part if part.shape[1] == width else np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
+            for part in parts
+        ]
+    return np.concatenate(parts)
+
+
+def _indexed(codes: NDArray[np.uint64], texts: dict[int, str]) -> tuple[Ints, list[str]]:
+    """Turn hashes into indices of a list of texts; -1 where a message has no such element."""
+    indices = np.full(codes.shape, -1, np.int64)
+    for i, code in enumerate(texts):
+        indices[codes == np.uint64(code)] = i
+    return indices, list(texts.values())

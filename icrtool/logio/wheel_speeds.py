@@ -1,0 +1,169 @@
+"""From what the wheels tell (rad, counts, m; position or speed; a body twist) to the speed of each side in m/s."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.errors import ConfigError, DataError
+from icrtool.logio.stamps import increasing
+from icrtool.logio.wheel_sources import Unit, WheelMotion
+from icrtool.tables import Floats, Ints, PositionFixes, WheelSamples
+
+WINDOW_S = 2.0
+LEAST_MOVE_M = 0.3
+FEWEST_WINDOWS = 8
+"""The reference's way is held against the wheels' over straight windows of this length."""
+
+UNIT_TOLERANCE = 0.35
+"""A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
+
+LARGEST_SCALE_ERROR = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Metres by the position reference per unit the wheels tell: median, its standard deviation, windows used."""
+
+    value: float
+    std: float
+    windows: int
+
+
+def wheel_samples(
+    motion: WheelMotion, stamps: Ints, config: Config, gnss: PositionFixes, log_name: str
+) -> tuple[WheelSamples, str, list[str]]:
+    """Turn wheel motion into speeds held over each interval.
+
+    Returns
+    -------
+    samples, how, warnings : how says in words what was used
+
+    Raises
+    ------
+    ConfigError
+        A radius, width or resolution that is needed and cannot be found from the log.
+    DataError
+        Fewer than two usable samples.
+    """
+    rows, backwards, dropped = increasing(stamps)
+    warnings = []
+    if backwards:
+        warnings.append(f"{log_name}: {motion.topic}: {backwards} wheel stamps go back; sorted")
+    if dropped > len(stamps) // 100:
+        warnings.append(f"{log_name}: {motion.topic}: {dropped} of {len(stamps)} wheel samples share a stamp with another; the last was kept")
+    left, right, unit, is_position = _pick(motion, config)
+    left, right = left[rows], right[rows]
+    told = np.isfinite(left) & np.isfinite(right)
+    stamps, left, right = stamps[rows][told], left[told], right[told]
+    if len(stamps) < 2:  # noqa: PLR2004 - an interval needs two ends
+        raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
+    if is_position:
+        interval = np.diff(stamps) / 1e9
+        left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
+        left[-1], right[-1] = left[-2], right[-2]
+    factor, how = _metres_per_unit(motion, unit, stamps, left, right, gnss, config)
+    left = left * factor * config.wheels.left_scale
+    right = right * factor * config.wheels.right_scale
+    samples = WheelSamples(stamps, left, right)
+    scale = reference_scale(samples.stamp_ns, left, right, gnss)
+    if scale is not None and abs(scale.value - 1.0) > max(LARGEST_SCALE_ERROR, 4.0 * scale.std):
+        warnings.append(
+            f"{log_name}: the wheels tell {100 / scale.value:.0f} % of the way the position reference tells "
+            f"({scale.windows} straight windows): check wheel radius and units"
+        )
+    quantity = "position" if is_position else "speed"
+    return samples, f"{quantity}{how}", warnings
+
+
+def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
+    """Compare the reference's way with the wheels' over straight windows; None where too few are straight."""
+    if len(gnss.stamp_ns) < 2:  # noqa: PLR2004 - an interval
+        return None
+    edges = np.arange(max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9))
+    if len(edges) < 2:  # noqa: PLR2004 - an interval
+        return None
+    places = np.searchsorted(gnss.stamp_ns, edges)
+    places = places[places < len(gnss.stamp_ns)]
+    moments = gnss.stamp_ns[places]
+    interval = np.diff(stamps) / 1e9
+    ways = []
+    for speed in (left, right):
+        travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])
+        ways.append(np.diff(np.interp(moments, stamps, travelled)))
+    way, turn = (ways[0] + ways[1]) / 2, np.abs(ways[0] - ways[1])
+    chord = np.hypot(np.diff(gnss.north_m[places]), np.diff(gnss.east_m[places]))
+    whole = np.abs(np.diff(moments) / 1e9 - WINDOW_S) < WINDOW_S / 4
+    straight = whole & (turn < 0.1 * np.abs(way)) & (chord > LEAST_MOVE_M) & (np.abs(way) > 0)
+    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+        return None
+    ratio = chord[straight] / np.abs(way[straight])
+    centre = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - centre)))
+    return Scale(centre, 1.2533 * spread / math.sqrt(len(ratio)), len(ratio))
+
+
+def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bool]:
+    """Return left, right, their unit, and whether they are positions."""
+    if motion.twist is not None:
+        width = config.robot.track_width_m
+        if width is None:
+            raise ConfigError("robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME")
+        speed, turn = motion.twist.T
+        return speed - turn * width / 2, speed + turn * width / 2, "m", False
+    wanted = config.wheels.quantity
+    position, speed_left, speed_right = motion.position_left, motion.speed_left, motion.speed_right
+    has_position = position is not None and motion.position_right is not None
+    has_speed = speed_left is not None and speed_right is not None
+    if wanted in ("position", "counts") and not has_position:
+        raise ConfigError("wheels.quantity", f"{motion.topic} tells no {wanted}", "leave it on auto")
+    if wanted == "velocity" and not has_speed:
+        raise ConfigError("wheels.quantity", f"{motion.topic} tells no velocity", "leave it on auto")
+    use_position = has_position and wanted != "velocity" and (wanted != "auto" or _alive(motion))
+    if use_position or not has_speed:
+        assert position is not None and motion.position_right is not None
+        unit: Unit = "counts" if wanted == "counts" else motion.position_unit
+        return position, motion.position_right, unit, True
+    assert speed_left is not None and speed_right is not None
+    return speed_left, speed_right, motion.speed_unit, False
+
+
+def _alive(motion: WheelMotion) -> bool:
+    """Say whether the positions move where the speeds do: some drivers leave the position at zero."""
+    assert motion.position_left is not None and motion.position_right is not None
+    finite = np.isfinite(motion.position_left) & np.isfinite(motion.position_right)
+    if np.count_nonzero(finite) < len(finite) / 2:
+        return False
+    if motion.speed_left is None or motion.speed_right is None:
+        return True
+    still = [float(np.ptp(side[finite])) == 0.0 for side in (motion.position_left, motion.position_right)]
+    moves = [float(np.nanmax(np.abs(side))) > 0.0 for side in (motion.speed_left, motion.speed_right)]
+    return not any(s and m for s, m in zip(still, moves, strict=True))
+
+
+def _metres_per_unit(
+    motion: WheelMotion, unit: Unit, stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes, config: Config
+) -> tuple[float, str]:
+    """Return metres per unit and, in words, how it is known."""
+    radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
+    known: dict[Unit, float] = {"m": 1.0}
+    if radius is not None:
+        known["rad"] = radius
+        if counts is not None:
+            known["counts"] = 2 * math.pi * radius / counts
+    if unit in known:
+        return known[unit], "" if unit == "m" else f" in {unit}"
+    scale = reference_scale(stamps, left, right, gnss)
+    if unit == "unknown" and scale is not None:
+        name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
+        if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
+            return value, f" in {name} (by the position reference)"
+    if scale is None:
+        needed = "robot.encoder_counts_per_rev" if unit == "counts" and radius is not None else "robot.wheel_radius_m"
+        raise ConfigError(
+            needed, f"needed to read {motion.topic} in {unit}", "give it, or --robot NAME; the log has no straight driving to find it from"
+        )
+    return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"

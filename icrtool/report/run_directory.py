@@ -1,0 +1,206 @@
+"""The run directory: what `icrtool fit` leaves behind, and what `icrtool dropout-report` takes up again."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from icrtool.analysis.fit import RUN_SCHEMA, FilterRun
+from icrtool.errors import RunError
+from icrtool.report.states_csv import StatesFileError, StatesFormat, file_sha256, read_states, write_states
+from icrtool.report.whole_directory import check_place, whole_directory
+from icrtool.tables import Bools, Ints, States
+
+RUN_FILE = "run.json"
+CHECKSUM_FILE = "SHA256SUMS"
+"""Sums of run.json and the states, in the form ``sha256sum -c`` reads: an edited run is not taken for a measured one."""
+
+STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
+
+PLOT_FORMATS = ("png", "svg", "pdf")
+
+SCHEMA_FAMILY = "icrtool/run/"
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRun:
+    """A run as its directory holds it.
+
+    Attributes
+    ----------
+    name : name of the log
+    in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
+    outages_ns : half-open spans without usable GNSS, (k, 2)
+    summary : run.json
+    track_width_m : b of the robot, None where it was not given
+    directory : where it was read from
+    """
+
+    name: str
+    table: States
+    in_gap: Bools
+    outages_ns: Ints
+    summary: dict[str, Any]
+    track_width_m: float | None
+    directory: Path
+
+
+def check_run_place(directory: Path) -> None:
+    """Refuse a place where a run directory cannot be put, before any work is done for it.
+
+    Raises
+    ------
+    OutputError
+        A file or a directory that is not a run of ours is there.
+    """
+    check_place(directory, is_run_directory, kind="run directory")
+
+
+def write_run(
+    run: FilterRun, directory: Path, *, states: StatesFormat = "csv", plots: tuple[str, ...] = ("png",)
+) -> None:
+    """Write a run directory, whole or not at all.
+
+    Parameters
+    ----------
+    run : what `fit` returned
+    directory : where it shall appear; an old run there is replaced, with all that was made from it
+    states : format of the states
+    plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+
+    Raises
+    ------
+    OutputError
+        A file or a foreign directory is in the way, or the disk does not take it.
+    """
+    if unknown := set(plots) - set(PLOT_FORMATS):
+        raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
+    with (
+        whole_directory(directory, is_run_directory, kind="run directory") as partial,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        states_name = f"states.{states}"
+        states_sum = pool.submit(write_states, run.table, partial / states_name, states)
+        if plots:
+            from icrtool.report.figures import draw_figures
+
+            (partial / "plots").mkdir()
+            draw_figures(run, partial / "plots", plots)
+        (partial / RUN_FILE).write_bytes(json_bytes(run_document(run)))
+        sums = {RUN_FILE: file_sha256(partial / RUN_FILE), states_name: states_sum.result()}
+        (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
+
+
+def read_run(directory: Path) -> StoredRun:
+    """Read a run directory back.
+
+    Raises
+    ------
+    RunError
+        Not a run directory, one of another schema, or one that was edited or cut short since it was written.
+    """
+    document = _read_document(directory)
+    sums = _read_sums(directory)
+    name = next((name for name in STATES_FILES if name in sums), None)
+    if name is None:
+        raise RunError(directory, f"{CHECKSUM_FILE} names no states", "run icrtool fit again")
+    for file in (RUN_FILE, name):
+        _check_sum(directory, file, sums.get(file))
+    try:
+        table = read_states(directory / name, STATES_FILES[name])
+        return StoredRun(
+            name=str(document["log"]),
+            table=table,
+            in_gap=np.isin(table.stamp_ns, _spans(document["wheel_gaps_ns"])[:, 0]),
+            outages_ns=_spans(document["outages_ns"]),
+            summary=document,
+            track_width_m=document["config"]["robot"]["track_width_m"],
+            directory=directory,
+        )
+    except (OSError, StatesFileError, KeyError, TypeError, ValueError) as err:
+        raise RunError(directory, f"cannot be read ({err})", "run icrtool fit again") from err
+
+
+def is_run_directory(directory: Path) -> bool:
+    """Say whether a directory is a run of ours, of whatever version."""
+    try:
+        schema = json.loads((directory / RUN_FILE).read_bytes())["schema"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+
+
+def run_document(run: FilterRun) -> dict[str, Any]:
+    """Return what run.json holds: the summary, and what `read_run` needs beside the states."""
+    stamps = run.table.stamp_ns
+    gaps = np.flatnonzero(run.in_gap)
+    needed = {
+        "outages_ns": run.outages_ns.tolist(),
+        "wheel_gaps_ns": np.column_stack([stamps[gaps], stamps[gaps + 1]]).tolist(),
+    }
+    return {**run.summary, **{key: value for key, value in needed.items() if key not in run.summary}}
+
+
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
+    text = json.dumps(_plain(document), indent=2, ensure_ascii=False, allow_nan=False)
+    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
+    return (text + "\n").encode("utf-8", errors="backslashreplace")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _read_document(directory: Path) -> dict[str, Any]:
+    try:
+        raw = (directory / RUN_FILE).read_bytes()
+    except OSError as err:
+        why = "not a run directory" if directory.is_dir() else "no such run directory"
+        raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
+    try:
+        document = json.loads(raw)
+    except ValueError as err:
+        raise RunError(directory, f"{RUN_FILE} is not JSON", "run icrtool fit again") from err
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not (isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)):
+        raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
+    if schema != RUN_SCHEMA:
+        raise RunError(directory, f"its schema is {schema}, this icrtool reads {RUN_SCHEMA}", "run icrtool fit again")
+    return cast(dict[str, Any], document)
+
+
+def _read_sums(directory: Path) -> dict[str, str]:
+    try:
+        lines = (directory / CHECKSUM_FILE).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise RunError(directory, f"no readable {CHECKSUM_FILE}", "run icrtool fit again") from err
+    return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
+
+
+def _check_sum(directory: Path, name: str, expected: str | None) -> None:
+    try:
+        found = file_sha256(directory / name)
+    except OSError as err:
+        raise RunError(directory, f"{name} is missing or unreadable", "run icrtool fit again") from err
+    if found != expected:
+        raise RunError(directory, f"{name} was edited or cut short since the run", "run icrtool fit again")
+
+
+def _spans(pairs: object) -> Ints:
+    return np.array(pairs, np.int64).reshape(-1, 2)

@@ -1,0 +1,190 @@
+"""The typed tables that cross rooms: what was measured, in the charter's frame and units, and what the filter made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Role = Literal["wheels", "gnss", "heading"]
+
+
+def _check_columns(table: object, *columns: str) -> None:
+    length = len(getattr(table, "stamp_ns"))
+    for column in columns:
+        found = len(getattr(table, column))
+        if found != length:
+            raise ValueError(f"{type(table).__name__}.{column} has {found} rows, stamp_ns has {length}")
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSamples:
+    """Speeds of the left and the right side.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), strictly increasing
+    v_left_mps, v_right_mps : float64 (n,), forward positive, each held over [k, k+1)
+    """
+
+    stamp_ns: Ints
+    v_left_mps: Floats
+    v_right_mps: Floats
+
+    def __post_init__(self) -> None:
+        _check_columns(self, "v_left_mps", "v_right_mps")
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFixes:
+    """Positions of the antenna (or of the tracked reference point) in the local plane.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), non-decreasing
+    north_m, east_m : float64 (n,)
+    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
+    """
+
+    stamp_ns: Ints
+    north_m: Floats
+    east_m: Floats
+    var_north_m2: Floats
+    var_east_m2: Floats
+    cov_north_east_m2: Floats
+
+    def __post_init__(self) -> None:
+        _check_columns(self, "north_m", "east_m", "var_north_m2", "var_east_m2", "cov_north_east_m2")
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingSamples:
+    """Headings, clockwise from north.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), non-decreasing
+    heading_rad : float64 (n,), in (-pi, pi]
+    var_rad2 : float64 (n,), NaN where the log does not say
+    """
+
+    stamp_ns: Ints
+    heading_rad: Floats
+    var_rad2: Floats
+
+    def __post_init__(self) -> None:
+        _check_columns(self, "heading_rad", "var_rad2")
+
+
+@dataclass(frozen=True, slots=True)
+class Datum:
+    """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class StreamChoice:
+    """Which topic feeds a role, and why.
+
+    Attributes
+    ----------
+    topic : topic name; a left/right pair reads ``/left + /right``
+    rate_hz : 1 / median interval
+    clock : ``header`` or ``log``: which stamps are used
+    jitter_ms : standard deviation of the interval between samples
+    """
+
+    role: Role
+    topic: str
+    message_type: str
+    count: int
+    rate_hz: float
+    clock: Literal["header", "log"]
+    jitter_ms: float
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file that was read: path as given, size, SHA-256 (hex)."""
+
+    path: str
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLog:
+    """What a robot measured on one drive: the tables the filter needs, and where they came from.
+
+    Attributes
+    ----------
+    datum : None where the position reference was metric already (total station, lidar, motion capture)
+    rejected_fixes : fixes dropped at the door by reason (``no fix``, ``not finite`` ...)
+    warnings : sentences for the user, in the order they were found
+    """
+
+    name: str
+    wheels: WheelSamples
+    gnss: PositionFixes
+    heading: HeadingSamples
+    datum: Datum | None
+    streams: tuple[StreamChoice, ...]
+    inputs: tuple[InputFile, ...]
+    rejected_fixes: dict[str, int]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """Recorded filter states, one per wheel sample. The columns of states.csv, in its order; all of shape (n,).
+
+    Attributes
+    ----------
+    heading_rad : unwrapped
+    std_* : one standard deviation, the square root of the diagonal of P
+    v_left_mps, v_right_mps : held until the next state
+    distance_m : path length since the first state
+    """
+
+    stamp_ns: Ints
+    t_s: Floats
+    north_m: Floats
+    east_m: Floats
+    heading_rad: Floats
+    y_icr_right_m: Floats
+    y_icr_left_m: Floats
+    x_icr_m: Floats
+    std_north_m: Floats
+    std_east_m: Floats
+    std_heading_rad: Floats
+    std_y_icr_right_m: Floats
+    std_y_icr_left_m: Floats
+    std_x_icr_m: Floats
+    v_left_mps: Floats
+    v_right_mps: Floats
+    distance_m: Floats
+
+    def columns(self) -> dict[str, Floats | Ints]:
+        """Return the columns by name, in the order of states.csv."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def frame(self) -> pd.DataFrame:
+        """Return the columns as a DataFrame equal to states.csv."""
+        import pandas as pd
+
+        return pd.DataFrame(self.columns())
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
