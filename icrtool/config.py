@@ -79,7 +79,8 @@ class FilterConfig(_Section):
     """The EKF of Section 3. A value left out is the preset's.
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
-    `heading_std_deg` those of R (Eq. 31), used where the messages do not say.
+    `heading_std_deg` those of R (Eq. 31), used where the messages do not say. `process_position_mps` is 0.2 (Eq. 30);
+    ``auto`` raises it, in preset ``field``, when the fixes contradict wheels this good.
     """
 
     preset: Literal["field", "paper"] = "field"
@@ -87,7 +88,7 @@ class FilterConfig(_Section):
     initial_y_icr_left_m: Finite | None = None
     initial_x_icr_m: Finite | None = None
     initial_icr_std_m: Positive | None = None
-    process_position_mps: NotNegative = 0.2
+    process_position_mps: Literal["auto"] | NotNegative = "auto"
     process_heading_degps: NotNegative = 5.0
     process_icr_mps: NotNegative = 0.01
     gnss_std_m: Positive = 0.01

@@ -13,6 +13,9 @@ from icrtool.core.ekf import FilterParameters, Measurements
 from icrtool.errors import DataError
 from icrtool.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
 
+PAPER_PROCESS_POSITION_MPS = 0.2
+"""Pentzer 2014, Eq. 30; its text says 0.1 m/s, its matrix prints 0.2 squared: the matrix is used."""
+
 PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
 PAPER_INITIAL_ICR_STD_M = 1.0
 """Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
@@ -66,6 +69,7 @@ def set_up_filter(
     *,
     heading_offset_rad: float = 0.0,
     heading_std_at_least_rad: float = 0.0,
+    process_position_mps: float | None = None,
     change_stamps_ns: tuple[int, ...] = (),
     outages_ns: tuple[tuple[int, int], ...] = (),
 ) -> FilterSetup:
@@ -75,6 +79,7 @@ def set_up_filter(
     ----------
     heading_offset_rad : subtracted from every heading sample
     heading_std_at_least_rad : raises the noise of the heading samples
+    process_position_mps : in place of the configured one
     change_stamps_ns : terrain changes, where the ICR covariance is inflated
     outages_ns : half-open spans in which GNSS and heading are taken away
 
@@ -101,7 +106,7 @@ def set_up_filter(
         change_t=_seconds(np.array(sorted(change_stamps_ns), np.int64), epoch),
     )
     t0 = _start_time(log, data)
-    parameters = _parameters(config, data.wheel_t)
+    parameters = _parameters(config, data.wheel_t, process_position_mps)
     x0, P0 = _start_state(data, t0, config, parameters)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
@@ -203,10 +208,17 @@ def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
 
 
-def _parameters(config: Config, wheel_t: Floats) -> FilterParameters:
+def configured_process_position_mps(config: Config) -> float:
+    """Return the position process noise a run starts with."""
+    given = config.filter.process_position_mps
+    return PAPER_PROCESS_POSITION_MPS if given == "auto" else given
+
+
+def _parameters(config: Config, wheel_t: Floats, process_position_mps: float | None) -> FilterParameters:
     settings = config.filter
     paper = settings.preset == "paper"
-    position, icr = settings.process_position_mps**2, settings.process_icr_mps**2
+    speed = configured_process_position_mps(config) if process_position_mps is None else process_position_mps
+    position, icr = speed**2, settings.process_icr_mps**2
     return FilterParameters(
         process_variance=(position, position, math.radians(settings.process_heading_degps) ** 2, icr, icr, icr),
         rate_invariant=not paper,

@@ -9,17 +9,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.analysis.filter_setup import FilterSetup, set_up_filter, wheel_gap_s
+from icrtool.analysis.filter_setup import (
+    FilterSetup,
+    configured_process_position_mps,
+    set_up_filter,
+    wheel_gap_s,
+)
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary
 from icrtool.config import Config
-from icrtool.core.ekf import UNSEEN, FilterOutput, run_filter
+from icrtool.core.ekf import GATED, UNSEEN, FilterOutput, run_filter
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
     import pandas as pd
 
 RUN_SCHEMA = "icrtool/run/1"
+
+TOLERATED_NIS = 2.5
+"""Mean NIS of the fixes: 2 is expected where the noises are right."""
+
+PROCESS_POSITION_STEP = 2.0
+LARGEST_PROCESS_POSITION_MPS = 10.0
+WORTHWHILE_SHARE = 0.9
+"""Doubling the position noise is worth it when it brings the mean NIS below this part of what it was."""
 
 OUTAGE_S = 2.0
 """Longer than this without a usable fix is a GNSS outage."""
@@ -58,6 +71,7 @@ class FilterRun:
     outages_ns : half-open spans without usable GNSS, (k, 2)
     gnss, heading : what became of the measurements
     covariance : (6, 6) at the end
+    process_position_mps : position process noise the run ended with
     convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
     """
 
@@ -70,9 +84,20 @@ class FilterRun:
     heading: MeasurementOutcome
     heading_check: HeadingCheck
     covariance: Floats
+    process_position_mps: float
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """Name of the log."""
+        return self.log.name
+
+    @property
+    def track_width_m(self) -> float | None:
+        """Distance b between the track centre lines, None where not given."""
+        return self.config.robot.track_width_m
 
     @property
     def states(self) -> pd.DataFrame:
@@ -105,10 +130,7 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
     """
     config = config if config is not None else Config()
     check = check_heading(log, config)
-    setup = set_up_filter(
-        log, config, heading_offset_rad=check.applied_offset_rad, heading_std_at_least_rad=check.applied_std_rad
-    )
-    output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    setup, output, position_noise = _run(log, config, check)
     table = _states(log, setup, output)
     gnss = _outcome(
         log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
@@ -120,7 +142,7 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
     gap = wheel_gap_s(config, setup.data.wheel_t)
     in_gap = np.append(np.diff(table.t_s) > gap, False)  # noqa: FBT003 - the last state has no interval after it
     convergence = converge(table)
-    warnings = (*log.warnings, *check.warnings, *_doubts(table, gnss))
+    warnings = (*log.warnings, *check.warnings, *_doubts(log.name, table, gnss), *_noise_note(log.name, config, position_noise))
     summary = {
         "schema": RUN_SCHEMA,
         "tool_version": __version__,
@@ -133,7 +155,7 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
         "icr": icr_summary(table, convergence),
         "gnss": gnss_summary(log, gnss),
         "heading": check.summary(),
-        "filter": {"preset": config.filter.preset, "states": len(table), **nis_summary(gnss, heading)},
+        "filter": {"preset": config.filter.preset, "process_position_mps": position_noise, "states": len(table), **nis_summary(gnss, heading)},
     }
     return FilterRun(
         log=log,
@@ -145,10 +167,40 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
         heading=heading,
         heading_check=check,
         covariance=_square(output.P),
+        process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
         summary=summary,
     )
+
+
+def _run(log: RobotLog, config: Config, check: HeadingCheck) -> tuple[FilterSetup, FilterOutput, float]:
+    """Run the filter; in preset ``field`` again with more position noise while the fixes contradict the wheels.
+
+    A contradiction (NIS of the fixes, each counted up to its gate) that falls as the noise grows comes from the wheels
+    or the clocks (held samples, delays, slip), or from fixes that err together: then the larger noise is the honest one.
+    Bad fixes stay bad whatever the noise.
+    """
+
+    def run(speed: float) -> tuple[FilterSetup, FilterOutput, float]:
+        setup = set_up_filter(
+            log, config, heading_offset_rad=check.applied_offset_rad, heading_std_at_least_rad=check.applied_std_rad,
+            process_position_mps=speed,
+        )  # fmt: skip
+        output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+        nis = output.gnss_nis[output.gnss_code > UNSEEN]
+        contradiction = float(np.minimum(nis, setup.parameters.gnss_gate).mean()) if len(nis) else 0.0
+        return setup, output, contradiction
+
+    speed = configured_process_position_mps(config)
+    setup, output, contradiction = run(speed)
+    adapts = config.filter.preset == "field" and config.filter.process_position_mps == "auto"
+    while adapts and contradiction > TOLERATED_NIS and speed < LARGEST_PROCESS_POSITION_MPS:
+        next_setup, next_output, next_one = run(speed * PROCESS_POSITION_STEP)
+        if next_one > WORTHWHILE_SHARE * contradiction:
+            break
+        speed, setup, output, contradiction = speed * PROCESS_POSITION_STEP, next_setup, next_output, next_one
+    return setup, output, speed
 
 
 def _states(log: RobotLog, setup: FilterSetup, output: FilterOutput) -> States:
@@ -189,7 +241,16 @@ def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
     return np.array(spans, np.int64).reshape(-1, 2)
 
 
-def _doubts(table: States, gnss: MeasurementOutcome) -> list[str]:
+def _noise_note(name: str, config: Config, position_noise: float) -> list[str]:
+    if position_noise == configured_process_position_mps(config):
+        return []
+    return [
+        f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
+        f"position noise raised to {position_noise:.1f} m/s; filter.process_position_mps sets it"
+    ]
+
+
+def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
     """Return what a user should know before trusting the numbers."""
     doubts = []
     distance = float(table.distance_m[-1])
@@ -200,12 +261,12 @@ def _doubts(table: States, gnss: MeasurementOutcome) -> list[str]:
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
         doubts.append("the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels")
     seen = int(np.count_nonzero(gnss.code > UNSEEN))
-    gated = int(np.count_nonzero(gnss.code == 2))  # noqa: PLR2004 - GATED
+    gated = int(np.count_nonzero(gnss.code == GATED))
     if seen and gated > 0.1 * seen:
         doubts.append(
             f"{100 * gated / seen:.0f} % of the fixes were rejected: clocks, antenna place or fix quality do not fit the wheels"
         )
-    return doubts
+    return [f"{name}: {doubt}" for doubt in doubts]
 
 
 def _square(upper: Floats) -> Floats:

@@ -1,30 +1,33 @@
-"""Hold the heading against the GNSS course on straight stretches: offset, convention, scatter."""
+"""Hold the heading against the way that position tells: offset, convention, scatter."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.tables import Bools, Floats, Ints, RobotLog
+from icrtool.tables import Floats, Ints, RobotLog
 
-SHORTEST_CHORD_M = 0.5
-CHORD_IN_GNSS_STD = 30.0
-"""A course is taken over a chord this long, so that the fixes' noise turns it by about 2 deg at most."""
+SHORTEST_WINDOW_M = 1.0
+WINDOW_IN_GNSS_STD = 12.0
+"""A course is taken over this much way, so that the noise of the fixes turns it by no more than some 7 deg."""
 
-STRAIGHT_RAD = math.radians(5.0)
-"""The heading changes less than this over a straight stretch."""
+LONGEST_WINDOW_S = 30.0
+"""A window that takes longer holds an outage or a stop, and no course."""
 
-FEWEST_CHORDS = 8
+FEWEST_WINDOWS = 8
 SIGNIFICANT_SIGMAS = 4.0
 SMALLEST_OFFSET_RAD = math.radians(2.0)
 """An offset is believed when it is this many of its standard deviations, and at least this large."""
 
 EXPLAINED = 0.8
-"""Mean resultant length of heading minus course above which they are one direction seen twice."""
+"""Mean resultant length of course minus heading above which they are one direction seen twice."""
+
+NOISY_SCATTER_RAD = math.radians(6.0)
+"""Scatter about the course, beyond what the fixes explain, above which the heading's noise is raised to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +36,15 @@ class HeadingCheck:
 
     Attributes
     ----------
-    chords : straight stretches compared
-    offset_rad, offset_std_rad : heading minus course, robust circular mean; NaN when there was nothing to compare
+    windows : stretches of way compared
+    offset_rad, offset_std_rad : heading minus course at no curvature; NaN when there was nothing to compare
     scatter_rad : robust standard deviation of the differences
     agreement, mirrored_agreement : mean resultant length of heading minus course, as given and turned the other way
     applied_offset_rad : what `fit` subtracts
     applied_std_rad : the least noise `fit` gives the heading
     """
 
-    chords: int
+    windows: int
     offset_rad: float
     offset_std_rad: float
     scatter_rad: float
@@ -62,136 +65,149 @@ class HeadingCheck:
         }
         numbers = {name: math.degrees(value) if math.isfinite(value) else None for name, value in degrees.items()}
         return {
-            "chords": self.chords,
+            "windows": self.windows,
             **numbers,
             "agreement": self.agreement if math.isfinite(self.agreement) else None,
             "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
         }
 
 
+class Course(NamedTuple):
+    """Windows of way: what position tells against what wheels and heading tell.
+
+    Attributes
+    ----------
+    angle : (w,) heading minus course [rad], in (-pi, pi]
+    mirrored : (w,) the same for a heading that turns the other way
+    curvature : (w,) heading change over way [rad/m]
+    noise_rad : what the fixes' noise alone turns a course by
+    samples : median number of heading samples in a window
+    """
+
+    angle: Floats
+    mirrored: Floats
+    curvature: Floats
+    noise_rad: float
+    samples: float
+
+
 def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
-    """Compare the heading of a log with its GNSS course.
+    """Compare the heading of a log with the way its fixes tell.
 
     The offset is applied where ``frames.heading_offset_deg`` is ``auto``, the preset is not ``paper`` and the offset is
     significant; a number there is applied as it is.
+
+    Notes
+    -----
+    Over each window the wheels' speed is laid along the measured heading and summed; the angle from there to the
+    displacement of the fixes is the heading's offset, plus a part proportional to the curvature (the antenna's lever arm
+    and x_icr make the antenna crab in turns). A robust line through angle over curvature separates the two.
     """
     given = config.frames.heading_offset_deg
     paper = config.filter.preset == "paper"
     fixed = 0.0 if paper or given == "auto" else math.radians(given)
-    heading, course = straight_courses(log)
-    if len(heading) < FEWEST_CHORDS:
-        return HeadingCheck(len(heading), math.nan, math.nan, math.nan, math.nan, math.nan, fixed, 0.0, ())
-    difference = heading - course
-    agreement = abs(np.exp(1j * difference).mean())
-    mirrored = abs(np.exp(1j * (-heading - course)).mean())
-    offset, scatter = robust_direction(difference)
-    sigma = scatter / math.sqrt(len(difference))
-    warnings: list[str] = []
-    applied, raised = fixed, 0.0
-    text = f"heading is {math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}° off the GNSS course ({len(difference)} straight stretches)"
+    course = measure_course(log)
+    if len(course.angle) < FEWEST_WINDOWS:
+        return HeadingCheck(len(course.angle), math.nan, math.nan, math.nan, math.nan, math.nan, fixed, 0.0, ())
+    agreement = float(abs(np.exp(1j * course.angle).mean()))
+    mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
+    offset, sigma, scatter = offset_at_no_curvature(course.angle, course.curvature)
+    own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
+    applied, raised, warnings = fixed, 0.0, []
+    text = f"heading is {math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}° off the course ({len(course.angle)} windows)"
     if agreement < EXPLAINED and mirrored >= EXPLAINED:
-        warnings.append(
-            f"{log.name}: the heading turns the other way than the GNSS course; set frames.heading to the other of enu and ned"
-        )
+        warnings.append(f"{log.name}: the heading turns the other way than the course: set frames.heading to the other of enu and ned")
     elif agreement < EXPLAINED:
-        warnings.append(
-            f"{log.name}: the heading does not follow the GNSS course (agreement {agreement:.2f} of 1); the ICRs cannot be trusted"
-        )
+        warnings.append(f"{log.name}: the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs")
     elif abs(offset - fixed) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
         if given == "auto" and not paper:
             applied = offset
-            warnings.append(f"{log.name}: {text}: applied; --set frames.heading_offset_deg=… fixes it")
+            warnings.append(f"{log.name}: {text}: applied; frames.heading_offset_deg sets it")
         else:
             warnings.append(f"{log.name}: {text}, {math.degrees(fixed):+.1f}° is applied")
-    stated = float(np.nanmedian(np.append(np.sqrt(log.heading.var_rad2), math.nan))) if len(log.heading.stamp_ns) else math.nan
-    usual = max(stated if math.isfinite(stated) else 0.0, math.radians(config.filter.heading_std_deg))
-    if not paper and agreement >= EXPLAINED and scatter > 3.0 * max(usual, SMALLEST_OFFSET_RAD):
-        raised = scatter
+    if not paper and agreement >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
+        # The scatter is that of window means: samples that err together count as one, so each gets a share of it.
+        raised = own_scatter * math.sqrt(course.samples)
         warnings.append(
-            f"{log.name}: the heading scatters by {math.degrees(scatter):.0f}° about the GNSS course, "
-            f"it claims {math.degrees(usual):.1f}°: its noise is raised to that"
+            f"{log.name}: the heading scatters by {math.degrees(own_scatter):.0f}° about the course, over whole windows: its noise is raised accordingly"
         )
     return HeadingCheck(
-        len(difference), offset, sigma, scatter, float(agreement), float(mirrored), applied, raised, tuple(warnings)
+        len(course.angle), offset, sigma, own_scatter, agreement, mirrored, applied, raised, tuple(warnings)
     )
 
 
-def robust_direction(angles: Floats) -> tuple[float, float]:
-    """Return the centre (mean, then median of what is left) and the robust standard deviation of angles [rad]."""
-    centre = float(np.angle(np.exp(1j * angles).mean()))
-    for _ in range(2):
-        residual = np.angle(np.exp(1j * (angles - centre)))
-        centre += float(np.median(residual))
-    residual = np.angle(np.exp(1j * (angles - centre)))
-    return math.remainder(centre, 2 * math.pi), 1.4826 * float(np.median(np.abs(residual)))
+def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, float, float]:
+    """Fit angle = offset + slope * curvature, robustly; return offset, its standard deviation, and the scatter [rad].
 
-
-def straight_courses(log: RobotLog) -> tuple[Floats, Floats]:
-    """Return heading and course [rad, clockwise from north] over straight stretches, reversing taken into account.
-
-    A stretch is a chord between two fixes, walked through the log one after the other; the body's heading is the
-    mean over it, and it counts when wheels and heading say it was straight.
+    Notes
+    -----
+    Iteratively reweighted least squares with Huber's weights (Huber 1964) about the circular mean.
     """
-    gnss, heading, wheels = log.gnss, log.heading, log.wheels
-    if min(len(gnss.stamp_ns), len(heading.stamp_ns), len(wheels.stamp_ns)) < 2:  # noqa: PLR2004 - an interval
-        return np.empty(0), np.empty(0)
-    variance = gnss.var_north_m2 + gnss.var_east_m2
+    centre = float(np.angle(np.exp(1j * angle).mean()))
+    residual = np.angle(np.exp(1j * (angle - centre)))
+    design = np.column_stack([np.ones(len(residual)), curvature])
+    weight = np.ones(len(residual))
+    for _ in range(20):
+        weighted = design * weight[:, None]
+        # A circle has one curvature only: the ridge then leaves the slope at zero, and its doubt in the offset.
+        information = design.T @ weighted + np.diag([0.0, 1e-6])
+        solution = np.linalg.solve(information, weighted.T @ residual)
+        left = residual - design @ solution
+        scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        weight = np.minimum(1.0, 1.5 * scatter / np.maximum(np.abs(left), 1e-12))
+    sigma = scatter * math.sqrt(float(np.linalg.inv(information)[0, 0]))
+    return math.remainder(centre + float(solution[0]), 2 * math.pi), sigma, scatter
+
+
+def measure_course(log: RobotLog) -> Course:
+    """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
+    gnss, wheels = log.gnss, log.wheels
+    none = Course(np.empty(0), np.empty(0), np.empty(0), 0.0, 1.0)
+    if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:  # noqa: PLR2004 - an interval
+        return none
+    variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance)]
-    noise = math.sqrt(float(np.median(known)) / 2) if len(known) else 0.01
-    begin, end = _chords(gnss.north_m, gnss.east_m, max(SHORTEST_CHORD_M, CHORD_IN_GNSS_STD * noise))
+    noise = math.sqrt(float(np.median(known))) if len(known) else 0.01
+    length = max(SHORTEST_WINDOW_M, WINDOW_IN_GNSS_STD * noise)
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * np.where(interval < 1.0, interval, 0.0)
+    psi_at = np.interp(
+        wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
+    )
+    travelled = np.concatenate([[0.0], np.cumsum(np.abs(step))])
+    laid = np.concatenate([[0.0], np.cumsum(step * np.exp(1j * psi_at))])
+    begin, end = _windows(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled), gnss.stamp_ns, length)
     if not len(begin):
-        return np.empty(0), np.empty(0)
-    t_begin, t_end = gnss.stamp_ns[begin], gnss.stamp_ns[end]
-    north, east = gnss.north_m[end] - gnss.north_m[begin], gnss.east_m[end] - gnss.east_m[begin]
-    unwrapped = np.unwrap(heading.heading_rad)
-    mean, spread = _mean_and_spread(heading.stamp_ns, unwrapped, t_begin, t_end)
-    travel_left = _integral_at(wheels.stamp_ns, wheels.v_left_mps, t_begin, t_end)
-    travel_right = _integral_at(wheels.stamp_ns, wheels.v_right_mps, t_begin, t_end)
-    travel = (travel_left + travel_right) / 2
-    chord = np.hypot(north, east)
-    straight = _is_straight(spread, travel, travel_left - travel_right, chord, t_end - t_begin)
-    course = np.arctan2(east, north) + np.where(travel < 0, math.pi, 0.0)
-    return mean[straight], course[straight]
+        return none
+
+    def between(values: Floats) -> Floats:
+        at = np.interp(gnss.stamp_ns, wheels.stamp_ns, values)
+        return at[end] - at[begin]
+
+    seen = (gnss.north_m[end] - gnss.north_m[begin]) + 1j * (gnss.east_m[end] - gnss.east_m[begin])
+    real, imaginary, way = between(laid.real), between(laid.imag), between(travelled)
+    turned = between(np.append(psi_at, psi_at[-1]))
+    moved = (np.abs(seen) > length / 3) & (np.hypot(real, imaginary) > length / 3)
+    told, mirror = real + 1j * imaginary, real - 1j * imaginary
+    return Course(
+        np.angle(told * np.conj(seen))[moved],
+        np.angle(mirror * np.conj(seen))[moved],
+        (turned / way)[moved],
+        noise * math.sqrt(2.0) / length,
+        float(np.median(between(np.arange(len(psi_at) + 1.0)) * _rate_ratio(log))),
+    )
 
 
-def _is_straight(spread: Floats, travel: Floats, turn: Floats, chord: Floats, duration_ns: Ints) -> Bools:
-    """Say which chords were driven straight: little turn by heading and wheels, wheels and chord about as long."""
-    typical = float(np.median(np.abs(travel))) if len(travel) else 0.0
-    moved = np.abs(travel) > 0.3 * typical
-    quick = duration_ns < 20e9  # noqa: PLR2004 - a chord over an outage is no course
-    calm = (spread < STRAIGHT_RAD) | (spread <= np.percentile(spread, 20))
-    unturned = np.abs(turn) < 0.1 * np.maximum(np.abs(travel), 1e-9)
-    return moved & quick & calm & unturned & (chord > 0)
+def _rate_ratio(log: RobotLog) -> float:
+    """Return heading samples per wheel sample."""
+    interval = [float(np.median(np.diff(table.stamp_ns))) for table in (log.wheels, log.heading)]
+    return interval[0] / interval[1] if interval[1] > 0 else 1.0
 
 
-def _chords(north: Floats, east: Floats, length: float) -> tuple[Ints, Ints]:
-    """Return begin and end rows of successive chords of at least `length` [m]."""
-    begin, end, last = [], [], 0
-    step = np.hypot(np.diff(north), np.diff(east))
-    if float(step.sum()) < length:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    for i in range(1, len(north)):
-        if (north[i] - north[last]) ** 2 + (east[i] - east[last]) ** 2 >= length * length:
-            begin.append(last)
-            end.append(i)
-            last = i
-    return np.array(begin, np.int64), np.array(end, np.int64)
-
-
-def _integral_at(stamps: Ints, speed: Floats, begin: Ints, end: Ints) -> Floats:
-    """Return the integral of a held speed [m/s] between stamps [ns]."""
-    travel = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(stamps) / 1e9)])
-    return np.interp(end, stamps, travel) - np.interp(begin, stamps, travel)
-
-
-def _mean_and_spread(stamps: Ints, values: Floats, begin: Ints, end: Ints) -> tuple[Floats, Floats]:
-    """Return mean and standard deviation of samples between stamps [ns]; NaN where there is none."""
-    first, last = np.searchsorted(stamps, begin), np.searchsorted(stamps, end, side="right")
-    count = np.maximum(last - first, 1)
-    # Sums are taken about the first sample of each stretch, so that a heading that wound up over hours loses nothing.
-    centred = values - values[0]
-    sums, squares = np.concatenate([[0.0], np.cumsum(centred)]), np.concatenate([[0.0], np.cumsum(centred**2)])
-    mean = (sums[last] - sums[first]) / count
-    variance = np.maximum((squares[last] - squares[first]) / count - mean**2, 0.0)
-    empty = last <= first
-    return np.where(empty, np.nan, mean + values[0]), np.where(empty, np.inf, np.sqrt(variance))
+def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:
+    """Return first and last fix of successive windows of at least `length` [m], without those that took too long."""
+    targets = np.arange(travelled[0], travelled[-1], length)
+    edges = np.unique(np.searchsorted(travelled, targets))
+    begin, end = edges[:-1], edges[1:]
+    quick = stamps[end] - stamps[begin] < LONGEST_WINDOW_S * 1e9
+    return begin[quick], end[quick]

@@ -230,6 +230,8 @@ def filter_loop(
                 t_next = min(t_next, data.gnss_t[j])
             if h < n_heading:
                 t_next = min(t_next, data.heading_t[h])
+            if c < n_change:
+                t_next = min(t_next, data.change_t[c])
             if t_next > t:
                 travelled += advance(t_next - t, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
                 t = t_next
@@ -262,21 +264,25 @@ def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters
     Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
-    n, n_gnss, n_heading = len(data.wheel_t), len(data.gnss_t), len(data.heading_t)
     first = int(np.searchsorted(data.wheel_t, t0))
     j, h, c = (int(np.searchsorted(times, t0, side="right")) for times in (data.gnss_t, data.heading_t, data.change_t))
-    x, P = x0.astype(np.float64), P0[np.triu_indices(6)].astype(np.float64)
-    out = FilterOutput(
-        x=np.empty((n - first, 6)),
-        variance=np.empty((n - first, 6)),
-        distance=np.empty(n - first),
+    out = empty_output(data, first, P0)
+    filter_loop(data, t0, first, (j, h, c), x0.astype(np.float64), out.P, parameters, out)
+    return out
+
+
+def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
+    """Return the output of a run from wheel sample `first` on, before it has run; its P holds P0 (6, 6)."""
+    rows, n_gnss, n_heading = len(data.wheel_t) - first, len(data.gnss_t), len(data.heading_t)
+    return FilterOutput(
+        x=np.empty((rows, 6)),
+        variance=np.empty((rows, 6)),
+        distance=np.empty(rows),
         gnss_nis=np.full(n_gnss, np.nan),
         gnss_code=np.zeros(n_gnss, np.uint8),
         gnss_residual=np.full((n_gnss, 2), np.nan),
         heading_nis=np.full(n_heading, np.nan),
         heading_code=np.zeros(n_heading, np.uint8),
         heading_innovation=np.full(n_heading, np.nan),
-        P=P,
+        P=P0[np.triu_indices(6)].astype(np.float64),
     )
-    filter_loop(data, t0, first, (j, h, c), x, P, parameters, out)
-    return out

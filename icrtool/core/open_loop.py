@@ -121,6 +121,7 @@ def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> No
         next_gap = lo
         for row in range(ends.shape[1]):
             start = lo + row
+            end = max(end, start)
             while end < len(distance) and distance[end] - distance[start] < horizons_m[h]:
                 end += 1
             if end == len(distance):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.logio.channel import Block, Channel
 from icrtool.logio.definitions import definitions_of
-from icrtool.logio.layout import Layout, compile_layout
+from icrtool.logio.layout import Definitions, Layout, compile_layout
 from icrtool.logio.walk import walk_messages
 from icrtool.tables import Ints
 
@@ -44,11 +44,32 @@ class TopicTable:
     def __len__(self) -> int:
         return len(self.log_time_ns)
 
-    def floats(self, path: str) -> NDArray[np.float64]:
-        """Return a column as float64, NaN everywhere when the type has no such field."""
-        if path not in self.columns:
-            return np.full(len(self), np.nan)
-        return self.columns[path].astype(np.float64)
+    def find(self, *paths: str) -> NDArray[Any] | None:
+        """Return the first of these columns that the type has: drivers spell a field ``hAcc`` or ``h_acc``."""
+        return next((self.columns[path] for path in paths if path in self.columns), None)
+
+    def column(self, *paths: str) -> NDArray[Any]:
+        """Return the first of these columns that the type has.
+
+        Raises
+        ------
+        DefinitionError
+            The type, as the log defines it, has none of them.
+        """
+        values = self.find(*paths)
+        if values is None:
+            raise DefinitionError(self.topic, f"its {self.message_type} has no field {' or '.join(paths)}")
+        return values
+
+    def floats(self, *paths: str) -> NDArray[np.float64]:
+        """Return the first of these columns as float64, NaN everywhere when the type has none."""
+        values = self.find(*paths)
+        return np.full(len(self), np.nan) if values is None else values.astype(np.float64)
+
+    def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
+        """Return the table of the chosen messages."""
+        columns = {path: values[chosen] for path, values in self.columns.items()}
+        return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
 
     def text(self, path: str) -> str:
         """Return the first text of a text field, empty when there is none."""
@@ -58,10 +79,18 @@ class TopicTable:
 
 @dataclass(slots=True)
 class TopicCollector:
-    """Gathers the columns of one topic while blocks go by."""
+    """Gathers the columns of one topic while blocks go by.
+
+    Attributes
+    ----------
+    definitions : in place of the channel's own, None where those are used
+    largest_capacity : elements taken of a sequence at most
+    """
 
     channel: Channel
     wanted: tuple[str, ...]
+    definitions: Definitions | None = None
+    largest_capacity: int = _LARGEST_CAPACITY
     _capacity: int = _FIRST_CAPACITY
     _layout: Layout | None = None
     _source: str = ""
@@ -75,6 +104,7 @@ class TopicCollector:
 
     def _compile(self) -> None:
         definitions, self._source = definitions_of(self.channel)
+        definitions = self.definitions if self.definitions is not None else definitions
         encoding = self.channel.encoding
         if encoding not in ("cdr", "ros1"):
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
@@ -92,9 +122,9 @@ class TopicCollector:
         """Add the chosen messages of a block."""
         start, end = block.start[chosen], block.end[chosen]
         table, readable = walk_messages(self.layout, block.data, start, end)
-        most = max((int(self.layout.counts(table, path).max()) for path in self.layout.slots), default=0)
-        if self._capacity < most <= _LARGEST_CAPACITY:
-            self._capacity = most
+        most = max((int(self.layout.counts(table[readable], path).max(initial=0)) for path in self.layout.slots), default=0)
+        if self._capacity < min(most, self.largest_capacity):
+            self._capacity = min(most, self.largest_capacity)
             self._compile()
             table, readable = walk_messages(self.layout, block.data, start, end)
         self._unreadable += len(readable) - int(np.count_nonzero(readable))
@@ -156,28 +186,29 @@ def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
 
 def _merged(group: list[TopicTable]) -> TopicTable:
     """Join tables of one topic and type, sorted by log time."""
+    unreadable = sum(table.unreadable for table in group)
     group = [table for table in group if len(table)] or group[:1]
     times = np.concatenate([table.log_time_ns for table in group])
     order = np.argsort(times, kind="stable")
     columns: dict[str, NDArray[Any]] = {}
     texts: dict[str, list[str]] = {}
-    for path in group[0].columns:
+    # Publishers may have been built from different versions of the type: what all of them tell is kept.
+    for path in (path for path in group[0].columns if all(path in table.columns for table in group)):
         parts = [table.columns[path] for table in group]
         if path in group[0].texts:
             texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))
             renumber = [np.array([*(texts[path].index(t) for t in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
-        columns[path] = _joined(parts)[order]
-    unreadable = sum(table.unreadable for table in group)
+        columns[path] = _joined(parts, -1 if path in texts else 0)[order]
     first = group[0]
     return TopicTable(first.topic, first.message_type, times[order], columns, texts, unreadable, first.definition_source)
 
 
-def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """Concatenate parts; those with fewer columns are padded with NaN or 0."""
-    if parts[0].ndim == 2:
+def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
+    """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
+    if parts[0].ndim == 2:  # noqa: PLR2004 - rows and elements
         width = max(part.shape[1] for part in parts)
-        lacking = np.nan if parts[0].dtype.kind == "f" else 0
+        lacking = np.nan if parts[0].dtype.kind == "f" else lacking
         parts = [
             part if part.shape[1] == width else np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
             for part in parts

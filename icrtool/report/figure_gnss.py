@@ -2,59 +2,71 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
-from matplotlib.figure import Figure
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.report.decimate import extremes
-from icrtool.report.figure_style import BAD_FIX_COLOR, MEAN, inches, new_figure, shade_spans
-from icrtool.report.words import position_word, run_title
-from icrtool.tables import Bools, Floats
+from icrtool.report.figure_style import BAD_FIX_COLOR, BAR_COLOR, MEAN, inches, new_figure, shade_spans
+from icrtool.report.words import length_text, position_word, run_title
+from icrtool.tables import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH_IN, HEIGHT_IN = 7.2, 3.9
 
-LINE_COLOR = "#5b8db8"
 TYPICAL_PERCENT = 99.5
 HEADROOM = 1.6
 """The y range ends at this many times the 99.5 % difference: a few outliers do not flatten the rest."""
-LEAST_RANGE_M = 0.01
+LEAST_RANGE_M = 0.001
+BREAK_PERCENT = 1.0
+BREAK_IN_INTERVALS = 5.0
+"""No line is drawn over a stretch without used fixes that is this long, and this many times the usual interval."""
 MARKS = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
 def draw_gnss_difference(run: FilterRun) -> Figure:
     """Draw the distance between filter and fixes over percent of the mission, rejected fixes apart."""
-    word = position_word(run)
     facts = run.summary["gnss"]
-    figure = new_figure(
-        run_title(run), f"Distance between filter and {word} fixes", width_in=WIDTH_IN, height_in=HEIGHT_IN
-    )
+    subtitle = f"Distance between filter and {position_word(run)}"
+    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.55, bottom=0.85))
+    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=0.9))
     duration = float(run.table.t_s[-1])
     percent, difference, code = 100 * run.gnss.t_s / duration, run.gnss.difference, run.gnss.code
     used, gated = (code > UNSEEN) & (code != GATED), code == GATED
     top = _top(difference[used])
-    shade_spans(axes, 100 * (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / duration, label="no usable GNSS")
     if used.any():
-        x, y = _with_breaks(run, percent, difference, used)
+        x, y = _with_breaks(percent[used], difference[used])
         shown = extremes(y)
-        axes.plot(x[shown], y[shown], color=LINE_COLOR, linewidth=0.7, label="used fixes")
-        axes.axhline(facts["mean_difference_m"], label=f"mean {_length(facts['mean_difference_m'])}", **MEAN.keywords())
+        mean, most = (length_text(facts[name]) for name in ("mean_difference_m", "max_difference_m"))
+        axes.plot(x[shown], y[shown], color=BAR_COLOR, linewidth=0.7, label=f"used, max {most}")
+        axes.axhline(facts["mean_difference_m"], label=f"mean {mean}", **MEAN.keywords())
     if gated.any():
-        x, y = percent[gated], difference[gated]
-        shown = extremes(y, points=MARKS)
-        axes.plot(
-            x[shown], np.minimum(y[shown], 0.985 * top), linestyle="none", marker="x", markersize=4.5, color=BAD_FIX_COLOR,
-            label=f"rejected fixes ({int(gated.sum())}; at the top: beyond)", clip_on=False,
-        )  # fmt: skip
+        _draw_rejected(axes, percent[gated], difference[gated], top)
+    shade_spans(axes, 100 * (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / duration, label="no usable GNSS")
     axes.set_xlim(0, 100)
     axes.set_ylim(0, top)
     axes.set_xlabel("Mission time [%]")
     axes.set_ylabel("Difference [m]")
-    figure.legend(loc="lower center", ncols=4, columnspacing=2.0)
+    figure.legend(loc="lower center", ncols=5, columnspacing=1.6, handlelength=2.0)
     return figure
+
+
+def _draw_rejected(axes: Axes, percent: Floats, difference: Floats, top: float) -> None:
+    """Mark rejected fixes where they are, and those above the picture at its upper edge."""
+    look: dict[str, Any] = {"linestyle": "none", "color": BAD_FIX_COLOR, "markersize": 4.5, "clip_on": False}
+    beyond = difference > top
+    for rows, marker, where in ((~beyond, "x", ""), (beyond, "^", ", above")):
+        x, y = percent[rows], np.minimum(difference[rows], top)
+        if len(x):
+            shown = extremes(difference[rows], points=MARKS)
+            axes.plot(x[shown], y[shown], marker=marker, label=f"{len(x)} rejected{where}", **look)
 
 
 def _top(difference: Floats) -> float:
@@ -62,15 +74,14 @@ def _top(difference: Floats) -> float:
     if not len(difference):
         return 1.0
     typical = HEADROOM * float(np.percentile(difference, TYPICAL_PERCENT))
-    return max(min(typical, 1.05 * float(difference.max())), LEAST_RANGE_M)
+    return max(min(typical, 1.1 * float(difference.max())), LEAST_RANGE_M)
 
 
-def _with_breaks(run: FilterRun, percent: Floats, difference: Floats, used: Bools) -> tuple[Floats, Floats]:
-    """Return the used fixes with a NaN at the begin of every outage, so that no line crosses it."""
-    x, y = percent[used], difference[used]
-    begins = np.searchsorted(run.gnss.stamp_ns[used], run.outages_ns[:, 0], side="right")
-    return np.insert(x, begins, np.nan), np.insert(y, begins, np.nan)
-
-
-def _length(metres: float) -> str:
-    return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
+def _with_breaks(percent: Floats, difference: Floats) -> tuple[Floats, Floats]:
+    """Return the points with a NaN in every stretch without fixes, so that no line crosses it."""
+    if len(percent) < 2:
+        return percent, difference
+    interval = np.diff(percent)
+    long = interval > max(BREAK_PERCENT, BREAK_IN_INTERVALS * float(np.median(interval)))
+    after = np.flatnonzero(long) + 1
+    return np.insert(percent, after, np.nan), np.insert(difference, after, np.nan)

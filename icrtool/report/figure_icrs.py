@@ -2,63 +2,81 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.summary import ICR_COLUMNS
-from icrtool.report.decimate import LINE_POINTS, extremes
-from icrtool.report.figure_style import HALF_WIDTH, MEAN, OUTAGE_COLOR, TimeAxis, inches, new_figure, shade_spans
-from icrtool.report.words import run_title
+from icrtool.report.decimate import extremes
+from icrtool.report.figure_style import (
+    BAND_COLOR,
+    BAR_COLOR,
+    HALF_WIDTH,
+    MEAN,
+    OUTAGE_COLOR,
+    TimeAxis,
+    inches,
+    new_figure,
+    shade_spans,
+)
+from icrtool.report.words import run_title, signed
 from icrtool.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH_IN = 7.2
 
-LINE_COLOR, BAND_COLOR = "black", "#a6c4e0"
-BAR_COLOR = "#5b8db8"
+LINE_COLOR = "black"
+NAMES = {
+    "y_icr_right_m": r"$y_{\mathrm{ICR,r}}$",
+    "y_icr_left_m": r"$y_{\mathrm{ICR,l}}$",
+    "x_icr_m": r"$x_{\mathrm{ICR}}$",
+}
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
-NAMES = {"y_icr_right_m": "$y_{ICR,r}$", "y_icr_left_m": "$y_{ICR,l}$", "x_icr_m": "$x_{ICR}$"}
 
-LEAST_HALF_RANGE_M = 0.05
-CALM_PERCENT = 98.0
-"""The y range holds the band of all but the widest 2 % of the states: the first seconds do not flatten the rest."""
+RANGE_PERCENT = (0.2, 99.8)
+BAND_RANGE_PERCENT = (2.0, 98.0)
+CLUSTER_RANGE_PERCENT = (0.5, 99.5)
+"""A range passes over the extremes of so little of the time: one spike does not flatten the rest."""
+LEAST_HALF_RANGE_M = 0.02
 
-LONG_RUN = 4.0
+LONG_RUN = 2.5
 """A run this many times longer than its learning gets a panel of its own for the learning."""
-LEARNING_MARGIN = 1.6
-LEAST_LEARNING_S = 20.0
+LEARNING_MARGIN = 0.6
+LEAST_MARGIN_S = 10.0
+
+BINS = 30
 
 
 def draw_icr_estimates(run: FilterRun) -> Figure:
-    """Draw the three ICR estimates over time with ±2σ, their 10-90 % rise, b/2 where known, and GNSS outages."""
-    figure = new_figure(run_title(run), "ICR estimates", width_in=WIDTH_IN, height_in=5.6)
-    learning = _learning_s(run)
-    duration = float(run.table.t_s[-1])
-    two = duration > LONG_RUN * learning
-    panels = figure.subplots(3, 2 if two else 1, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [1, 2] if two else [1]})
-    margins = inches(figure, left=0.75, right=0.2, top=0.55, bottom=0.95)
-    figure.subplots_adjust(**margins, wspace=0.06, hspace=0.28)
-    spans = [(0.0, learning), (0.0, duration)] if two else [(0.0, duration)]
+    """Draw the three ICR estimates over time with ±2σ, their 10-90 % rise, b/2 where known, and GNSS outages.
+
+    A long run has two columns, each with its own scale: the learning, and what follows.
+    """
+    spans = _spans_s(run)
+    subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
+    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=5.8)
+    panels = figure.subplots(
+        3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
+    )
+    margins = inches(figure, left=0.75, right=0.2, top=0.8, bottom=0.9)
+    figure.subplots_adjust(**margins, wspace=0.22, hspace=0.3)
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
-        low, high = _y_range(run, column)
-        for axes, (begin, end) in zip(row, spans, strict=True):
-            _draw_estimate(axes, run, column, begin, end)
-            axes.set_ylim(low, high)
+        for axes, span in zip(row, spans, strict=True):
+            _draw_estimate(axes, run, column, span, first=axes is row[0])
         row[0].set_ylabel(f"{NAMES[column]} [m]")
-        row[0].set_title(_rise_text(run, column), loc="left", pad=3.0)
-        for axes in row[1:]:
-            axes.tick_params(labelleft=False)
-    for axes, (_, end) in zip(panels[-1], spans, strict=True):
-        axes.set_xlabel(f"Time [{TimeAxis.for_span(end).unit}]")
-    figure.legend(handles=_estimate_keys(run), loc="lower center", ncols=5, columnspacing=1.8)
+        row[0].set_title(_rise_text(run, column), loc="left", pad=4.0)
+        row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
+    for axes, (begin, end) in zip(panels[-1], spans, strict=True):
+        axes.set_xlabel(f"Time [{TimeAxis.for_span(end - begin).unit}]")
+    keys = _estimate_keys(run)
+    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.4, handlelength=2.0)
     return figure
 
 
@@ -66,76 +84,98 @@ def draw_icr_clusters(run: FilterRun) -> Figure:
     """Draw how much of the time each ICR estimate had which value, after convergence."""
     settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
     after = run.table.t_s >= settled
-    figure = new_figure(
-        run_title(run), f"Clustering of the ICR estimates from {settled:.1f} s on", width_in=WIDTH_IN, height_in=3.6
-    )
+    subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
+    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=3.9)
     panels = figure.subplots(1, 3, sharey=True)
-    figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=0.75, bottom=0.85), wspace=0.12)
+    figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
-    for axes, column in zip(panels, ("y_icr_left_m", "x_icr_m", "y_icr_right_m"), strict=True):
-        _draw_histogram(axes, run, column, getattr(run.table, column)[after], weight)
+    columns = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
+    values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
+    spans = [float(np.ptp(np.percentile(value, CLUSTER_RANGE_PERCENT))) for value in values]
+    span = max(*spans, 2 * LEAST_HALF_RANGE_M)
+    for axes, column, value in zip(panels, columns, values, strict=True):
+        _draw_histogram(axes, run, column, value, weight, span)
     panels[0].set_ylabel("Time [%]")
-    keys = [Line2D([], [], label="mean", **MEAN.keywords())]
+    keys = [
+        Patch(color=BAR_COLOR, linewidth=0, label=f"estimates, bins of {_bin_width(span):g} m"),
+        Line2D([], [], label="mean", **MEAN.keywords()),
+    ]
     if run.config.robot.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
-    figure.legend(handles=keys, loc="lower center", ncols=2, columnspacing=3.0)
+    figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
     return figure
 
 
-def _learning_s(run: FilterRun) -> float:
-    """Return how much of the begin shows the rise of all three estimates [s]."""
-    last = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
-    return max(LEARNING_MARGIN * last, LEAST_LEARNING_S)
+def _spans_s(run: FilterRun) -> list[tuple[float, float]]:
+    """Return begin and end [s] of the panels: the rise of all three estimates and what follows, or all in one."""
+    duration = float(run.table.t_s[-1])
+    rises = [rise for rise in run.convergence.values() if rise is not None]
+    first, last = min((rise[0] for rise in rises), default=0.0), max((rise[1] for rise in rises), default=0.0)
+    margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
+    begin, end = max(first - margin, 0.0), last + margin
+    return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
 
 
-def _draw_estimate(axes: Axes, run: FilterRun, column: str, begin_s: float, end_s: float) -> None:
-    table, time = run.table, TimeAxis.for_span(end_s - begin_s)
-    rows = slice(int(np.searchsorted(table.t_s, begin_s)), int(np.searchsorted(table.t_s, end_s, side="right")))
-    t, value = table.t_s[rows] / time.seconds, getattr(table, column)[rows]
+def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float, float], *, first: bool) -> None:
+    """Draw one estimate over a span; the `first` panel also has b/2 and the rise."""
+    table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
+    rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
+    t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
     band = 2 * getattr(table, f"std_{column}")[rows]
-    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / time.seconds)
     low, high = value - band, value + band
-    shown = extremes(low, high, points=LINE_POINTS)
+    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit)
+    shown = extremes(low, high)
     axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
     shown = extremes(value)
     axes.plot(t[shown], value[shown], color=LINE_COLOR, linewidth=1.0)
+    spread = [*np.percentile(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
+    if first:
+        # Here the band is as wide as the prior: it is shown as far as the estimates go.
+        spread += _draw_rise(axes, run, column, unit)
+    else:
+        spread += [np.percentile(low, BAND_RANGE_PERCENT[0]), np.percentile(high, BAND_RANGE_PERCENT[1])]
+    middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
+    axes.set_xlim(span_s[0] / unit, span_s[1] / unit)
+    axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+    axes.locator_params(axis="y", nbins=5)
+
+
+def _draw_rise(axes: Axes, run: FilterRun, column: str, unit_s: float) -> list[float]:
+    """Draw b/2 and the begin and end of the rise; return where they are [m]."""
+    heights: list[float] = []
     if (width := run.config.robot.track_width_m) is not None:
-        axes.axhline(SIDES[column] * width / 2, **HALF_WIDTH.keywords())
+        heights.append(SIDES[column] * width / 2)
+        axes.axhline(heights[0], **HALF_WIDTH.keywords())
     if (rise := run.convergence[column]) is not None:
-        at = [int(np.searchsorted(table.t_s, second)) for second in rise]
-        marks = {"linestyle": "none", "color": "black", "markersize": 5.5, "zorder": 4}
-        axes.plot(table.t_s[at[:1]] / time.seconds, getattr(table, column)[at[:1]], marker="o", markerfacecolor="white", **marks)
-        axes.plot(table.t_s[at[1:]] / time.seconds, getattr(table, column)[at[1:]], marker="o", **marks)
-    axes.set_xlim(begin_s / time.seconds, end_s / time.seconds)
+        for second, face in zip(rise, ("white", "black"), strict=True):
+            height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
+            axes.plot([second / unit_s], [height], markerfacecolor=face, **_mark())
+            heights.append(height)
+    return heights
 
 
-def _y_range(run: FilterRun, column: str) -> tuple[float, float]:
-    """Return the y limits [m]: every estimate, the band where it is not at its widest, and b/2."""
-    value: Floats = getattr(run.table, column)
-    band: Floats = 2 * getattr(run.table, f"std_{column}")
-    calm = band <= np.percentile(band, CALM_PERCENT)
-    low, high = min(value.min(), (value - band)[calm].min()), max(value.max(), (value + band)[calm].max())
-    if (width := run.config.robot.track_width_m) is not None:
-        low, high = min(low, SIDES[column] * width / 2), max(high, SIDES[column] * width / 2)
-    middle, half = (low + high) / 2, max((high - low) / 2, LEAST_HALF_RANGE_M)
-    return float(middle - 1.08 * half), float(middle + 1.08 * half)
+def _mark() -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
 def _rise_text(run: FilterRun, column: str) -> str:
-    icr, rise = run.summary["icr"], run.convergence[column]
-    final = f"final {icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f} m"
-    return f"{final},  10–90 % in {rise[1] - rise[0]:.1f} s" if rise is not None else f"{final},  hardly moved from its start"
+    rise = run.convergence[column]
+    return f"10–90 % in {rise[1] - rise[0]:.1f} s" if rise is not None else "hardly moved from its start"
+
+
+def _final_text(run: FilterRun, column: str) -> str:
+    icr = run.summary["icr"]
+    return f"final {signed(icr['final'][column])} ± {icr['final_std'][column]:.3f} m"
 
 
 def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
-    mark = {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5}
     keys: list[Line2D | Patch] = [
         Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
         Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
     ]
     if any(rise is not None for rise in run.convergence.values()):
-        keys.append(Line2D([], [], markerfacecolor="white", label="10 % of the way", **mark))
-        keys.append(Line2D([], [], label="90 %", **mark))
+        keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
+        keys.append(Line2D([], [], label="90 % of the way", **_mark()))
     if run.config.robot.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     if len(run.outages_ns):
@@ -143,22 +183,29 @@ def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
     return keys
 
 
-def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weight: Floats) -> None:
+def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weight: Floats, span_m: float) -> None:
+    """Draw percent of time over value, and show `span_m` of it."""
+    middle = float(np.percentile(value, CLUSTER_RANGE_PERCENT).mean())
+    low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
+    width = _bin_width(span_m)
+    edges = width * np.arange(np.floor(low / width), np.ceil(high / width) + 1)
+    share, _ = np.histogram(value, bins=edges, weights=weight)
+    axes.stairs(100 * share / max(weight.sum(), 1e-9), edges, fill=True, color=BAR_COLOR)
+    axes.set_xlim(low, high)
     mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
-    width = _bin_width(std)
-    first = np.floor(value.min() / width) * width
-    edges = first + width * np.arange(int((value.max() - first) / width) + 2)
-    axes.hist(value, bins=edges.tolist(), weights=100 * weight / weight.sum(), color=BAR_COLOR, edgecolor="white", linewidth=0.4)
     axes.axvline(mean, **MEAN.keywords())
+    title = f"{signed(mean)} ± {std:.3f} m"
     if (track := run.config.robot.track_width_m) is not None:
         axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
-    axes.set_title(f"{mean:+.3f} ± {std:.3f} m", pad=3.0)
+        title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"
+    axes.set_title(title, pad=4.0)
     axes.set_xlabel(f"{NAMES[column]} [m]")
+    axes.locator_params(axis="x", nbins=4, min_n_ticks=3)
     axes.grid(visible=False, axis="x")
 
 
-def _bin_width(std: float) -> float:
-    """Return a round bin width [m], a third to a half of the standard deviation."""
-    target = max(std / 2.5, 1e-3)
+def _bin_width(span_m: float) -> float:
+    """Return the round width of about `BINS` bins over a span [m]."""
+    target = span_m / BINS
     decade = 10.0 ** np.floor(np.log10(target))
-    return float(decade * max(step for step in (1.0, 2.0, 5.0) if step * decade <= target * (1 + 1e-9)))
+    return float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.report.figure_gnss import draw_gnss_difference
 from icrtool.report.figure_icrs import draw_icr_clusters, draw_icr_estimates
 from icrtool.report.figure_style import save, style
 from icrtool.report.figure_trajectory import draw_trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FIGURES: dict[str, Callable[[FilterRun], Figure]] = {
     "trajectory": draw_trajectory,

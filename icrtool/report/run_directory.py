@@ -20,7 +20,7 @@ from icrtool.tables import Bools, Ints, States
 
 RUN_FILE = "run.json"
 CHECKSUM_FILE = "SHA256SUMS"
-"""Sums of run.json and the states, in the form ``sha256sum -c`` reads: an edited run is not taken for a measured one."""
+"""Sums of run.json and the states, as ``sha256sum -c`` reads them: an edited run is not taken for a measured one."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
 
@@ -52,7 +52,7 @@ class StoredRun:
     directory: Path
 
 
-def check_run_place(directory: Path) -> None:
+def check_target(directory: Path) -> None:
     """Refuse a place where a run directory cannot be put, before any work is done for it.
 
     Raises

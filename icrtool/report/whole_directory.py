@@ -34,7 +34,9 @@ def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
         elif not directory.is_dir():
             raise OutputError(directory, "a file is there", f"name another place for the {kind}")
         elif not ours(directory) and any(directory.iterdir()):
-            raise OutputError(directory, f"holds something that is not a {kind}", "it is left alone; name another place")
+            raise OutputError(
+                directory, f"holds something that is not a {kind}", "it is left alone; name another place"
+            )
     except OSError as err:
         raise OutputError(directory, "cannot be written", err.strerror or str(err)) from err
 

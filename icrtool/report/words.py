@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from icrtool.analysis.fit import FilterRun
 
-ICR_WORDS = {"y_icr_right_m": "right y", "y_icr_left_m": "left y", "x_icr_m": "x"}
-
 
 def run_title(run: FilterRun) -> str:
     """Return the log's name, and the robot's where it has one."""
@@ -15,7 +13,19 @@ def run_title(run: FilterRun) -> str:
 
 def position_word(run: FilterRun) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
-    return "GNSS" if run.log.datum is not None else "position reference"
+    return "GNSS fixes" if run.log.datum is not None else "position reference"
+
+
+def signed(metres: float) -> str:
+    """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
+    return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
+
+
+def length_text(metres: float) -> str:
+    """Return a distance as ``3.4 mm``, ``1.2 cm`` or ``3.45 m``."""
+    if metres < 0.01:
+        return f"{1000 * metres:.1f} mm"
+    return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
 def duration_text(seconds: float) -> str:

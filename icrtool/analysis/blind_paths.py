@@ -1,0 +1,106 @@
+"""Single blind drives worth a picture: the worst ones, a cornering and a straight one (Pentzer 2014, Figs. 33-34)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icrtool.analysis.dropout import DrivenRun, Model, drive_of, models_of
+from icrtool.core.open_loop import Drive, OpenLoopPath, open_loop_path, trial_ends
+from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.tables import Floats, Ints
+
+WORST_COUNT = 10
+WORST_HORIZON_M = 10.0
+EXAMPLE_HORIZON_M = 15.0
+PICTURED = ("icr", "no_slip")
+
+
+@dataclass(frozen=True, slots=True)
+class BlindDrive:
+    """One trial: from state `start` to state `end`, the reference's path and each model's.
+
+    Attributes
+    ----------
+    reference_north_m, reference_east_m : (m,)
+    paths : by model name
+    errors_m : by model name, at the end
+    """
+
+    start: int
+    end: int
+    stamp_ns: int
+    t_s: float
+    north_m: float
+    east_m: float
+    horizon_m: float
+    heading_change_rad: float
+    speed_mean_mps: float
+    reference_north_m: Floats
+    reference_east_m: Floats
+    paths: dict[str, OpenLoopPath]
+    errors_m: dict[str, float]
+
+
+def worst_drives(run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT) -> tuple[BlindDrive, ...]:
+    """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
+    drive, models = drive_of(run), models_of(run)
+    ends = trial_ends(drive, np.array([horizon_m]))
+    errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
+    ends = ends[:, 0]
+    chosen: list[int] = []
+    taken = np.zeros(len(errors), np.bool_)
+    for start in np.argsort(-np.nan_to_num(errors, nan=-1.0), kind="stable"):
+        if np.isnan(errors[start]) or len(chosen) == count:
+            break
+        if not (taken[start] or taken[ends[start]]):
+            chosen.append(int(start))
+            taken[start : ends[start] + 1] = True
+    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[BlindDrive, ...]:
+    """Return the trial with the most and the one with the least turning, none when no trial is that long."""
+    drive, models = drive_of(run), models_of(run)
+    ends: Ints = trial_ends(drive, np.array([horizon_m]))[:, 0]
+    starts = np.flatnonzero(ends >= 0)
+    # A parked start repeats the same way many times: the first state of each stands for it.
+    moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]  # noqa: FBT003
+    if not len(moving):
+        return ()
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])
+    turning = turned[ends[moving]] - turned[moving]
+    change = np.abs(drive.heading[ends[moving]] - drive.heading[moving])
+    chosen = (int(moving[np.argmax(change)]), int(moving[np.argmin(turning)]))
+    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def _blind_drive(
+    run: DrivenRun, drive: Drive, models: tuple[Model, ...], start: int, end: int, horizon_m: float
+) -> BlindDrive:
+    paths, errors = {}, {}
+    for model in models:
+        if model.name not in PICTURED:
+            continue
+        right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
+        path = open_loop_path(drive, right, left, x, start, end)
+        paths[model.name] = path
+        errors[model.name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
+    table = run.table
+    duration = float(table.t_s[end] - table.t_s[start])
+    return BlindDrive(
+        start=start,
+        end=end,
+        stamp_ns=int(table.stamp_ns[start]),
+        t_s=float(table.t_s[start]),
+        north_m=float(table.north_m[start]),
+        east_m=float(table.east_m[start]),
+        horizon_m=horizon_m,
+        heading_change_rad=float(table.heading_rad[end] - table.heading_rad[start]),
+        speed_mean_mps=float(table.distance_m[end] - table.distance_m[start]) / duration if duration > 0 else 0.0,
+        reference_north_m=table.north_m[start : end + 1],
+        reference_east_m=table.east_m[start : end + 1],
+        paths=paths,
+        errors_m=errors,
+    )

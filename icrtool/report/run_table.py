@@ -1,0 +1,132 @@
+"""A run as text: the few lines a field engineer reads first."""
+
+from __future__ import annotations
+
+import math
+
+from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
+from icrtool.report.words import duration_text, length_text, position_word, run_title
+
+WIDTH = 100
+LABEL = 12
+"""Columns of the left margin: what a line is about."""
+
+ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+
+Row = tuple[str, ...]
+
+
+def format_run(run: FilterRun) -> str:
+    """Return the table of a run: streams, drive, ICRs, position, heading; at most 100 columns wide, no line end.
+
+    Warnings are not in it: they belong to stderr.
+    """
+    lines = [
+        run_title(run),
+        "",
+        *_stream_lines(run),
+        "",
+        *_drive_lines(run),
+        "",
+        *_icr_lines(run),
+        *_multiplier_lines(run),
+        "",
+        *_position_lines(run),
+        *_heading_lines(run),
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _stream_lines(run: FilterRun) -> list[str]:
+    rows: list[Row] = [("stream", "topic", "type", "rate", "samples", "clock")]
+    for stream in run.log.streams:
+        kind = stream.message_type.replace("/msg/", "/")
+        rows.append((stream.role, stream.topic, kind, f"{stream.rate_hz:.1f} Hz", f"{stream.count:,}", stream.clock))
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
+    widths[0] = LABEL - 2
+    # Long names give way: the topic keeps its end, the type its begin.
+    room = WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
+    widths[1] = min(widths[1], max(room - widths[2], room // 2))
+    widths[2] = min(widths[2], room - widths[1])
+    return [
+        f"{row[0]:<{widths[0]}}  {_tail(row[1], widths[1]):<{widths[1]}}  {_head(row[2], widths[2]):<{widths[2]}}  "
+        f"{row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}  {row[5]}"
+        for row in rows
+    ]
+
+
+def _drive_lines(run: FilterRun) -> list[str]:
+    drive = run.summary["drive"]
+    speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s"
+    return [
+        _line("drive", f"{drive['distance_m']:.1f} m in {duration_text(drive['duration_s'])}, {speed} (mean ± std)")
+    ]
+
+
+def _icr_lines(run: FilterRun) -> list[str]:
+    icr = run.summary["icr"]
+    rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise")]
+    for column in ICR_COLUMNS:
+        rise = icr["convergence_s"][column]
+        rows.append(
+            (
+                ICR_LABELS[column],
+                f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}",
+                f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}",
+                f"{rise:.1f} s" if rise is not None else "hardly moved",
+            )
+        )
+    return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]}" for row in rows]
+
+
+def _multiplier_lines(run: FilterRun) -> list[str]:
+    width = run.config.robot.track_width_m
+    if width is None:
+        return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
+    multiplier = separation_multiplier(run.table, width)
+    return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m")]
+
+
+def _position_lines(run: FilterRun) -> list[str]:
+    gnss = run.summary["gnss"]
+    word = position_word(run)
+    lines = []
+    if gnss["mean_difference_m"] is not None:
+        mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
+        lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}"))
+    reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
+    why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
+    lines.append(
+        _line(
+            "fixes" if lines else "position",
+            f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
+        )
+    )
+    if gnss["recoveries"]:
+        lines.append(_line("", f"believed again after rejection: {gnss['recoveries']:,} times"))
+    if outages := len(run.outages_ns):
+        away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
+        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}, {away} in all"))
+    return lines
+
+
+def _heading_lines(run: FilterRun) -> list[str]:
+    check = run.heading_check
+    if not math.isfinite(check.offset_rad):
+        return [_line("heading", "could not be compared with the course: too little straight driving")]
+    offset = f"{math.degrees(check.offset_rad):+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
+    applied = math.degrees(check.applied_offset_rad)
+    return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label:<{LABEL}}{text}"
+
+
+def _tail(text: str, width: int) -> str:
+    return text if len(text) <= width else "..." + text[len(text) - width + 3 :]
+
+
+def _head(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: width - 3] + "..."
