@@ -19,7 +19,7 @@ Tables
     ``DropoutReport``: open-loop errors over distance, from every recorded state.
 Source of the method
     Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of
-    Track Instantaneous Centers of Rotation", J. Field Robotics 31(3), 2014. Equation numbers in the code are this paper's.
+    Track Instantaneous Centers of Rotation", J. Field Robotics 31(3), 2014. Equation numbers in the code are its.
 """
 
 from __future__ import annotations

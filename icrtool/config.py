@@ -80,7 +80,9 @@ class FilterConfig(_Section):
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
     `heading_std_deg` those of R (Eq. 31), used where the messages do not say. `process_position_mps` is 0.2 (Eq. 30);
-    ``auto`` raises it, in preset ``field``, when the fixes contradict wheels this good.
+    in preset ``field``, ``auto`` starts at 0.3 and raises it when the fixes contradict wheels this good.
+    `process_heading_degps` is 5 (Eq. 30), in preset ``field`` 7.
+    `heading_correlation_s` is how long an AHRS errs alike: closer samples are not independent (``field`` only).
     """
 
     preset: Literal["field", "paper"] = "field"
@@ -89,12 +91,13 @@ class FilterConfig(_Section):
     initial_x_icr_m: Finite | None = None
     initial_icr_std_m: Positive | None = None
     process_position_mps: Literal["auto"] | NotNegative = "auto"
-    process_heading_degps: NotNegative = 5.0
+    process_heading_degps: NotNegative | None = None
     process_icr_mps: NotNegative = 0.01
     gnss_std_m: Positive = 0.01
     gnss_std_floor_m: Positive = 0.01
     heading_std_deg: Positive = 1.0
     heading_std_floor_deg: Positive = 0.5
+    heading_correlation_s: NotNegative = 0.5
     gate_probability: Probability = 0.9999
     wheel_gap_s: Positive = 0.5
 
@@ -134,9 +137,7 @@ def builtin_robots() -> dict[str, dict[str, Any]]:
     return tomllib.loads(resources.files("icrtool").joinpath("robots.toml").read_text(encoding="utf-8"))
 
 
-def load_config(
-    path: str | Path | None = None, robot: str | None = None, sets: Iterable[str] = ()
-) -> Config:
+def load_config(path: str | Path | None = None, robot: str | None = None, sets: Iterable[str] = ()) -> Config:
     """Load a configuration: built-in robot < TOML file < `sets`.
 
     Parameters
@@ -172,7 +173,11 @@ def load_config(
 def _builtin_robot(name: str) -> dict[str, Any]:
     robots = builtin_robots()
     if name not in robots:
-        raise ConfigError(f"robot {name!r}", "not a built-in robot", f"one of {', '.join(robots)}, or --set robot.track_width_m=… robot.wheel_radius_m=…")
+        raise ConfigError(
+            f"robot {name!r}",
+            "not a built-in robot",
+            f"one of {', '.join(robots)}, or --set robot.track_width_m=… robot.wheel_radius_m=…",
+        )
     return {"name": name, **{key: value for key, value in robots[name].items() if key != "source"}}
 
 
@@ -189,7 +194,9 @@ def _parse_set(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     section, dot, name = key.strip().partition(".")
     if not (equals and dot and section and name):
-        raise ConfigError(f"--set {text}", "not of the form section.key=value", "for example --set topics.gnss=/gps/fix")
+        raise ConfigError(
+            f"--set {text}", "not of the form section.key=value", "for example --set topics.gnss=/gps/fix"
+        )
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
@@ -213,6 +220,6 @@ def _known_keys(location: list[str]) -> str:
     sections = Config.model_fields
     if len(location) > 1 and location[0] in sections:
         model = sections[location[0]].annotation
-        assert model is not None
-        return f"[{location[0]}] knows {', '.join(model.model_fields)}"
+        fields = model.model_fields if model is not None else {}
+        return f"[{location[0]}] knows {', '.join(fields)}"
     return f"the sections are {', '.join(sections)}"

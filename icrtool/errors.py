@@ -5,7 +5,7 @@ The line reads ``<what>: <what is wrong>; <what was found, or what to do>``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 
@@ -32,13 +32,15 @@ class DefinitionError(LogError):
 
 
 class MissingStreamError(LogError):
-    """A log without one of wheels, position or heading."""
+    """A log without wheels, position or heading; `needs` says, by what is missing, what could have been it."""
 
-    def __init__(self, log: Path | str, role: str, needs: str, holds: Sequence[str]) -> None:
-        self.role = role
+    def __init__(self, log: Path | str, needs: Mapping[str, str], holds: Sequence[str]) -> None:
+        self.roles = tuple(needs)
         self.holds = tuple(holds)
-        found = ", ".join(self.holds) if self.holds else "no topic at all"
-        super().__init__(log, f"no {role} found", f"needs {needs}; the log holds {found}")
+        *others, last = (f"no {role}" for role in needs)
+        missing = f"{', '.join(others)} and {last}" if others else last
+        wanted = "; ".join(f"needs {need}" if len(needs) == 1 else f"{role}: {need}" for role, need in needs.items())
+        super().__init__(log, f"{missing} found", f"{wanted}; the log holds {', '.join(self.holds)}")
 
 
 class DataError(IcrToolError):

@@ -1,4 +1,4 @@
-"""The typed tables that cross rooms: what was measured, in the charter's frame and units, and what the filter made of it."""
+"""The typed tables that cross rooms: what was measured, and what the filter made of it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ Bools = NDArray[np.bool_]
 Role = Literal["wheels", "gnss", "heading"]
 
 
-def _check_columns(table: object, *columns: str) -> None:
-    length = len(getattr(table, "stamp_ns"))
-    for column in columns:
-        found = len(getattr(table, column))
-        if found != length:
-            raise ValueError(f"{type(table).__name__}.{column} has {found} rows, stamp_ns has {length}")
+def _check_lengths(stamp_ns: Ints, *columns: Floats) -> None:
+    lengths = [len(column) for column in columns]
+    if any(length != len(stamp_ns) for length in lengths):
+        raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class WheelSamples:
     v_right_mps: Floats
 
     def __post_init__(self) -> None:
-        _check_columns(self, "v_left_mps", "v_right_mps")
+        _check_lengths(self.stamp_ns, self.v_left_mps, self.v_right_mps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,9 @@ class PositionFixes:
     cov_north_east_m2: Floats
 
     def __post_init__(self) -> None:
-        _check_columns(self, "north_m", "east_m", "var_north_m2", "var_east_m2", "cov_north_east_m2")
+        _check_lengths(
+            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class HeadingSamples:
     var_rad2: Floats
 
     def __post_init__(self) -> None:
-        _check_columns(self, "heading_rad", "var_rad2")
+        _check_lengths(self.stamp_ns, self.heading_rad, self.var_rad2)
 
 
 @dataclass(frozen=True, slots=True)

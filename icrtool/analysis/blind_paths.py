@@ -1,4 +1,4 @@
-"""Single blind drives worth a picture: the worst ones, a cornering and a straight one (Pentzer 2014, Figs. 33-34)."""
+"""Single blind drives worth a picture: the worst, a typical cornering, a typical straight one (Figs. 33-34)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from icrtool.analysis.dropout import DrivenRun, Model, drive_of, models_of
 from icrtool.core.open_loop import Drive, OpenLoopPath, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.tables import Floats, Ints
+from icrtool.tables import Floats
 
 WORST_COUNT = 10
 WORST_HORIZON_M = 10.0
 EXAMPLE_HORIZON_M = 15.0
+ALIKE_RAD = np.radians(10.0)
+STRAIGHT_SHARE = 0.05
 PICTURED = ("icr", "no_slip")
 
 
@@ -43,7 +45,9 @@ class BlindDrive:
     errors_m: dict[str, float]
 
 
-def worst_drives(run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT) -> tuple[BlindDrive, ...]:
+def worst_drives(
+    run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT
+) -> tuple[BlindDrive, ...]:
     """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
@@ -61,18 +65,27 @@ def worst_drives(run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int 
 
 
 def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[BlindDrive, ...]:
-    """Return the trial with the most and the one with the least turning, none when no trial is that long."""
+    """Return a typical cornering trial and a typical straight one, none when no trial is that long.
+
+    Notes
+    -----
+    Cornering: the heading changes by about half a turn, or as nearly so as the drive has it. Straight: of the
+    twentieth part of the trials that turns least. Typical: of those, the one with the median error of the momentary
+    ICRs.
+    """
     drive, models = drive_of(run), models_of(run)
-    ends: Ints = trial_ends(drive, np.array([horizon_m]))[:, 0]
+    ends = trial_ends(drive, np.array([horizon_m]))
+    errors, ends = open_loop_errors(drive, models[0].icrs, ends)[:, 0], ends[:, 0]
     starts = np.flatnonzero(ends >= 0)
-    # A parked start repeats the same way many times: the first state of each stands for it.
-    moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]  # noqa: FBT003
+    # A parked start repeats the same way many times: the last state of each stop stands for it.
+    moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]
     if not len(moving):
         return ()
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])
     turning = turned[ends[moving]] - turned[moving]
-    change = np.abs(drive.heading[ends[moving]] - drive.heading[moving])
-    chosen = (int(moving[np.argmax(change)]), int(moving[np.argmin(turning)]))
+    off = np.abs(np.abs(drive.heading[ends[moving]] - drive.heading[moving]) - np.pi)
+    groups = (moving[off <= off.min() + ALIKE_RAD], moving[turning <= np.quantile(turning, STRAIGHT_SHARE)])
+    chosen = (int(group[np.argsort(errors[group], kind="stable")[len(group) // 2]]) for group in groups)
     return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 

@@ -2,27 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, trial_ends
+from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.statistics import Histogram, Intervals, Summary, bootstrap_intervals, histogram, round_bin_width, summarise
-from icrtool.errors import DataError
+from icrtool.core.statistics import (
+    Histogram,
+    Intervals,
+    Summary,
+    bootstrap_intervals,
+    histogram,
+    round_bin_width,
+    summarise,
+)
+from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Bools, Floats, Ints, States
 
 if TYPE_CHECKING:
     import pandas as pd
 
-DEFAULT_HORIZONS_M = tuple(float(metres) for metres in range(1, 21))
 DEFAULT_SEED = 20140311
 """Seed of the bootstrap: any number, but the same for every run and every model."""
 
-LARGEST_TABLE_BYTES = 1 << 27
-"""Errors held at a time: horizons are taken in groups that keep below it, whatever the length of the log."""
+BOOTSTRAP_RESAMPLES = 300
+BOOTSTRAP_LEVEL = 0.95
+"""Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
+
+LARGEST_TABLE_BYTES = 96 << 20
+"""Errors of one model held at a time: horizons are taken in groups below it, whatever the length of the log."""
+
+STANDING_MPS = 0.01
+"""Slower than this the robot stands."""
+
+BULK_IN_P95 = 3.0
+MOST_BULKS = 10.0
+"""A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
+
+STARTS_A_CALL = 1 << 16
+"""Starts whose trial ends are held at a time."""
+
+MODELS_AT_ONCE = 2
+"""The kernels run beside each other; each holds a table of its own."""
 
 
 class DrivenRun(Protocol):
@@ -51,6 +79,11 @@ class DrivenRun(Protocol):
     @property
     def track_width_m(self) -> float | None:
         """Distance b between the track centre lines, None where not given."""
+        ...
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What run.json holds, the effective configuration among it."""
         ...
 
 
@@ -85,6 +118,9 @@ class DropoutReport:
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts that were none, by horizon; the same for every model
+    states : recorded states, each a start
+    standing : of them, those at which the robot stood: their trials are near copies of one another
+    seed : of the bootstrap
     """
 
     name: str
@@ -92,6 +128,7 @@ class DropoutReport:
     results: tuple[ModelResult, ...]
     counts: TrialCounts
     states: int
+    standing: int
     seed: int
 
     def result(self, model: str) -> ModelResult | None:
@@ -135,14 +172,20 @@ class DropoutReport:
 
 
 def dropout(
-    run: DrivenRun, horizons_m: Sequence[float] | None = None, *, seed: int = DEFAULT_SEED, sink: ErrorSink | None = None
+    run: DrivenRun,
+    horizons_m: Sequence[float] | None = None,
+    *,
+    models: Sequence[Model] | None = None,
+    seed: int = DEFAULT_SEED,
+    sink: ErrorSink | None = None,
 ) -> DropoutReport:
     """Say how far off the robot is after driving blind, from every recorded state.
 
     Parameters
     ----------
     run : a `FilterRun`, or a run read back from its directory
-    horizons_m : distances driven blind; default 1, 2, … 20 m
+    horizons_m : distances driven blind, in any order; default those of the run's configuration
+    models : what to predict with; default `models_of` the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -154,6 +197,8 @@ def dropout(
     ------
     DataError
         The run has fewer than two states.
+    ConfigError
+        A horizon that is no distance.
 
     Notes
     -----
@@ -162,30 +207,62 @@ def dropout(
     and an end inside a real GNSS outage are no trials; they are counted. Overlapping trials are not independent: the
     intervals come from a moving-block bootstrap with blocks of the horizon's length.
     """
-    if len(run.table) < 2:  # noqa: PLR2004 - an interval needs two ends
+    if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
-    horizons = np.array(sorted(horizons_m if horizons_m is not None else DEFAULT_HORIZONS_M), np.float64)
+    horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    groups = _groups(len(horizons), len(run.table))
+    models = models if models is not None else models_of(run)
     counts: list[TrialCounts] = []
-    parts: dict[str, list[ModelResult]] = {}
-    models = models_of(run)
-    for group in groups:
-        ends = trial_ends(drive, horizons[group])
-        counts.append(count_trials(ends))
-        for model in models:
-            errors = open_loop_errors(drive, model.icrs, ends)
-            parts.setdefault(model.name, []).append(_judge(model, errors, drive, horizons[group], seed))
-            if sink is not None:
-                sink(model.name, horizons[group], errors)
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
+    for group in _groups(len(horizons), len(run.table)):
+        counts.append(_count(drive, horizons[group]))
+        judge = partial(_judge, drive=drive, horizons=horizons[group], seed=seed, sink=sink)
+        with _side_by_side(wanted=sink is None) as spread:
+            for result in spread(judge, models):
+                parts[result.name].append(result)
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
         results=tuple(_joined(part) for part in parts.values()),
         counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
         states=len(run.table),
+        standing=int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1])),
         seed=seed,
     )
+
+
+def configured_horizons_m(run: DrivenRun) -> tuple[float, ...]:
+    """Return the horizons [m] of the configuration a run was made with."""
+    horizons: Iterable[float] = run.summary["config"]["dropout"]["horizons_m"]
+    return tuple(horizons)
+
+
+def check_horizons(horizons_m: Iterable[float]) -> Floats:
+    """Return horizons [m] in ascending order, each once.
+
+    Raises
+    ------
+    ConfigError
+        One is not a positive number, or there is none.
+    """
+    horizons = np.unique(np.fromiter(horizons_m, np.float64))
+    if not len(horizons):
+        raise ConfigError("horizons", "none is given", "name at least one distance in metres")
+    for horizon in horizons:
+        if not (math.isfinite(horizon) and horizon > 0):
+            raise ConfigError("horizons", f"{horizon:g} m is not a distance", "give positive metres")
+    return horizons
+
+
+def load_kernels() -> None:
+    """Have the compiled kernels ready: a toy drive, to be called while a run is still being read."""
+    way = np.arange(12.0)
+    no = np.zeros(len(way), np.bool_)
+    drive = Drive(np.ones_like(way), np.ones_like(way), np.ones_like(way), way, 0 * way, 0 * way, way, no, no.copy())
+    icrs, horizon = FrozenIcrs.constant(1.0, -1.0, 0.0), np.array([1.0])
+    errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
+    bootstrap_intervals(errors, way, horizon, DEFAULT_SEED)
+    open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
 
 
 def models_of(run: DrivenRun) -> tuple[Model, ...]:
@@ -220,28 +297,14 @@ def drive_of(run: DrivenRun) -> Drive:
     )
 
 
-def budget_distance(report: DropoutReport, model: str, budget_m: float) -> tuple[float, bool] | None:
-    """Return how far a model's 95th percentile stays within a budget [m].
-
-    Returns
-    -------
-    distance, beyond : interpolated between horizons, from 0 m at 0 m; `beyond` is True when the budget still held at
-        the last horizon with trials. None without the model or without trials.
-    """
-    result = report.result(model)
-    if result is None:
-        return None
-    told = np.isfinite(result.summary.p95)
-    if not told.any():
-        return None
-    distance = np.concatenate([[0.0], report.horizons_m[told]])
-    p95 = np.concatenate([[0.0], result.summary.p95[told]])
-    over = np.flatnonzero(p95 > budget_m)
-    if not len(over):
-        return float(distance[-1]), True
-    i = int(over[0])
-    share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
-    return float(distance[i - 1] + share * (distance[i] - distance[i - 1])), False
+@contextmanager
+def _side_by_side(*, wanted: bool) -> Iterator[Callable[..., Iterable[ModelResult]]]:
+    """Give a `map` over threads; or the plain one, which holds one table at a time and keeps the order for a sink."""
+    if not wanted:
+        yield map
+        return
+    with ThreadPoolExecutor(MODELS_AT_ONCE) as pool:
+        yield pool.map
 
 
 def _groups(horizons: int, states: int) -> list[slice]:
@@ -249,13 +312,42 @@ def _groups(horizons: int, states: int) -> list[slice]:
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: int) -> ModelResult:
+def _ranges(states: int) -> Iterator[tuple[int, int]]:
+    return ((lo, min(lo + STARTS_A_CALL, states)) for lo in range(0, states, STARTS_A_CALL))
+
+
+def _count(drive: Drive, horizons: Floats) -> TrialCounts:
+    """Count trials, and starts that are none by kind, for each horizon."""
+    parts = [count_trials(trial_ends(drive, horizons, lo, hi)) for lo, hi in _ranges(len(drive.distance))]
+    return TrialCounts(*(np.sum(column, axis=0) for column in zip(*parts, strict=True)))
+
+
+def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats) -> Floats:
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
+    errors = np.empty((len(horizons), len(drive.distance)))
+    for lo, hi in _ranges(len(drive.distance)):
+        errors[:, lo:hi] = open_loop_errors(drive, icrs, trial_ends(drive, horizons, lo, hi), lo).T
+    return errors.T
+
+
+def _judge(model: Model, *, drive: Drive, horizons: Floats, seed: int, sink: ErrorSink | None) -> ModelResult:
+    errors = _errors(drive, model.icrs, horizons)
+    if sink is not None:
+        sink(model.name, horizons, errors)
     summary = summarise(errors)
-    intervals = bootstrap_intervals(errors, drive.distance, horizons, seed)
+    intervals = bootstrap_intervals(errors, drive.distance, horizons, seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
     histograms = tuple(
-        histogram(errors[:, h], round_bin_width(float(np.nan_to_num(summary.largest[h])))) for h in range(len(horizons))
+        histogram(errors[:, h], _bin_width(float(summary.p95[h]), float(summary.largest[h])))
+        for h in range(len(horizons))
     )
     return ModelResult(model.name, model.label, summary, intervals, histograms)
+
+
+def _bin_width(p95_m: float, largest_m: float) -> float:
+    """Return the width of bins that show the bulk of the trials, few outliers apart, in at most some hundred bins."""
+    if math.isnan(largest_m):
+        return round_bin_width(0.0)
+    return round_bin_width(max(min(largest_m, BULK_IN_P95 * p95_m), largest_m / MOST_BULKS))
 
 
 def _joined(parts: list[ModelResult]) -> ModelResult:

@@ -11,14 +11,15 @@ import numpy as np
 from icrtool import __version__
 from icrtool.analysis.filter_setup import (
     FilterSetup,
+    WarmStart,
     configured_process_position_mps,
     set_up_filter,
     wheel_gap_s,
 )
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
-from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary
+from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
 from icrtool.config import Config
-from icrtool.core.ekf import GATED, UNSEEN, FilterOutput, run_filter
+from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput, run_filter
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ PROCESS_POSITION_STEP = 2.0
 LARGEST_PROCESS_POSITION_MPS = 10.0
 WORTHWHILE_SHARE = 0.9
 """Doubling the position noise is worth it when it brings the mean NIS below this part of what it was."""
+
+STATE_COLUMNS = ("north_m", "east_m", "heading_rad", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
+"""The state's entries, in the kernel's order."""
 
 OUTAGE_S = 2.0
 """Longer than this without a usable fix is a GNSS outage."""
@@ -56,7 +60,7 @@ class MeasurementOutcome:
     stamp_ns: Ints
     t_s: Floats
     nis: Floats
-    code: Any
+    code: Codes
     difference: Floats
 
 
@@ -72,6 +76,7 @@ class FilterRun:
     gnss, heading : what became of the measurements
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
+    changes_s : terrain changes, seconds since the first recorded state
     convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
     """
 
@@ -85,6 +90,7 @@ class FilterRun:
     heading_check: HeadingCheck
     covariance: Floats
     process_position_mps: float
+    changes_s: tuple[float, ...]
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
@@ -105,13 +111,21 @@ class FilterRun:
         return self.table.frame()
 
 
-def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
+def fit(
+    log: RobotLog,
+    config: Config | None = None,
+    *,
+    warm_start: WarmStart | None = None,
+    changes_s: tuple[float, ...] = (),
+) -> FilterRun:
     """Learn a robot's track ICRs from a log.
 
     Parameters
     ----------
     log : as `icrtool.read_log` returns it
     config : default: all defaults
+    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
+    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
 
     Returns
     -------
@@ -130,8 +144,8 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
     """
     config = config if config is not None else Config()
     check = check_heading(log, config)
-    setup, output, position_noise = _run(log, config, check)
-    table = _states(log, setup, output)
+    setup, output, position_noise = _run(log, config, check, warm_start, changes_s)
+    table = _states(log, output)
     gnss = _outcome(
         log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
     )
@@ -140,9 +154,14 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
         output.heading_innovation,
     )  # fmt: skip
     gap = wheel_gap_s(config, setup.data.wheel_t)
-    in_gap = np.append(np.diff(table.t_s) > gap, False)  # noqa: FBT003 - the last state has no interval after it
-    convergence = converge(table)
-    warnings = (*log.warnings, *check.warnings, *_doubts(log.name, table, gnss), *_noise_note(log.name, config, position_noise))
+    in_gap = np.append(np.diff(table.t_s) > gap, False)
+    convergence, outages = converge(table), _outages(table, gnss)
+    warnings = (
+        *log.warnings,
+        *check.warnings,
+        *_doubts(log.name, table, gnss),
+        *_noise_note(log.name, config, position_noise),
+    )
     summary = {
         "schema": RUN_SCHEMA,
         "tool_version": __version__,
@@ -152,21 +171,30 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
         "streams": [asdict(stream) for stream in log.streams],
         "warnings": list(warnings),
         "drive": drive_summary(table),
-        "icr": icr_summary(table, convergence),
+        "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
+        "segments": segment_summary(table, changes_s),
         "gnss": gnss_summary(log, gnss),
         "heading": check.summary(),
-        "filter": {"preset": config.filter.preset, "process_position_mps": position_noise, "states": len(table), **nis_summary(gnss, heading)},
+        "outages_ns": outages.tolist(),
+        "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(in_gap)],
+        "filter": {
+            "preset": config.filter.preset,
+            "process_position_mps": position_noise,
+            "states": len(table),
+            **nis_summary(gnss, heading),
+        },
     }
     return FilterRun(
         log=log,
         config=config,
         table=table,
         in_gap=in_gap,
-        outages_ns=_outages(table, gnss),
+        outages_ns=outages,
         gnss=gnss,
         heading=heading,
         heading_check=check,
         covariance=_square(output.P),
+        changes_s=tuple(sorted(changes_s)),
         process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
@@ -174,18 +202,21 @@ def fit(log: RobotLog, config: Config | None = None) -> FilterRun:
     )
 
 
-def _run(log: RobotLog, config: Config, check: HeadingCheck) -> tuple[FilterSetup, FilterOutput, float]:
+def _run(
+    log: RobotLog, config: Config, check: HeadingCheck, warm_start: WarmStart | None, changes_s: tuple[float, ...]
+) -> tuple[FilterSetup, FilterOutput, float]:
     """Run the filter; in preset ``field`` again with more position noise while the fixes contradict the wheels.
 
     A contradiction (NIS of the fixes, each counted up to its gate) that falls as the noise grows comes from the wheels
-    or the clocks (held samples, delays, slip), or from fixes that err together: then the larger noise is the honest one.
+    or the clocks (held samples, delays, slip), or from fixes that err together: the larger noise is the honest one.
     Bad fixes stay bad whatever the noise.
     """
 
     def run(speed: float) -> tuple[FilterSetup, FilterOutput, float]:
         setup = set_up_filter(
             log, config, heading_offset_rad=check.applied_offset_rad, heading_std_at_least_rad=check.applied_std_rad,
-            process_position_mps=speed,
+            heading_correlation_at_least_s=check.applied_correlation_s,
+            process_position_mps=speed, warm_start=warm_start, changes_s=changes_s,
         )  # fmt: skip
         output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
         nis = output.gnss_nis[output.gnss_code > UNSEEN]
@@ -203,26 +234,31 @@ def _run(log: RobotLog, config: Config, check: HeadingCheck) -> tuple[FilterSetu
     return setup, output, speed
 
 
-def _states(log: RobotLog, setup: FilterSetup, output: FilterOutput) -> States:
+def _states(log: RobotLog, output: FilterOutput) -> States:
     first = len(log.wheels.stamp_ns) - len(output.x)
     stamps = log.wheels.stamp_ns[first:]
     std = np.sqrt(np.maximum(output.variance, 0.0))
+    means, deviations = ([np.ascontiguousarray(column) for column in values.T] for values in (output.x, std))
     return States(
-        stamps,
-        (stamps - stamps[0]) / 1e9,
-        *(np.ascontiguousarray(column) for column in output.x.T),
-        *(np.ascontiguousarray(column) for column in std.T),
-        log.wheels.v_left_mps[first:],
-        log.wheels.v_right_mps[first:],
-        output.distance,
+        stamp_ns=stamps,
+        t_s=(stamps - stamps[0]) / 1e9,
+        **dict(zip(STATE_COLUMNS, means, strict=True)),
+        **{f"std_{name}": column for name, column in zip(STATE_COLUMNS, deviations, strict=True)},
+        v_left_mps=log.wheels.v_left_mps[first:],
+        v_right_mps=log.wheels.v_right_mps[first:],
+        distance_m=output.distance,
     )
 
 
 def _outcome(
-    stamps: Ints, index: Ints, table: States, nis: Floats, code: Any, difference: Floats
+    stamps: Ints, index: Ints, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
     """Put what the kernel said of the measurements it was given back in the rows of the log."""
-    all_nis, all_code, all_difference = np.full(len(stamps), np.nan), np.zeros(len(stamps), np.uint8), np.full(len(stamps), np.nan)
+    all_nis, all_code, all_difference = (
+        np.full(len(stamps), np.nan),
+        np.zeros(len(stamps), np.uint8),
+        np.full(len(stamps), np.nan),
+    )
     all_nis[index], all_code[index], all_difference[index] = nis, code, difference
     return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
 
@@ -230,7 +266,7 @@ def _outcome(
 def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
     """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns]."""
     used = gnss.stamp_ns[gnss.code > UNSEEN]
-    if len(used) < 2:  # noqa: PLR2004 - an interval needs two ends
+    if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)
     longest = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
@@ -244,10 +280,11 @@ def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
 def _noise_note(name: str, config: Config, position_noise: float) -> list[str]:
     if position_noise == configured_process_position_mps(config):
         return []
-    return [
+    text = (
         f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
         f"position noise raised to {position_noise:.1f} m/s; filter.process_position_mps sets it"
-    ]
+    )
+    return [text]
 
 
 def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
@@ -259,12 +296,15 @@ def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
     elif float(np.ptp(table.heading_rad)) < math.radians(20):
         doubts.append("the robot hardly turned: the ICRs are not observable on a straight drive")
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
-        doubts.append("the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels")
+        doubts.append(
+            "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
+        )
     seen = int(np.count_nonzero(gnss.code > UNSEEN))
     gated = int(np.count_nonzero(gnss.code == GATED))
     if seen and gated > 0.1 * seen:
         doubts.append(
-            f"{100 * gated / seen:.0f} % of the fixes were rejected: clocks, antenna place or fix quality do not fit the wheels"
+            f"{100 * gated / seen:.0f} % of the fixes were rejected: "
+            "clocks, antenna place or fix quality do not fit the wheels"
         )
     return [f"{name}: {doubt}" for doubt in doubts]
 

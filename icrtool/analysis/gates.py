@@ -1,4 +1,4 @@
-"""Gates: bounds on the dropout numbers, for CI."""
+"""Budgets and gates: how far an error stays within a bound, and bounds on the dropout numbers for CI."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import operator
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.analysis.dropout import DropoutReport
 from icrtool.errors import ConfigError
+from icrtool.tables import Floats
 
 _FORM = re.compile(
     r"^\s*(?P<model>\w+)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
@@ -20,6 +22,22 @@ _FORM = re.compile(
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
+
+
+class BudgetDistance(NamedTuple):
+    """How far a model's 95th percentile stays within a budget.
+
+    Attributes
+    ----------
+    distance_m : interpolated between horizons, from 0 m at 0 m
+    beyond : the budget still held at `distance_m`, the last horizon with trials
+    """
+
+    model: str
+    label: str
+    budget_m: float
+    distance_m: float
+    beyond: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +54,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a gate found: `value_m` is NaN where the log has no trial of that length; `margin_m` > 0 when it passed."""
+    """What a gate found: `value_m` is NaN where the log has no trial of that length; `margin_m` is negative when missed."""
 
     gate: Gate
     value_m: float
@@ -48,7 +66,21 @@ class Verdict:
         word = "pass" if self.passed else "FAIL"
         if math.isnan(self.value_m):
             return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log"
-        return f"{word}  {self.gate.text}: {self.value_m:.3f} m, margin {self.margin_m:+.3f} m"
+        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m"
+
+
+def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDistance, ...]:
+    """Return how far the 95th percentile of each model stays within a budget [m]; models without trials are left out.
+
+    Raises
+    ------
+    ConfigError
+        The budget is no length.
+    """
+    if not (math.isfinite(budget_m) and budget_m > 0):
+        raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
+    reached = ((result, _budget_distance(report.horizons_m, result.summary.p95, budget_m)) for result in report.results)
+    return tuple(BudgetDistance(result.name, result.label, budget_m, *found) for result, found in reached if found)
 
 
 def parse_gate(text: str) -> Gate:
@@ -61,10 +93,12 @@ def parse_gate(text: str) -> Gate:
     """
     match = _FORM.match(text)
     if match is None:
-        raise ConfigError(f"gate {text!r}", "not of the form model.p50|p95|expected|max@HORIZONm <= metres", 'for example "icr.p95@10m <= 3.8"')
-    return Gate(
-        " ".join(text.split()), match["model"], match["metric"], float(match["horizon"]), match["relation"], float(match["bound"])
-    )
+        form = "model.p50|p95|expected|max@HORIZONm <= metres"
+        raise ConfigError(f"gate {text!r}", f"not of the form {form}", 'for example "icr.p95@10m <= 3.8"')
+    horizon_m, bound_m = float(match["horizon"]), float(match["bound"])
+    if not horizon_m > 0:
+        raise ConfigError(f"gate {text!r}", "a horizon of 0 m is no drive", "name a distance, for example @10m")
+    return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m)
 
 
 def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
@@ -78,7 +112,8 @@ def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
     result = report.result(gate.model)
     if result is None:
         known = ", ".join(one.name for one in report.results)
-        raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", f"this run has {known}; no_slip needs robot.track_width_m")
+        advice = f"this run has {known}; no_slip needs robot.track_width_m"
+        raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
     places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m))
     if not len(places):
         raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", "add it to dropout.horizons_m")
@@ -86,3 +121,16 @@ def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
     value = float(getattr(result.summary, column)[places[0]])
     margin = gate.bound_m - value if gate.relation.startswith("<") else value - gate.bound_m
     return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m))
+
+
+def _budget_distance(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool] | None:
+    told = np.isfinite(p95_m)
+    if not told.any():
+        return None
+    distance, p95 = np.concatenate([[0.0], horizons_m[told]]), np.concatenate([[0.0], p95_m[told]])
+    over = np.flatnonzero(p95 > budget_m)
+    if not len(over):
+        return float(distance[-1]), True
+    i = int(over[0])
+    share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
+    return float(distance[i - 1] + share * (distance[i] - distance[i - 1])), False

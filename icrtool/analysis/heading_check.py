@@ -41,7 +41,7 @@ class HeadingCheck:
     scatter_rad : robust standard deviation of the differences
     agreement, mirrored_agreement : mean resultant length of heading minus course, as given and turned the other way
     applied_offset_rad : what `fit` subtracts
-    applied_std_rad : the least noise `fit` gives the heading
+    applied_std_rad, applied_correlation_s : the least noise, and how long it errs alike, that `fit` gives the heading
     """
 
     windows: int
@@ -52,6 +52,7 @@ class HeadingCheck:
     mirrored_agreement: float
     applied_offset_rad: float
     applied_std_rad: float
+    applied_correlation_s: float
     warnings: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
@@ -81,14 +82,14 @@ class Course(NamedTuple):
     mirrored : (w,) the same for a heading that turns the other way
     curvature : (w,) heading change over way [rad/m]
     noise_rad : what the fixes' noise alone turns a course by
-    samples : median number of heading samples in a window
+    duration_s : median duration of a window
     """
 
     angle: Floats
     mirrored: Floats
     curvature: Floats
     noise_rad: float
-    samples: float
+    duration_s: float
 
 
 def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
@@ -100,25 +101,32 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     Notes
     -----
     Over each window the wheels' speed is laid along the measured heading and summed; the angle from there to the
-    displacement of the fixes is the heading's offset, plus a part proportional to the curvature (the antenna's lever arm
-    and x_icr make the antenna crab in turns). A robust line through angle over curvature separates the two.
+    displacement of the fixes is the heading's offset, plus a part proportional to the curvature (the antenna's lever
+    arm and x_icr make the antenna crab in turns). A robust line through angle over curvature separates the two.
     """
     given = config.frames.heading_offset_deg
     paper = config.filter.preset == "paper"
     fixed = 0.0 if paper or given == "auto" else math.radians(given)
     course = measure_course(log)
     if len(course.angle) < FEWEST_WINDOWS:
-        return HeadingCheck(len(course.angle), math.nan, math.nan, math.nan, math.nan, math.nan, fixed, 0.0, ())
+        return HeadingCheck(len(course.angle), math.nan, math.nan, math.nan, math.nan, math.nan, fixed, 0.0, 0.0, ())
     agreement = float(abs(np.exp(1j * course.angle).mean()))
     mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
     offset, sigma, scatter = offset_at_no_curvature(course.angle, course.curvature)
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
-    applied, raised, warnings = fixed, 0.0, []
-    text = f"heading is {math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}° off the course ({len(course.angle)} windows)"
+    applied, raised, alike_s, warnings = fixed, 0.0, 0.0, []
+    found = f"{math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}°"
+    text = f"heading is {found} off the course ({len(course.angle)} windows)"
     if agreement < EXPLAINED and mirrored >= EXPLAINED:
-        warnings.append(f"{log.name}: the heading turns the other way than the course: set frames.heading to the other of enu and ned")
+        warnings.append(
+            f"{log.name}: the heading turns the other way than the course: "
+            "set frames.heading to the other of enu and ned"
+        )
     elif agreement < EXPLAINED:
-        warnings.append(f"{log.name}: the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs")
+        warnings.append(
+            f"{log.name}: the heading does not follow the course (agreement {agreement:.2f} of 1): "
+            "do not trust the ICRs"
+        )
     elif abs(offset - fixed) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
         if given == "auto" and not paper:
             applied = offset
@@ -126,13 +134,14 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         else:
             warnings.append(f"{log.name}: {text}, {math.degrees(fixed):+.1f}° is applied")
     if not paper and agreement >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
-        # The scatter is that of window means: samples that err together count as one, so each gets a share of it.
-        raised = own_scatter * math.sqrt(course.samples)
+        # The scatter is that of window means: the heading errs alike for as long as a window lasts.
+        raised, alike_s = own_scatter, course.duration_s
         warnings.append(
-            f"{log.name}: the heading scatters by {math.degrees(own_scatter):.0f}° about the course, over whole windows: its noise is raised accordingly"
+            f"{log.name}: the heading scatters by {math.degrees(own_scatter):.0f}° about the course, "
+            "over whole windows: its noise is raised accordingly"
         )
     return HeadingCheck(
-        len(course.angle), offset, sigma, own_scatter, agreement, mirrored, applied, raised, tuple(warnings)
+        len(course.angle), offset, sigma, own_scatter, agreement, mirrored, applied, raised, alike_s, tuple(warnings)
     )
 
 
@@ -146,7 +155,7 @@ def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, flo
     centre = float(np.angle(np.exp(1j * angle).mean()))
     residual = np.angle(np.exp(1j * (angle - centre)))
     design = np.column_stack([np.ones(len(residual)), curvature])
-    weight = np.ones(len(residual))
+    weight, scatter, information, solution = np.ones(len(residual)), 0.0, np.eye(2), np.zeros(2)
     for _ in range(20):
         weighted = design * weight[:, None]
         # A circle has one curvature only: the ridge then leaves the slope at zero, and its doubt in the offset.
@@ -163,7 +172,7 @@ def measure_course(log: RobotLog) -> Course:
     """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
     gnss, wheels = log.gnss, log.wheels
     none = Course(np.empty(0), np.empty(0), np.empty(0), 0.0, 1.0)
-    if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:  # noqa: PLR2004 - an interval
+    if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:
         return none
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance)]
@@ -194,14 +203,8 @@ def measure_course(log: RobotLog) -> Course:
         np.angle(mirror * np.conj(seen))[moved],
         (turned / way)[moved],
         noise * math.sqrt(2.0) / length,
-        float(np.median(between(np.arange(len(psi_at) + 1.0)) * _rate_ratio(log))),
+        float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,
     )
-
-
-def _rate_ratio(log: RobotLog) -> float:
-    """Return heading samples per wheel sample."""
-    interval = [float(np.median(np.diff(table.stamp_ns))) for table in (log.wheels, log.heading)]
-    return interval[0] / interval[1] if interval[1] > 0 else 1.0
 
 
 def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -13,12 +15,14 @@ from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter
 from icrtool.core.open_loop import open_loop_path
 from icrtool.errors import ConfigError
-from icrtool.tables import Floats, Ints
+from icrtool.tables import Floats
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""
 
 MOST_SPACED = 10
+
+OutageKind = Literal["forced", "real"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +37,7 @@ class Outage:
     north_m, east_m : (m,) the blind path, for a picture
     """
 
-    kind: str
+    kind: OutageKind
     begin_s: float
     end_s: float
     distance_m: float
@@ -46,27 +50,33 @@ class Outage:
 def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
     """Place outages of one length: at given seconds, or spaced evenly after the ICRs have converged.
 
+    Returns
+    -------
+    Half-open spans [ns], in order.
+
     Raises
     ------
     ConfigError
-        An outage that does not fit into the drive.
+        An outage that does not fit into the drive, or into the time between two others.
     """
-    table = run.table
-    last = float(table.t_s[-1])
-    if at_s:
-        begins = [float(t) for t in at_s]
-        if any(t < 0 or t + length_s > last for t in begins):
-            raise ConfigError("outage", f"{length_s:g} s at {', '.join(f'{t:g}' for t in begins)} s do not fit", f"the drive lasts {last:.1f} s")
-    else:
-        settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
-        settled = min(settled, last / 4)
-        count = min(MOST_SPACED, int((last - settled) * LONGEST_SHARE / length_s))
-        if count < 1:
-            raise ConfigError("outage", f"{length_s:g} s is too long for a drive of {last:.1f} s", "choose a shorter one")
-        free = (last - settled - count * length_s) / (count + 1)
-        begins = [settled + free + i * (length_s + free) for i in range(count)]
-    origin = int(table.stamp_ns[0])
-    return tuple((origin + int(t * 1e9), origin + int((t + length_s) * 1e9)) for t in sorted(begins))
+    last = float(run.table.t_s[-1])
+    if not length_s > 0:
+        raise ConfigError("outage", f"{length_s:g} s is no duration", "give positive seconds")
+    begins = sorted(float(t) for t in at_s) if at_s else _spaced(run, length_s)
+    for begin in begins:
+        if not 0 <= begin <= last - length_s:
+            raise ConfigError(
+                "outage", f"{length_s:g} s from {begin:g} s on do not fit", f"the drive lasts {last:.1f} s"
+            )
+    for begin, following in pairwise(begins):
+        if begin + length_s >= following:
+            raise ConfigError(
+                "outage",
+                f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s",
+                "the filter must learn between two outages: place them further apart",
+            )
+    origin = int(run.table.stamp_ns[0])
+    return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
 
 
 def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
@@ -76,50 +86,73 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
         run.config,
         heading_offset_rad=run.heading_check.applied_offset_rad,
         heading_std_at_least_rad=run.heading_check.applied_std_rad,
+        heading_correlation_at_least_s=run.heading_check.applied_correlation_s,
         process_position_mps=run.process_position_mps,
         outages_ns=tuple(spans_ns),
     )
     output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
-    table = run.table
-    rows = min(len(output.x), len(table))
+    # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
+    rows = min(len(output.x), len(run.table))
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]
-    away = np.hypot(north - table.north_m[-rows:], east - table.east_m[-rows:])
-    stamps, distance = table.stamp_ns[-rows:], table.distance_m[-rows:]
+    away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
+    stamps, distance = run.table.stamp_ns[-rows:], run.table.distance_m[-rows:]
+    origin = int(run.table.stamp_ns[0])
     outages = []
     for begin, end in spans_ns:
-        inside = np.flatnonzero((stamps >= begin) & (stamps < end))
-        if len(inside) > 1:
-            outages.append(_outage("forced", table.stamp_ns[0], begin, end, inside, distance, away, north, east))
+        inside = slice(*np.searchsorted(stamps, [begin, end]))
+        if len(stamps[inside]) > 1:
+            outages.append(
+                Outage(
+                    kind="forced",
+                    begin_s=(begin - origin) / 1e9,
+                    end_s=(end - origin) / 1e9,
+                    distance_m=float(np.ptp(distance[inside])),
+                    end_error_m=float(away[inside][-1]),
+                    max_error_m=float(away[inside].max()),
+                    north_m=north[inside],
+                    east_m=east[inside],
+                )
+            )
     return tuple(outages)
 
 
 def real_outages(run: DrivenRun) -> tuple[Outage, ...]:
-    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix, missed at the next one."""
+    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix, missed at the next one.
+
+    One that never ends, and one with a gap in the wheel data, has no miss and is left out.
+    """
     drive, table = drive_of(run), run.table
+    origin = int(table.stamp_ns[0])
     outages = []
     for begin, end in run.outages_ns:
-        inside = np.flatnonzero((table.stamp_ns >= begin) & (table.stamp_ns <= end))
-        if len(inside) < 2 or table.stamp_ns[-1] < end:  # noqa: PLR2004 - an interval; one that never ends has no miss
+        first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))
+        if last >= len(table) or last <= first or run.in_gap[first:last].any():
             continue
-        first, last = int(inside[0]), min(int(inside[-1]) + 1, len(table) - 1)
-        icrs = (float(column[first]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-        path = open_loop_path(drive, *icrs, first, last)
+        right, left, x = (float(column[first]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
+        path = open_loop_path(drive, right, left, x, first, last)
         miss = float(np.hypot(path.north[-1] - table.north_m[last], path.east[-1] - table.east_m[last]))
-        origin = int(table.stamp_ns[0])
         outages.append(
             Outage(
-                "real", (begin - origin) / 1e9, (end - origin) / 1e9,
-                float(table.distance_m[last] - table.distance_m[first]), miss, miss, path.north, path.east,
-            )  # fmt: skip
+                kind="real",
+                begin_s=(int(begin) - origin) / 1e9,
+                end_s=(int(end) - origin) / 1e9,
+                distance_m=float(table.distance_m[last] - table.distance_m[first]),
+                end_error_m=miss,
+                max_error_m=miss,
+                north_m=path.north,
+                east_m=path.east,
+            )
         )
     return tuple(outages)
 
 
-def _outage(
-    kind: str, origin: int, begin: int, end: int, inside: Ints, distance: Floats, away: Floats, north: Floats, east: Floats
-) -> Outage:
-    first, last = int(inside[0]), int(inside[-1])
-    return Outage(
-        kind, (begin - int(origin)) / 1e9, (end - int(origin)) / 1e9, float(distance[last] - distance[first]),
-        float(away[last]), float(away[first : last + 1].max()), north[first : last + 1], east[first : last + 1],
-    )  # fmt: skip
+def _spaced(run: FilterRun, length_s: float) -> list[float]:
+    """Return the begins [s] of as many outages as leave half of the drive to learn, evenly after convergence."""
+    last = float(run.table.t_s[-1])
+    settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
+    settled = min(settled, last / 4)
+    count = min(MOST_SPACED, int((last - settled) * LONGEST_SHARE / length_s))
+    if count < 1:
+        raise ConfigError("outage", f"{length_s:g} s is too long for a drive of {last:.1f} s", "choose a shorter one")
+    free = (last - settled - count * length_s) / (count + 1)
+    return [settled + free + i * (length_s + free) for i in range(count)]

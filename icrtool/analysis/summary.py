@@ -1,10 +1,12 @@
-"""The numbers of a run: distance and speed, ICR means, convergence, GNSS difference, NIS (Pentzer 2014, Tables I-III)."""
+"""The numbers of a run: distance, speed, ICR means, convergence, GNSS difference, NIS (Pentzer 2014, Tables I-III)."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.core.ekf import GATED, RECOVERED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
@@ -15,7 +17,10 @@ if TYPE_CHECKING:
 
 ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 
-SMALLEST_CHANGE_M = 0.01
+SETTLED_S = 2.0
+"""An estimate has arrived when it stays within 10 % of its way for this long: an overshoot passes through."""
+
+SMALLEST_CHANGE_M = 0.03
 """An ICR whose estimate moved less than this from its start has no rise to time."""
 
 
@@ -26,7 +31,7 @@ def converge(table: States) -> dict[str, tuple[float, float] | None]:
     -------
     dict
         By column: seconds at which the estimate has gone 10 % and 90 % of the way from its start to its settled
-        value (median over the second half of the run), or None where it hardly moved.
+        value (median over the second half of the run), or None where it hardly moved or never settled.
 
     Notes
     -----
@@ -41,16 +46,26 @@ def converge(table: States) -> dict[str, tuple[float, float] | None]:
             rises[column] = None
             continue
         gone = (estimate - estimate[0]) / change
-        first = int(np.argmax(gone >= 0.1))
-        last = first + int(np.argmax(gone[first:] >= 0.9))
-        rises[column] = (float(table.t_s[first]), float(table.t_s[last]))
+        first = int(np.argmax(np.abs(gone) >= 0.1))
+        last = _first_stay(table.t_s, np.abs(gone - 1.0) <= 0.1)
+        rises[column] = (float(table.t_s[first]), float(table.t_s[last])) if last is not None else None
     return rises
+
+
+def _first_stay(t_s: Floats, inside: NDArray[np.bool_]) -> int | None:
+    """Return the first row from which `inside` holds for `SETTLED_S`; None where it never does."""
+    outside = np.concatenate([[0], np.cumsum(~inside)])
+    until = np.searchsorted(t_s, t_s + SETTLED_S)
+    stays = inside & (outside[until] == outside[:-1]) & (t_s + SETTLED_S <= t_s[-1])
+    return int(np.argmax(stays)) if stays.any() else None
 
 
 def path_speed(table: States) -> Floats:
     """Return the speed over each interval between states (n - 1,) [m/s]; NaN where no time passes."""
     interval = np.diff(table.t_s)
-    return np.divide(np.diff(table.distance_m), interval, out=np.full(len(interval), np.nan), where=interval > 0)
+    speed = np.full(len(interval), np.nan)
+    np.divide(np.diff(table.distance_m), interval, out=speed, where=interval > 0)
+    return speed
 
 
 def drive_summary(table: States) -> dict[str, float]:
@@ -63,7 +78,9 @@ def drive_summary(table: States) -> dict[str, float]:
     return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
 
 
-def icr_summary(table: States, convergence: dict[str, tuple[float, float] | None]) -> dict[str, dict[str, float | None]]:
+def icr_summary(
+    table: States, convergence: dict[str, tuple[float, float] | None]
+) -> dict[str, dict[str, float | None]]:
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and rise times."""
     settled = max((rise[1] for rise in convergence.values() if rise is not None), default=0.0)
     after = table.t_s >= settled
@@ -77,6 +94,26 @@ def icr_summary(table: States, convergence: dict[str, tuple[float, float] | None
             column: rise[1] - rise[0] if rise is not None else None for column, rise in convergence.items()
         },
     }
+
+
+def segment_summary(table: States, changes_s: tuple[float, ...]) -> list[dict[str, Any]]:
+    """Return mean and standard deviation of the ICRs over the second half of each stretch between terrain changes."""
+    if not changes_s:
+        return []
+    edges = [0.0, *sorted(changes_s), float(table.t_s[-1])]
+    segments = []
+    for begin, end in pairwise(edges):
+        inside = (table.t_s >= (begin + end) / 2) & (table.t_s <= end)
+        columns: dict[str, Floats] = {column: getattr(table, column)[inside] for column in ICR_COLUMNS}
+        segments.append(
+            {
+                "begin_s": begin,
+                "end_s": end,
+                "mean": {column: float(values.mean()) if len(values) else None for column, values in columns.items()},
+                "std": {column: float(values.std()) if len(values) else None for column, values in columns.items()},
+            }
+        )
+    return segments
 
 
 def separation_multiplier(table: States, track_width_m: float) -> float:

@@ -19,5 +19,5 @@ def main() -> None:
     try:
         icrtool()
     except IcrToolError as err:
-        print(f"Error: {err}", file=sys.stderr)
+        sys.stderr.write(f"Error: {err}\n")
         sys.exit(1)

@@ -17,16 +17,35 @@ RUNS = Path("icrtool-runs")
 
 @click.command("fit")
 @options.LOGS
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory (several logs: its parent).")
-@click.option("--states", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True, help="Format of the states.")
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory (several logs: its parent)."
+)
+@click.option(
+    "--states", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True, help="Format of the states."
+)
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@click.option(
+    "--warm-start",
+    metavar="RUN",
+    type=click.Path(path_type=Path),
+    help="Start from another run's final ICRs and covariance.",
+)
+@click.option(
+    "--terrain-change",
+    "changes",
+    metavar="T",
+    multiple=True,
+    type=float,
+    help="Inflate the ICR covariance T seconds after the start; repeatable.",
+)
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
+    warm_start: Path | None, changes: tuple[float, ...],
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Learn the track ICRs of a robot from its logs, and write a run directory per log.
+    r"""Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
     robot.wheel_radius_m=… tell what the messages do not.
@@ -44,7 +63,7 @@ def command(
     failed: list[IcrToolError] = []
     for log, directory in zip(logs, directories, strict=True):
         try:
-            _fit_one(log, directory, config, states, formats, quiet=quiet, verbose=verbose)
+            _fit_one(log, directory, config, states, formats, warm_start, changes, quiet=quiet, verbose=verbose)
         except IcrToolError as err:
             if len(logs) == 1:
                 raise
@@ -61,7 +80,9 @@ def plot_formats(text: str) -> tuple[str, ...]:
         return ()
     unknown = [part for part in formats if part not in ("png", "svg", "pdf")]
     if unknown or not formats:
-        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of png, svg, pdf, none", param_hint="--plots")
+        raise click.BadParameter(
+            f"{', '.join(unknown) or text!r} is not one of png, svg, pdf, none", param_hint="--plots"
+        )
     return formats
 
 
@@ -73,25 +94,31 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     names = [log_name(log) for log in logs]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise OutputError(twice, "two logs have this name, their runs would be one directory", "fit them one at a time, each with its -o")
+        raise OutputError(
+            twice,
+            "two logs have this name, their runs would be one directory",
+            "fit them one at a time, each with its -o",
+        )
     if output is not None and len(logs) == 1:
         return [output]
     return [(output or RUNS) / name for name in names]
 
 
 def _fit_one(
-    log: Path, directory: Path, config: Config, states: str, formats: tuple[str, ...], *, quiet: bool, verbose: bool
-) -> None:
-    from icrtool.report.run_directory import check_target, write_run
+    log: Path, directory: Path, config: Config, states: str, formats: tuple[str, ...],
+    warm_start: Path | None, changes: tuple[float, ...], *, quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    from icrtool.report.run_directory import check_target, read_warm_start, write_run
 
     check_target(directory)
+    start = read_warm_start(warm_start) if warm_start is not None else None
     with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
         from icrtool.logio import read_log
 
         measured = read_log(log, config, progress)
     from icrtool.analysis.fit import fit
 
-    run = fit(measured, config)
+    run = fit(measured, config, warm_start=start, changes_s=changes)
     write_run(run, directory, states="parquet" if states == "parquet" else "csv", plots=formats)
     options.warn(run.warnings, quiet=quiet)
     if not quiet:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from icrtool.cli import options
+
+if TYPE_CHECKING:
+    from icrtool.config import Config
 
 
 @click.command("info")
@@ -14,7 +18,12 @@ from icrtool.cli import options
 @options.configuration
 @options.verbosity
 def command(
-    logs: tuple[Path, ...], config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool
+    logs: tuple[Path, ...],
+    config_file: Path | None,
+    robot: str | None,
+    sets: tuple[str, ...],
+    quiet: bool,
+    verbose: bool,
 ) -> None:
     """Say what each log holds, which topic would feed wheels, position and heading, and why.
 
@@ -35,14 +44,12 @@ def command(
         raise SystemExit(1)
 
 
-def _describe(log: Path, config: object, *, quiet: bool, verbose: bool) -> bool:
+def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
     """Print what a log holds; say whether it can be fitted."""
-    from icrtool.config import Config
     from icrtool.errors import IcrToolError
     from icrtool.logio import assemble, survey_log
     from icrtool.logio.describe import describe_survey
 
-    assert isinstance(config, Config)
     with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
         survey = survey_log(log, config, progress)
     try:

@@ -21,9 +21,13 @@ LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=cl
 def configuration(command: Command) -> Command:
     """Add --config, --robot and --set."""
     options = (
-        click.option("--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."),
+        click.option(
+            "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."
+        ),
         click.option("--robot", metavar="NAME", help="Built-in robot, for example husky-a200, jackal, warthog."),
-        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."),
+        click.option(
+            "--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."
+        ),
     )
     for option in reversed(options):
         command = option(command)

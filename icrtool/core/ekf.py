@@ -18,7 +18,7 @@ from icrtool.core.ekf_step import DIAGONAL, Floats, correct, measured_column, pr
 Codes = NDArray[np.uint8]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""What became of a measurement: before the start or after the end, used, rejected by the gate, used to end a lock-out."""
+"""What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
@@ -32,6 +32,7 @@ class FilterParameters(NamedTuple):
     process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
     rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
     gnss_gate, heading_gate : largest NIS accepted; inf accepts all
+    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
     antenna_forward, antenna_right : lever arm of the antenna [m], body frame
     wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
     gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
@@ -43,6 +44,7 @@ class FilterParameters(NamedTuple):
     rate_invariant: bool
     gnss_gate: float
     heading_gate: float
+    heading_correlation: float
     antenna_forward: float
     antenna_right: float
     wheel_gap_s: float
@@ -118,7 +120,7 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
         run[1] = t
     run[2] = nu_n
     run[3] = nu_e
-    return run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s
+    return bool(run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s)
 
 
 @njit
@@ -171,20 +173,23 @@ def take_fix(
 def take_heading(
     t: float, z: float, r: float, x: Floats, P: Floats, PH: Floats, run: Floats, parameters: FilterParameters
 ) -> tuple[int, float, float]:
-    """Gate and apply one heading z [rad] of variance r; return what became of it, its NIS and its innovation."""
+    """Gate and apply one heading z [rad] of variance r; return what became of it, its NIS and its innovation.
+
+    The gate asks whether this sample is right (variance r); the update gives it its share of what its neighbours say
+    too (variance r times the correlation).
+    """
     nu = wrap(z - x[2])
-    S = measured_column(P, 2, 0.0, PH) + r
-    nis = nu * nu / S
+    nis = nu * nu / (P[11] + r)
     code = USED
     if nis > parameters.heading_gate:
         if rejected_run(run, t, nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
             code = RECOVERED
             P[11] += nu * nu
-            S = measured_column(P, 2, 0.0, PH) + r
         else:
             code = GATED
     if code != GATED:
         run[0] = 0.0
+        S = measured_column(P, 2, 0.0, PH) + r * parameters.heading_correlation
         correct(x, P, PH, S, nu)
     return code, nis, nu
 
@@ -211,7 +216,7 @@ def advance(
 
 
 @njit
-def filter_loop(
+def filter_loop(  # noqa: C901 - the order of events, in one place
     data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
     parameters: FilterParameters, out: FilterOutput,
 ) -> None:  # fmt: skip

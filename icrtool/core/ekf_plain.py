@@ -34,9 +34,7 @@ def step_state(x: Floats, v_left: float, v_right: float, dt: float) -> Floats:
     omega = (v_left - v_right) / W
     v_y = -omega * x_v
     c, s = np.cos(psi), np.sin(psi)
-    return np.array(
-        [N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega, y_r, y_l, x_v]
-    )
+    return np.array([N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega, y_r, y_l, x_v])
 
 
 def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float) -> Floats:
@@ -96,7 +94,7 @@ def run_filter_plain(
         if kind == 0:
             for place in (3, 4, 5):
                 P[place, place] = max(P[place, place], parameters.icr_inflation_m2)
-        elif kind == 3:  # noqa: PLR2004 - wheels
+        elif kind == 3:
             held = i
             out.x[i - first], out.variance[i - first] = x, np.diag(P)
             out.distance[i - first] = travelled
@@ -108,7 +106,8 @@ def run_filter_plain(
 
 def _antenna(psi: float, parameters: FilterParameters) -> Floats:
     c, s = math.cos(psi), math.sin(psi)
-    return np.array([[c, -s], [s, c]]) @ np.array([parameters.antenna_forward, parameters.antenna_right])
+    forward, right = parameters.antenna_forward, parameters.antenna_right
+    return np.array([c * forward - s * right, s * forward + c * right])
 
 
 def _measure(
@@ -123,7 +122,11 @@ def _measure(
         H[:, 2] = [-a[1], a[0]]
         nu, R, gate = data.gnss_z[i] - x[:2] - a, np.diag(data.gnss_r[i]), parameters.gnss_gate
     else:
-        nu, R, gate = np.array([wrap(data.heading_z[i] - x[2])]), data.heading_r[i : i + 1, None], parameters.heading_gate
+        nu, R, gate = (
+            np.array([wrap(data.heading_z[i] - x[2])]),
+            data.heading_r[i : i + 1, None],
+            parameters.heading_gate,
+        )
     S = H @ P @ H.T + R
     nis, code = float(nu @ np.linalg.solve(S, nu)), USED
     if nis > gate:
@@ -133,9 +136,9 @@ def _measure(
         code = RECOVERED if run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s else GATED
         if code == RECOVERED:
             P = P + np.diag([*nu**2, 0.0, 0.0, 0.0, 0.0] if kind == 1 else [0.0, 0.0, nu[0] ** 2, 0.0, 0.0, 0.0])
-            S = H @ P @ H.T + R
     if code != GATED:
         run[0] = 0
+        S = H @ P @ H.T + R * (1.0 if kind == 1 else parameters.heading_correlation)
         K = np.linalg.solve(S, H @ P).T
         x = x + K @ nu
         P = (np.eye(6) - K @ H) @ P

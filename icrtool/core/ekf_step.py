@@ -9,6 +9,7 @@ The sums are written out: loops over a 6 x 6 array take three times as long.
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,7 +111,7 @@ def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
         PH[3] += h_psi * P[12]
         PH[4] += h_psi * P[13]
         PH[5] += h_psi * P[14]
-    return PH[axis] + h_psi * PH[2]
+    return float(PH[axis] + h_psi * PH[2])
 
 
 @njit

@@ -9,21 +9,27 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Channel, Container
+from icrtool.logio.channel import Block, Channel, Container, Problems
+from icrtool.logio.decompress import LARGEST_CHUNK_BYTES
 from icrtool.logio.mcap_file import McapFile
 from icrtool.logio.sqlite_bag import SqliteBag
+from icrtool.tables import Ints
 
 _STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
+_LARGEST_METADATA_BYTES = 1 << 24
+_LARGEST_RATIO = 1000
+"""A file that decompresses to more than so many times its size is no recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Metadata:
-    """The part of metadata.yaml that reading needs."""
+    """The part of metadata.yaml that reading needs; `message_compression` is empty where there is none."""
 
-    files: tuple[str, ...]
-    compression_mode: str
-    compression_format: str
+    files: tuple[str, ...] = ()
+    message_compression: str = ""
 
 
 class BagDirectory:
@@ -32,25 +38,25 @@ class BagDirectory:
     Raises
     ------
     LogError
-        No storage file in it, an unreadable metadata.yaml, or none of its files can be read.
+        No storage file in it, or none of them can be read.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._problems: list[str] = []
+        self._problems = Problems(path.name)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._parts: list[Container] = []
-        metadata = _read_metadata(path)
-        self.files = self._find_files(metadata)
+        self.files: list[Path] = []
+        metadata = self._read_metadata()
         try:
-            for file in self.files:
-                self._open_part(file, metadata)
+            for file in self._find_files(metadata.files):
+                self._open_part(file, metadata.message_compression)
+            if not self._parts:
+                raise LogError(path, "no storage file in it can be read", "; ".join(self._problems))
         except BaseException:
             self.close()
             raise
-        if not self._parts:
-            raise LogError(path, "no storage file in it can be read", "; ".join(self._problems))
-        self._numbers: list[dict[int, int]] = []
+        self._numbers: list[tuple[Ints, Ints]] = []
         self.channels = self._merge_channels()
 
     @property
@@ -71,46 +77,61 @@ class BagDirectory:
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file."""
-        import numpy as np
+        for part, (own, merged) in zip(self._parts, self._numbers, strict=True):
+            if not len(own):
+                continue
+            for block in part.blocks(frozenset(own[np.isin(merged, list(wanted))].tolist())):
+                place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
+                yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
 
-        for part, numbers in zip(self._parts, self._numbers, strict=True):
-            own = frozenset(number for number, merged in numbers.items() if merged in wanted)
-            table = np.full(max(numbers, default=0) + 1, -1, np.int64)
-            for number, merged in numbers.items():
-                table[number] = merged
-            for block in part.blocks(own):
-                known = (block.channel >= 0) & (block.channel < len(table))
-                yield block._replace(channel=np.where(known, table[np.where(known, block.channel, 0)], -1))
+    def _read_metadata(self) -> _Metadata:
+        """Return what metadata.yaml says; a recorder that was killed leaves none, or half of it."""
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
 
-    def _find_files(self, metadata: _Metadata | None) -> list[Path]:
-        if metadata is not None and metadata.files:
-            named = [self._path / Path(name).name for name in metadata.files]
-            missing = [file.name for file in named if not file.is_file()]
-            if missing and len(missing) < len(named):
-                self._problems.append(f"{self._path.name}: metadata.yaml names files that are not there: {', '.join(missing)}")
-            named = [file for file in named if file.is_file()]
-            if named:
-                return named
+        file = self._path / "metadata.yaml"
+        if not file.is_file():
+            self._problems.say("no metadata.yaml; the storage files in it were read by name")
+            return _Metadata()
+        try:
+            if file.stat().st_size > _LARGEST_METADATA_BYTES:
+                raise ValueError("far too long")
+            document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+            information = document["rosbag2_bagfile_information"]
+            by_message = str(information.get("compression_mode")).upper() == "MESSAGE"
+            return _Metadata(
+                files=tuple(name for name in information["relative_file_paths"] if isinstance(name, str)),
+                message_compression=str(information.get("compression_format")) if by_message else "",
+            )
+        except (YAMLError, LookupError, TypeError, AttributeError, ValueError, OSError, RecursionError):
+            self._problems.say("its metadata.yaml cannot be read; the storage files in it were read by name")
+            return _Metadata()
+
+    def _find_files(self, names: tuple[str, ...]) -> list[Path]:
+        """Return the files that metadata.yaml names and that are there; all storage files where it names none."""
+        named = [self._path / Path(name).name for name in dict.fromkeys(names)]
+        missing = [file.name for file in named if not file.is_file()]
+        if missing:
+            self._problems.say(f"metadata.yaml names files that are not there: {', '.join(missing)}")
+        if len(missing) < len(named):
+            return [file for file in named if file.name not in missing]
         found = sorted(
             (file for file in self._path.iterdir() if file.is_file() and _STORAGE.search(file.name)), key=_natural_key
         )
         if not found:
             raise LogError(self._path, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
-        if metadata is None:
-            self._problems.append(f"{self._path.name}: no metadata.yaml; the storage files in it were read by name")
         return found
 
-    def _open_part(self, file: Path, metadata: _Metadata | None) -> None:
-        by_message = metadata is not None and metadata.compression_mode.upper() == "MESSAGE"
-        message_compression = metadata.compression_format if metadata is not None and by_message else ""
+    def _open_part(self, file: Path, message_compression: str) -> None:
         try:
             storage = self._unpacked(file) if file.suffix in (".zstd", ".zst") else file
-            if storage.suffix == ".mcap":
-                self._parts.append(McapFile(storage))
-            else:
-                self._parts.append(SqliteBag(storage, message_compression))
+            kind = McapFile if storage.suffix == ".mcap" else SqliteBag
+            self._parts.append(kind(storage, message_compression))
+            self.files.append(file)
         except LogError as err:
-            self._problems.append(str(err))
+            self._problems.say(f"{file.name}: {err.why}; {err.advice}")
+        except OSError as err:
+            self._problems.say(f"{file.name}: cannot be read; {err.strerror}")
 
     def _unpacked(self, file: Path) -> Path:
         """Decompress a storage file to a temporary folder, a piece at a time."""
@@ -118,17 +139,28 @@ class BagDirectory:
 
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix="icrtool-")
-        target = Path(self._scratch.name) / file.stem
+        folder = Path(self._scratch.name) / str(len(self.files))
+        folder.mkdir(exist_ok=True)
+        target = folder / file.stem
+        left = LARGEST_CHUNK_BYTES + _LARGEST_RATIO * file.stat().st_size
         try:
-            with file.open("rb") as source, target.open("wb") as sink:
-                zstandard.ZstdDecompressor().copy_stream(source, sink)
+            with (
+                file.open("rb") as source,
+                zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True) as reader,
+                target.open("wb") as sink,
+            ):
+                while left > 0 and (piece := reader.read(1 << 20)):
+                    sink.write(piece)
+                    left -= len(piece)
+            if left <= 0:
+                self._problems.say(f"{file.name}: is over {_LARGEST_RATIO} times its size when decompressed; cut there")
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
-            self._problems.append(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
+            self._problems.say(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
         except OSError as err:
-            needed = shutil.disk_usage(self._scratch.name).free
-            raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{needed} bytes are free for it") from err
+            free = shutil.disk_usage(self._scratch.name).free
+            raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err
         return target
 
     def _merge_channels(self) -> list[Channel]:
@@ -146,30 +178,11 @@ class BagDirectory:
                     count = (known.count or 0) + (channel.count or 0) if both else None
                     merged[key] = replace(known, count=count, definition=known.definition or channel.definition)
                 numbers[channel.id] = merged[key].id
-            self._numbers.append(numbers)
+            own = np.array(sorted(numbers), np.int64)
+            self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
         return list(merged.values())
 
 
 def _natural_key(path: Path) -> list[tuple[int, str]]:
     """Sort ``bag_10`` after ``bag_9``."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def _read_metadata(path: Path) -> _Metadata | None:
-    """Return what metadata.yaml says; None where there is none."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    file = path / "metadata.yaml"
-    if not file.is_file():
-        return None
-    try:
-        document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
-        information = document["rosbag2_bagfile_information"]
-        return _Metadata(
-            files=tuple(str(name) for name in information["relative_file_paths"]),
-            compression_mode=str(information.get("compression_mode") or ""),
-            compression_format=str(information.get("compression_format") or ""),
-        )
-    except (YAMLError, KeyError, TypeError, AttributeError, ValueError, OSError) as err:
-        raise LogError(file, "not a rosbag2 metadata file", "remove it to read the storage files by name") from err

@@ -14,6 +14,8 @@ from icrtool.tables import Ints
 
 Bytes = NDArray[np.uint8]
 
+MOST_PROBLEMS = 20
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
@@ -87,7 +89,26 @@ class Container(Protocol):
         ...
 
 
+class Problems(list[str]):
+    """What could not be read of a file, in sentences: each is kept once, and no more of them than a person reads."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self._name = name
+
+    def say(self, problem: str) -> None:
+        """Add a sentence."""
+        text = printable(f"{self._name}: {problem}")
+        if text not in self and len(self) <= MOST_PROBLEMS:
+            self.append(text if len(self) < MOST_PROBLEMS else printable(f"{self._name}: and more of the kind"))
+
+
+def printable(text: str) -> str:
+    """Return a text from a log fit for one line: what is no printable character becomes a replacement character."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def ros_type_name(name: str) -> str:
     """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``."""
-    package, _, rest = name.partition("/")
+    package, _, rest = printable(name).partition("/")
     return f"{package}/{rest.removeprefix('msg/')}"

@@ -63,9 +63,13 @@ class DynamicJointCollector:
         self._definitions, self._source = definitions_of(channel)
         self._collectors: dict[int, TopicCollector] = {}
         self._unreadable = 0
-        encoding = self._collector(0).layout.cdr
+        layout = self._collector(1).layout
+        kinds = {path: slot.kind for path, slot in layout.slots.items()}
+        texts = (_NAMES, "joint 0.interface_names[*]")
+        if "joint 0.values[*]" not in kinds or any(kinds.get(path) != "string" for path in texts):
+            raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
         self._counter = compile_layout(
-            self._unrolled(0), channel.message_type, (_JOINTS,), "cdr" if encoding else "ros1"
+            self._unrolled(0), channel.message_type, (_JOINTS,), "cdr" if layout.cdr else "ros1"
         )
 
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
@@ -83,9 +87,8 @@ class DynamicJointCollector:
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time."""
         tables = [_as_joint_state(each.table(), joints) for joints, each in self._collectors.items()]
-        nothing = TopicTable(
-            self._channel.topic, self._channel.message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source
-        )
+        topic, message_type = self._channel.topic, self._channel.message_type
+        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
         return merge_tables([nothing, *tables])[0]
 
     def _collector(self, joints: int) -> TopicCollector:
@@ -118,12 +121,11 @@ def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
     """Return the table with the columns of a JointState; NaN where a joint has no such interface."""
     columns = {path: values for path, values in table.columns.items() if path in _HEADER}
     texts = {path: texts for path, texts in table.texts.items() if path in _HEADER}
-    names = table.find(_NAMES)
-    if names is None:
+    if not len(table):
         return table
+    names, texts["name[*]"] = table.words(_NAMES)
     columns["name[*]"] = np.full((len(table), joints), -1, np.int64)
     columns["name[*]"][:, : names.shape[1]] = names[:, :joints]
-    texts["name[*]"] = table.texts[_NAMES]
     for quantity in ("position", "velocity"):
         column = columns[f"{quantity}[*]"] = np.full((len(table), joints), np.nan)
         for j in range(joints):
@@ -135,9 +137,8 @@ def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
 
 def _interface(table: TopicTable, joint: str, quantity: str) -> NDArray[np.float64]:
     """Return the values (n,) that stand at the place of an interface's name, NaN where the name is not listed."""
-    names, values = table.column(f"{joint}interface_names[*]"), table.column(f"{joint}values[*]")
+    (names, texts), values = table.words(f"{joint}interface_names[*]"), table.column(f"{joint}values[*]")
     told = np.full(len(table), np.nan)
-    texts = table.texts[f"{joint}interface_names[*]"]
     if quantity not in texts:
         return told
     for place in range(min(names.shape[1], values.shape[1])):

@@ -61,9 +61,10 @@ class Layout:
     slots: dict[str, Slot]
     cdr: bool
 
-    def has(self, path: str) -> bool:
-        """Say whether the message type has this field."""
-        return path in self.slots
+    @property
+    def count_columns(self) -> set[int]:
+        """The columns that hold the number of elements of a sequence."""
+        return {slot.count_column for slot in self.slots.values() if slot.count_column >= 0}
 
     def numbers(self, table: NDArray[np.uint64], path: str) -> NDArray[Any]:
         """Return a numeric field: (n,) or, for an array, (n, longest) with what a message lacks as NaN or 0."""

@@ -14,12 +14,13 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.logio.channel import Block, Channel, Container
+from icrtool.logio.dynamic_joints import Collector, collector_for
 from icrtool.logio.heading_sources import Convention, HeadingSource
 from icrtool.logio.open_log import open_log
 from icrtool.logio.position_sources import PositionSource
-from icrtool.logio.select import Candidates, choose, common_clock, fields_to_take, find_candidates
+from icrtool.logio.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
 from icrtool.logio.stamps import StampedRows, increasing, rate_and_jitter
-from icrtool.logio.topic_table import TopicCollector, TopicTable, merge_tables
+from icrtool.logio.topic_table import TopicTable, merge_tables
 from icrtool.logio.wheel_speeds import wheel_samples
 from icrtool.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
 
@@ -107,14 +108,8 @@ def log_name(path: Path) -> str:
 def assemble(survey: Survey, config: Config) -> RobotLog:
     """Choose the streams of a surveyed log and convert them; errors as `read_log`."""
     found, name = survey.candidates, survey.name
-    topics = config.topics
-
-    def pick(role: Role, sources: tuple, configured: str | None):  # type: ignore[no-untyped-def,type-arg]  # per-role types
-        return choose(role, sources, configured, survey.path, survey.channels, found.unread)
-
-    motion, wheels_why = pick("wheels", found.wheels, topics.wheels or topics.wheel_left and None)
-    position, gnss_why = pick("gnss", found.gnss, topics.gnss)
-    source, heading_why = pick("heading", found.heading, topics.heading)
+    choice = choose_streams(found, config, survey.path, survey.channels)
+    motion, position, source = choice.wheels, choice.gnss, choice.heading
     delays = [
         s.delay_ns / 1e9 if s.header_ns is not None else None for s in (motion.stamps, position.stamps, source.stamps)
     ]
@@ -132,9 +127,9 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     if source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     streams = (
-        _stream("wheels", motion, samples.stamp_ns, clock, f"{wheels_why}; {how}"),
-        _stream("gnss", position, gnss.stamp_ns, clock, gnss_why),
-        _stream("heading", source, heading.stamp_ns, clock, f"{heading_why}; {convention}"),
+        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
+        _stream("gnss", position, gnss.stamp_ns, clock, choice.why["gnss"]),
+        _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )
     unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
@@ -150,11 +145,11 @@ def _collect(
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Take the columns of all channels that some role may need, in one pass over the log."""
     unread: dict[str, str] = {}
-    collectors: dict[int, TopicCollector] = {}
+    collectors: dict[int, Collector] = {}
     by_id = {channel.id: channel for channel in container.channels}
     for number, paths in fields_to_take(container.channels, config).items():
         try:
-            collectors[number] = TopicCollector(by_id[number], paths)
+            collectors[number] = collector_for(by_id[number], paths)
         except DefinitionError as err:
             unread[by_id[number].topic] = str(err)
     for block in _ahead(container.blocks(frozenset(collectors)), pool):

@@ -15,11 +15,11 @@ BAG_MESSAGE, BAG_CONNECTION = 2, 7
 
 @njit
 def little_endian(data: Bytes, at: int, size: int) -> int:
-    """Return the unsigned little-endian integer of `size` bytes."""
+    """Return the unsigned little-endian integer of `size` bytes; over 2^63 it comes out negative."""
     value = np.uint64(0)
     for i in range(size):
         value |= np.uint64(data[at + i]) << np.uint64(8 * i)
-    return np.int64(value)
+    return int(np.int64(value))
 
 
 @njit
@@ -61,7 +61,8 @@ def scan_mcap(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, in
 def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int]:
     """Find message and connection records of a ROS 1 bag chunk.
 
-    Parameters and returns as `scan_mcap`; for a connection the range is that of its data (its own header).
+    Parameters and returns as `scan_mcap`; for a connection the range is that of its data (the header its publisher
+    sent), and the place of the record's own header stands instead of the log time.
     """
     at, count, size = begin, 0, len(data)
     while at + 4 <= size and count < len(rows):
@@ -90,7 +91,7 @@ def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int
         if opcode in (BAG_MESSAGE, BAG_CONNECTION):
             rows[count, 0] = opcode
             rows[count, 1] = connection
-            rows[count, 2] = stamp
+            rows[count, 2] = stamp if opcode == BAG_MESSAGE else header
             rows[count, 3] = content
             rows[count, 4] = content + length
             count += 1

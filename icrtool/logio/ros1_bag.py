@@ -3,36 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Channel, ros_type_name
-from icrtool.logio.decompress import DecompressionError, decompress
+from icrtool.logio.channel import Block, Channel, Problems, printable, ros_type_name
+from icrtool.logio.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress
 from icrtool.logio.records import BAG_CONNECTION, BAG_MESSAGE, RecordTable
 
 MAGIC = b"#ROSBAG V2.0\n"
-_BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO = 3, 4, 5, 6
+_BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
 _LARGEST_HEADER_BYTES = 1 << 24
 
 
 class _Record(NamedTuple):
     """A top-level record: header fields, file offset of its data, length of its data."""
 
-    fields: dict[str, bytes]
+    fields: dict[bytes, bytes]
     at: int
     length: int
 
     @property
     def op(self) -> int:
-        return int.from_bytes(self.fields.get("op", b"\0"), "little")
+        return self.number(b"op", 1)
 
-    def number(self, name: str) -> int:
-        return int.from_bytes(self.fields.get(name, b""), "little")
+    def number(self, name: bytes, size: int = 4) -> int:
+        return int.from_bytes(self.fields.get(name, b"")[:size], "little")
 
-    def text(self, name: str) -> str:
+    def text(self, name: bytes) -> str:
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
@@ -55,19 +56,19 @@ class Ros1Bag:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.files = [path]
-        self.problems: list[str] = []
+        self.problems = Problems(path.name)
         self._table = RecordTable()
         self._connections: dict[int, Channel] = {}
-        self._counts: dict[int, int] = {}
         self._stream = path.open("rb")
-        self._size = path.stat().st_size
         try:
+            self._size = path.stat().st_size
             self._check_start()
             self._chunks = self._read_index()
             if self._chunks is None:
-                for _ in self._walk(frozenset(), report=False):
+                self.problems.say("has no index (not closed, or cut off); read from start to end")
+                for _ in self._walk(learn=True):
                     pass
-        except LogError:
+        except BaseException:
             self.close()
             raise
         self.channels = list(self._connections.values())
@@ -85,42 +86,38 @@ class Ros1Bag:
         if not wanted:
             return
         if self._chunks is None:
-            self.problems.append(f"{self._path.name}: has no index (not closed, or cut off); read from start to end")
-            yield from self._walk(wanted, report=True)
+            yield from self._walk()
             return
         for chunk in self._chunks:
             if chunk.connections is not None and not chunk.connections & wanted:
                 continue
             record = self._record(chunk.at)
             if record is None or record.op != _CHUNK:
-                self.problems.append(f"{self._path.name}: no chunk at byte {chunk.at}, where the index says one is")
+                self.problems.say(f"no chunk at byte {chunk.at}, where the index says one is")
                 continue
-            block = self._read_chunk(record, wanted, report=True)
+            block = self._read_chunk(record)
             if block is not None:
                 yield block
 
     def _check_start(self) -> None:
         start = self._stream.read(len(MAGIC))
-        if start[:9] == b"#ROSBAG V" and start != MAGIC:
-            raise LogError(self._path, "a bag of another version", "only 2.0 is read; `rosbag fix` turns older ones into it")
+        if start[:9] == MAGIC[:9] and start != MAGIC:
+            raise LogError(
+                self._path, "a bag of another version", "only 2.0 is read; `rosbag fix` turns older ones into it"
+            )
         if start != MAGIC:
             raise LogError(self._path, "not a ROS 1 bag", "its first bytes are not a bag's")
 
     def _record(self, at: int) -> _Record | None:
         """Read the header of the record at a file offset; None where no whole header stands."""
-        self._stream.seek(at)
-        head = self._stream.read(4)
-        header_length = int.from_bytes(head, "little")
-        if len(head) < 4 or header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
+        if not 0 <= at < self._size:
             return None
-        header = self._stream.read(header_length)
+        self._stream.seek(at)
+        header_length = int.from_bytes(self._stream.read(4), "little")
+        if header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
+            return None
+        fields = _header_fields(self._stream.read(header_length))
         length = int.from_bytes(self._stream.read(4), "little")
-        fields, place = {}, 0
-        while place + 4 <= len(header):
-            end = place + 4 + int.from_bytes(header[place : place + 4], "little")
-            name, _, value = header[place + 4 : end].partition(b"=")
-            fields[name.decode("ascii", "replace")] = value
-            place = end
         return _Record(fields, at + header_length + 8, length)
 
     def _read_index(self) -> list[_Chunk] | None:
@@ -128,101 +125,106 @@ class Ros1Bag:
         first = self._record(len(MAGIC))
         if first is None or first.op != _BAG_HEADER:
             return None
-        if first.text("encryptor"):
+        if first.text(b"encryptor"):
             raise LogError(self._path, "an encrypted bag", "decrypt it first")
-        at, chunks, chunk_count = first.number("index_pos"), [], first.number("chunk_count")
-        if not 0 < at <= self._size:
+        at = first.number(b"index_pos", 8)
+        if at <= 0:
             return None
-        while at < self._size:
+        chunks: dict[int, _Chunk] = {}
+        counts: dict[int, int] = {}
+        while at != self._size:
             record = self._record(at)
-            if record is None or record.at + record.length > self._size:
+            if record is None or record.length > min(_LARGEST_HEADER_BYTES, self._size - record.at):
                 return None
             self._stream.seek(record.at)
             content = self._stream.read(record.length)
             if record.op == BAG_CONNECTION:
-                self._learn(record.number("conn"), record.text("topic"), content)
+                self._learn(record.number(b"conn"), record.text(b"topic"), content)
             elif record.op == _CHUNK_INFO:
-                counts = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2)
-                for connection, count in counts.tolist():
-                    self._counts[connection] = self._counts.get(connection, 0) + count
-                chunks.append(_Chunk(record.number("chunk_pos"), frozenset(counts[:, 0].tolist()) or None))
+                held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
+                for connection, count in held:
+                    counts[connection] = counts.get(connection, 0) + count
+                place = record.number(b"chunk_pos", 8)
+                chunks[place] = _Chunk(place, frozenset(connection for connection, _ in held) or None)
             else:
                 return None
             at = record.at + record.length
-        if len(chunks) != chunk_count:
+        if (len(chunks), len(self._connections)) != (first.number(b"chunk_count"), first.number(b"conn_count")):
             return None
-        self._connections = {
-            number: Channel(c.id, c.topic, c.message_type, c.encoding, c.definition, count=self._counts.get(number, 0))
-            for number, c in self._connections.items()
-        }
-        return sorted(chunks, key=lambda chunk: chunk.at)
+        self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
+        return sorted(chunks.values(), key=lambda chunk: chunk.at)
 
-    def _walk(self, wanted: frozenset[int], *, report: bool) -> Iterator[Block]:
-        """Go through the records one after the other, as far as they can be read."""
+    def _walk(self, *, learn: bool = False) -> Iterator[Block]:
+        """Go through the records one after the other, as far as they can be read.
+
+        Parameters
+        ----------
+        learn : remember connections
+        """
         at = len(MAGIC)
         while at < self._size:
             record = self._record(at)
-            if record is None or not record.fields or not 0 < record.op <= BAG_CONNECTION:
+            if record is None or not 0 < record.op <= BAG_CONNECTION:
                 break
-            cut = record.at + record.length > self._size
+            cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                block = self._read_chunk(record, wanted, report=report, cut=cut)
+                block = self._read_chunk(record, learn=learn, cut=cut)
                 if block is not None:
                     yield block
             if cut:
                 break
-            if record.op == BAG_CONNECTION:
+            if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_HEADER_BYTES:
                 self._stream.seek(record.at)
-                self._learn(record.number("conn"), record.text("topic"), self._stream.read(record.length))
+                self._learn(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
             at = record.at + record.length
-        if report and at < self._size:
-            self.problems.append(
-                f"{self._path.name}: cut off or damaged at byte {at} of {self._size}; what stands before it was read"
-            )
+        if at < self._size:
+            self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
 
-    def _read_chunk(self, record: _Record, wanted: frozenset[int], *, report: bool, cut: bool = False) -> Block | None:
-        self._stream.seek(record.at)
-        packed = self._stream.read(record.length)
+    def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Block | None:
+        size = record.number(b"size")
         try:
-            size = record.number("size")
-            data = np.frombuffer(decompress(packed, record.text("compression"), size, partial=cut), np.uint8)
+            if record.length > LARGEST_CHUNK_BYTES:
+                raise DecompressionError(f"it claims {record.length} bytes")
+            self._stream.seek(record.at)
+            packed = self._stream.read(record.length)
+            data = np.frombuffer(decompress(packed, record.text(b"compression"), size, partial=cut), np.uint8)
         except DecompressionError as err:
-            if report:
-                self.problems.append(f"{self._path.name}: chunk at byte {record.at} left out: {err.args[0]}")
+            if not cut:
+                self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")
             return None
         rows, stop = self._table.scan_bag(data)
-        if report and stop < len(data) and not cut:
-            self.problems.append(
-                f"{self._path.name}: chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged"
-            )
-        if self._chunks_unknown():
-            for row in rows[rows[:, 0] == BAG_CONNECTION]:
-                self._learn(int(row[1]), "", bytes(data[row[3] : row[4]]))
-        if not wanted:
-            return None
+        if stop < len(data) and not cut:
+            self.problems.say(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+        if learn:
+            for _, number, header, start, end in rows[rows[:, 0] == BAG_CONNECTION].tolist():
+                topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
+                self._learn(number, topic, bytes(data[start:end]))
         rows = rows[rows[:, 0] == BAG_MESSAGE]
         return Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
 
-    def _chunks_unknown(self) -> bool:
-        return getattr(self, "_chunks", None) is None
-
     def _learn(self, number: int, topic: str, content: bytes) -> None:
         """Remember a connection record; `content` is the header that the publisher sent."""
-        fields, place = {}, 0
-        while place + 4 <= len(content):
-            end = place + 4 + int.from_bytes(content[place : place + 4], "little")
-            name, _, value = content[place + 4 : end].partition(b"=")
-            fields[name.decode("ascii", "replace")] = value.decode("utf-8", "replace")
-            place = end
-        if number in self._connections or "type" not in fields:
+        fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
+        if number in self._connections or b"type" not in fields:
             return
         self._connections[number] = Channel(
             id=number,
-            topic=topic or fields.get("topic", ""),
-            message_type=ros_type_name(fields["type"]),
+            topic=printable(topic or fields.get(b"topic", "")),
+            message_type=ros_type_name(fields[b"type"]),
             encoding="ros1",
-            definition=fields.get("message_definition", ""),
+            definition=fields.get(b"message_definition", ""),
         )
+
+
+def _header_fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a record's or a connection's header by name."""
+    fields, place = {}, 0
+    while place + 4 <= len(header):
+        end = place + 4 + int.from_bytes(header[place : place + 4], "little")
+        name, _, value = header[place + 4 : end].partition(b"=")
+        fields[name] = value
+        place = end
+    return fields
 
 
 def is_ros1_bag(stream: BinaryIO) -> bool:

@@ -7,9 +7,11 @@ from collections.abc import Iterable, Sequence
 
 _WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
 _OTHER_JOINTS = re.compile(
-    r"arm|gripper|flipper|finger|steer|pan|tilt|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension|lift", re.IGNORECASE
+    r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
-_TOKENS = re.compile(r"[a-z]+|[A-Z][a-z]*|[A-Z]+(?![a-z])|\d+")
+"""Words of a joint's name, whole ones: a Panther's wheels do not pan."""
+
+_TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
 _RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "rwheel", "wr"}
 
@@ -19,19 +21,28 @@ def side_of(name: str) -> str:
     lowered = name.lower()
     if ("left" in lowered) != ("right" in lowered):
         return "left" if "left" in lowered else "right"
-    tokens = {token.lower() for token in _TOKENS.findall(name.replace("_", " "))}
+    tokens = set(_words(name))
     left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
     if left == right:
         return ""
     return "left" if left else "right"
 
 
+def _words(name: str) -> list[str]:
+    """Return the words of a name, lower case: ``wheel_FL_joint``, ``frontLeftWheel``, ``panther/rl_wheel_joint``."""
+    return [word.lower() for word in _TOKENS.findall(name.replace("_", " "))]
+
+
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
     """Return the places of the left and of the right wheel joints among the names of a message."""
-    usable = [i for i, name in enumerate(names) if side_of(name) and not _OTHER_JOINTS.search(name)]
+    usable = [i for i, name in enumerate(names) if side_of(name) and not _belongs_elsewhere(name)]
     named = [i for i in usable if _WHEEL_WORDS.search(names[i])]
     chosen = named or usable
     return [i for i in chosen if side_of(names[i]) == "left"], [i for i in chosen if side_of(names[i]) == "right"]
+
+
+def _belongs_elsewhere(name: str) -> bool:
+    return any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
 
 
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:

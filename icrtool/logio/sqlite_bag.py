@@ -1,21 +1,29 @@
-"""rosbag2's sqlite3 storage: one ``.db3`` file."""
+"""rosbag2's sqlite3 storage: one ``.db3`` file, whole or damaged, with or without a write-ahead log beside it."""
 
 from __future__ import annotations
 
+import os
 import sqlite3
+import struct
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Channel, ros_type_name
-from icrtool.logio.decompress import DecompressionError, decompress_message
+from icrtool.logio.channel import Block, Channel, Problems, printable, ros_type_name
+from icrtool.logio.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
 
 MAGIC = b"SQLite format 3\0"
-_ROWS_A_BLOCK = 4096
+_FIRST_ROWS, _MOST_ROWS = 64, 4096
+_BLOCK_BYTES = 1 << 24
+_UNKNOWN_ROWS = 1 << 40
+
+Row = tuple[Any, Any, Any, int]
+"""Topic id, log time [ns], message, row number. SQLite holds a column to no type."""
 
 
 class SqliteBag:
@@ -23,7 +31,7 @@ class SqliteBag:
 
     Parameters
     ----------
-    message_compression : ``zstd`` where each message was compressed on its own, else empty
+    message_compression : how each message was compressed on its own (rosbag2's metadata.yaml tells), empty if not told
 
     Raises
     ------
@@ -33,91 +41,209 @@ class SqliteBag:
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
         self._path = path
-        self._message_compression = message_compression
         self.files = [path]
-        self.problems: list[str] = []
-        journal = path.with_name(path.name + "-wal")
-        # Without immutable=1 SQLite wants to write beside a log that was recorded in WAL mode.
-        immutable = "" if journal.exists() and journal.stat().st_size else "&immutable=1"
-        self._database = sqlite3.connect(
-            f"file:{quote(str(path.absolute()))}?mode=ro{immutable}", uri=True, check_same_thread=False
-        )
-        self._last_row = self._rows = 0
+        self.problems = Problems(path.name)
+        self._made_beside: Path | None = None
+        self._last_row = 0
         try:
-            self.channels = self._read_topics()
-            self._rows = int(self._database.execute("SELECT max(id) FROM messages").fetchone()[0] or 0)
-        except sqlite3.DatabaseError as err:
-            self.close()
-            raise LogError(path, "not a readable rosbag2 database", str(err)) from err
+            self._database = self._connect()
+            try:
+                self.channels = self._read_topics()
+                self._message_compression = message_compression or self._found_compression()
+                self._rows = self._count_rows()
+            except BaseException:
+                self.close()
+                raise
+        except sqlite3.Error as err:
+            found = "; ".join([printable(str(err)), *self.problems])
+            raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""
         return self._last_row / max(self._rows, 1)
 
     def close(self) -> None:
-        """Release the database."""
+        """Release the database; nothing stays beside it that was not there before."""
         self._database.close()
+        if self._made_beside is not None:
+            self._made_beside.unlink(missing_ok=True)
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted topics in the order they were stored."""
+        if not wanted:
+            return
+        blocks = self._stored(wanted)
+        if self._message_compression:
+            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
+        yield from blocks
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open the database to read, with the write-ahead log that a recorder leaves when it is killed."""
+        log, index = (self._path.with_name(self._path.name + end) for end in ("-wal", "-shm"))
+        if log.exists() and log.stat().st_size:
+            self._made_beside = None if os.path.lexists(index) else index
+            database = self._open("mode=ro")
+            try:
+                database.execute("SELECT name FROM sqlite_master")
+            except sqlite3.OperationalError as err:
+                database.close()
+                self.problems.say(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
+            else:
+                return database
+        # Without `immutable` SQLite wants to write beside a log that was recorded in WAL mode.
+        database = self._open("mode=ro&immutable=1")
+        try:
+            database.execute("SELECT name FROM sqlite_master")
+        except sqlite3.DatabaseError:
+            # SQLite refuses a file that is shorter than its header says. With this it reads the pages that are there.
+            database.execute("PRAGMA writable_schema = ON")
+        return database
+
+    def _open(self, mode: str) -> sqlite3.Connection:
+        name = quote(os.fsencode(self._path.absolute()))
+        database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK_BYTES)
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
+        return database
 
     def _read_topics(self) -> list[Channel]:
-        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type='table'")}
+        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(tables)) or 'none'}")
-        definitions: dict[str, tuple[str, str]] = {}
-        if "message_definitions" in tables:
-            for name, encoding, text in self._database.execute(
-                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            ):
-                definitions[name] = (encoding, text)
+            raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(map(str, tables))) or 'none'}")
+        definitions = self._read_definitions() if "message_definitions" in tables else {}
         channels = []
         for number, topic, name, encoding in self._database.execute(
-            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+            "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer' ORDER BY id"
         ):
             written, text = definitions.get(name, ("", ""))
             channels.append(
                 Channel(
-                    id=int(number),
-                    topic=str(topic),
+                    id=number,
+                    topic=printable(str(topic)),
                     message_type=ros_type_name(str(name)),
-                    encoding=str(encoding),
+                    encoding=printable(str(encoding)),
                     definition=text if written in ("ros2msg", "ros2idl") else "",
                     definition_format="idl" if written == "ros2idl" else "msg",
                 )
             )
         return channels
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the wanted topics in the order they were stored."""
-        if not wanted:
-            return
-        places = ",".join(str(number) for number in sorted(wanted))
+    def _read_definitions(self) -> dict[str, tuple[str, str]]:
+        """Return encoding and text of the message definitions by type."""
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        try:
+            return {name: (encoding, str(text)) for name, encoding, text in self._database.execute(query)}
+        except sqlite3.Error as err:
+            self.problems.say(f"its message definitions cannot be read ({err})")
+            return {}
+
+    def _found_compression(self) -> str:
+        """Tell message compression by the first message: a serialised one never begins like a compressed one."""
+        try:
+            first = self._database.execute("SELECT data FROM messages LIMIT 1").fetchone()
+        except sqlite3.Error:
+            return ""
+        return "zstd" if first and isinstance(first[0], bytes) and first[0].startswith(ZSTD_MAGIC) else ""
+
+    def _count_rows(self) -> int:
+        try:
+            return self._database.execute("SELECT max(rowid) FROM messages").fetchone()[0] or 0
+        except sqlite3.Error:
+            return _UNKNOWN_ROWS
+
+    def _stored(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages as they are stored; where pages are damaged, go on behind them."""
         # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
-        cursor = self._database.cursor()
-        cursor.arraysize = _ROWS_A_BLOCK
-        try:
-            cursor.execute(f"SELECT topic_id, timestamp, data, id FROM messages WHERE topic_id IN ({places})")  # noqa: S608
-            while rows := cursor.fetchmany():
-                yield self._block(rows)
-        except sqlite3.DatabaseError as err:
-            self.problems.append(f"{self._path.name}: damaged ({err}); what stands before the damage was read")
+        topics, lost = (",".join(str(number) for number in sorted(rows)) for rows in (wanted, self._rows_cut_off()))
+        of_topics = f"topic_id IN ({topics}) AND rowid NOT IN ({lost})"
+        query = f"SELECT topic_id, timestamp, data, rowid FROM messages WHERE {of_topics} AND rowid > ?"  # noqa: S608
+        after, step = 0, 1
+        while after < self._rows:
+            damage: sqlite3.Error | None = None
+            for rows, damage in self._batches(query, after):  # noqa: B007 - the last one is looked at below
+                if rows:
+                    self._last_row = after = max(after, rows[-1][3])
+                    step = 1
+                    yield self._block(rows)
+            if damage is None:
+                return
+            self.problems.say(f"damaged ({damage}); what could be read of it was read")
+            after, step = after + step, 2 * step
 
-    def _block(self, rows: list[tuple[int, int, bytes, int]]) -> Block:
-        channels, times, messages, numbers = zip(*rows, strict=True)
-        self._last_row = numbers[-1]
-        if self._message_compression:
-            messages = tuple(self._unpack(message) for message in messages)
-        lengths = np.fromiter(map(len, messages), np.int64, len(messages))
-        end = np.cumsum(lengths)
-        data = np.frombuffer(b"".join(messages), np.uint8)
-        return Block(data, np.array(channels, np.int64), np.array(times, np.int64), end - lengths, end)
+    def _rows_cut_off(self) -> frozenset[int]:
+        """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it."""
+        size = self._path.stat().st_size
+        with self._path.open("rb") as stream:
+            # The field has two bytes, and 1 stands for 65536.
+            page_bytes = int.from_bytes(stream.read(18)[16:], "big")
+            page_bytes = page_bytes if page_bytes > 1 else 1 << 16
+            if size % page_bytes == 0:
+                return frozenset()
+            stream.seek(size - size % page_bytes)
+            page = stream.read()
+        self.problems.say("cut off; what could be read of it was read")
+        return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
-    def _unpack(self, message: bytes) -> bytes:
+    def _batches(self, query: str, after: int) -> Iterator[tuple[list[Row], sqlite3.Error | None]]:
+        """Yield rows, some megabytes at a time; at a damage those before it, and the damage."""
+        count = _FIRST_ROWS
         try:
-            return decompress_message(message, self._message_compression)
-        except DecompressionError as err:
-            problem = f"{self._path.name}: messages that do not decompress left out: {err.args[0]}"
-            if problem not in self.problems:
-                self.problems.append(problem)
-            return b""
+            cursor = self._database.execute(query, (after,))
+        except sqlite3.Error as err:
+            yield [], err
+            return
+        while True:
+            rows: list[Row] = []
+            try:
+                rows.extend(islice(cursor, count))
+            except sqlite3.Error as err:
+                yield rows, err
+                return
+            yield rows, None
+            if len(rows) < count:
+                return
+            held = sum(len(row[2]) for row in rows if isinstance(row[2], bytes))
+            count = max(1, min(_MOST_ROWS, _BLOCK_BYTES * len(rows) // max(held, 1)))
+
+    def _block(self, rows: list[Row]) -> Block:
+        try:
+            return _packed(rows)
+        except (TypeError, ValueError, OverflowError):
+            sound = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
+            self.problems.say(f"{len(rows) - len(sound)} rows without a time or a message left out")
+            return _packed(sound)
+
+
+def _packed(rows: list[Row]) -> Block:
+    """Join the messages of rows to one buffer."""
+    messages = [row[2] for row in rows]
+    end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
+    start = np.concatenate([[0], end])[:-1].astype(np.int64)
+    times = np.array([row[1] for row in rows], np.int64)
+    return Block(
+        np.frombuffer(b"".join(messages), np.uint8), np.array([row[0] for row in rows], np.int64), times, start, end
+    )
+
+
+def _table_rows(page: bytes) -> Iterator[tuple[int, int]]:
+    """Yield row number and end of the rows on a leaf page of a table (https://sqlite.org/fileformat.html, 1.6)."""
+    if page[:1] != b"\x0d":
+        return
+    count = min(int.from_bytes(page[3:5], "big"), (len(page) - 8) // 2)
+    for (place,) in struct.iter_unpack(">H", page[8 : 8 + 2 * max(count, 0)]):
+        length, at = _variable_integer(page, place)
+        row, at = _variable_integer(page, at)
+        yield row, at + length
+
+
+def _variable_integer(page: bytes, at: int) -> tuple[int, int]:
+    """Return SQLite's integer of one to nine bytes at a place, and the place behind it."""
+    value = 0
+    for byte in page[at : at + 8]:
+        value, at = value << 7 | byte & 0x7F, at + 1
+        if byte < 0x80:
+            return value, at
+    return value << 8 | int.from_bytes(page[at : at + 1], "big"), at + 1
 
 
 def is_sqlite(stream: BinaryIO) -> bool:

@@ -51,6 +51,8 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     delay = int(np.median(log_ns - header))
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
+    # A few stamps of another clock (a first message at 0) are put where their log times say.
+    header = np.where(np.abs(log_ns - header - delay) > NEAR_NS, log_ns - delay, header)
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
@@ -65,13 +67,13 @@ def increasing(stamps: Ints) -> tuple[Ints, int, int]:
     backwards = int(np.count_nonzero(np.diff(stamps) < 0))
     order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
     ordered = stamps[order]
-    keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)  # noqa: FBT003
+    keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
     return order[keep], backwards, len(stamps) - int(np.count_nonzero(keep))
 
 
 def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
     """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""
-    if len(stamps) < 2:  # noqa: PLR2004 - an interval needs two ends
+    if len(stamps) < 2:
         return float("nan"), float("nan")
     interval = np.diff(stamps)
     median = float(np.median(interval))

@@ -49,17 +49,29 @@ class TopicTable:
         return next((self.columns[path] for path in paths if path in self.columns), None)
 
     def column(self, *paths: str) -> NDArray[Any]:
-        """Return the first of these columns that the type has.
+        """Return the first of these columns of numbers that the type has.
 
         Raises
         ------
         DefinitionError
             The type, as the log defines it, has none of them.
         """
-        values = self.find(*paths)
+        values = self.find(*(path for path in paths if path not in self.texts))
         if values is None:
-            raise DefinitionError(self.topic, f"its {self.message_type} has no field {' or '.join(paths)}")
+            raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
         return values
+
+    def words(self, path: str) -> tuple[Ints, list[str]]:
+        """Return a column of texts as indices (n,) or (n, k), -1 where a message has less, and the texts.
+
+        Raises
+        ------
+        DefinitionError
+            The type, as the log defines it, has no such field.
+        """
+        if path not in self.texts:
+            raise DefinitionError(self.topic, f"its {self.message_type} has no text {path}")
+        return self.columns[path], self.texts[path]
 
     def floats(self, *paths: str) -> NDArray[np.float64]:
         """Return the first of these columns as float64, NaN everywhere when the type has none."""
@@ -115,23 +127,25 @@ class TopicCollector:
     @property
     def layout(self) -> Layout:
         """The compiled layout."""
-        assert self._layout is not None
+        if self._layout is None:
+            raise ValueError("the layout is compiled when the collector is made")
         return self._layout
 
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
         start, end = block.start[chosen], block.end[chosen]
         table, readable = walk_messages(self.layout, block.data, start, end)
-        most = max((int(self.layout.counts(table[readable], path).max(initial=0)) for path in self.layout.slots), default=0)
+        told = table if readable.all() else table[readable]
+        most = max((int(told[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
         if self._capacity < min(most, self.largest_capacity):
             self._capacity = min(most, self.largest_capacity)
             self._compile()
             table, readable = walk_messages(self.layout, block.data, start, end)
-        self._unreadable += len(readable) - int(np.count_nonzero(readable))
-        table = table[readable]
+            told = table if readable.all() else table[readable]
+        self._unreadable += len(table) - len(told)
         self._times.append(block.log_time_ns[chosen][readable])
         for path, slot in self.layout.slots.items():
-            values = self._codes(path, table, block) if slot.kind == "string" else self.layout.numbers(table, path)
+            values = self._codes(path, told, block) if slot.kind == "string" else self.layout.numbers(told, path)
             self._parts.setdefault(path, []).append(values)
 
     def _codes(self, path: str, table: NDArray[np.uint64], block: Block) -> NDArray[np.uint64]:
@@ -200,17 +214,18 @@ def _merged(group: list[TopicTable]) -> TopicTable:
             renumber = [np.array([*(texts[path].index(t) for t in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
         columns[path] = _joined(parts, -1 if path in texts else 0)[order]
-    first = group[0]
-    return TopicTable(first.topic, first.message_type, times[order], columns, texts, unreadable, first.definition_source)
+    return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)
 
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
     """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
-    if parts[0].ndim == 2:  # noqa: PLR2004 - rows and elements
+    if parts[0].ndim == 2:
         width = max(part.shape[1] for part in parts)
         lacking = np.nan if parts[0].dtype.kind == "f" else lacking
         parts = [
-            part if part.shape[1] == width else np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
+            np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
+            if part.shape[1] < width
+            else part
             for part in parts
         ]
     return np.concatenate(parts)

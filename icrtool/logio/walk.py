@@ -45,6 +45,21 @@ def read_word(data: Bytes, at: int, size: int, big: bool) -> np.uint64:
 
 
 @njit
+def hash_text(data: Bytes, at: int, length: int) -> np.uint64:
+    """Return a 64-bit hash of `length` bytes, eight at a time (FNV-1a over words, folded so that no bit is lost)."""
+    code = _FNV_OFFSET ^ np.uint64(length)
+    place, words_end = at, at + (length & ~7)
+    while place < words_end:
+        code = (code ^ read_word(data, place, 8, False)) * _FNV_PRIME
+        code ^= code >> np.uint64(29)
+        place += 8
+    if place < at + length:
+        code = (code ^ read_word(data, place, at + length - place, False)) * _FNV_PRIME
+        code ^= code >> np.uint64(29)
+    return code
+
+
+@njit
 def walk(
     data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools
 ) -> None:
@@ -71,6 +86,18 @@ def walk(
         while step < len(program):
             operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
             capacity = program[step, 4]
+            if operation == SKIP or operation == TAKE:
+                if cdr:
+                    at += (base - at) & (size - 1)
+                if at + size * count > stop:
+                    readable[m] = False
+                    break
+                if operation == TAKE and taking:
+                    for i in range(count):
+                        table[m, column + shift + i] = read_word(data, at + i * size, size, big)
+                at += size * count
+                step += 1
+                continue
             if operation == END_LOOP:
                 left[depth - 1] -= 1
                 if left[depth - 1] > 0:
@@ -105,7 +132,8 @@ def walk(
                 if count == 0:
                     step = program[step, 6]
                     continue
-                if depth >= _MAX_NESTING:
+                # An element takes a byte at least: elements of no fields would loop for free.
+                if depth >= _MAX_NESTING or count > stop - at:
                     readable[m] = False
                     break
                 returns[depth], left[depth], column_base[depth], iteration[depth] = step, count, shift, 0
@@ -115,9 +143,7 @@ def walk(
             if operation in (SKIP_STRING, TAKE_STRING):
                 if operation == TAKE_STRING and taking:
                     length = count - 1 if cdr and count > 0 else count
-                    code = _FNV_OFFSET
-                    for i in range(length):
-                        code = (code ^ np.uint64(data[at + i])) * _FNV_PRIME
+                    code = hash_text(data, at, length)
                     table[m, column + shift] = np.uint64(at)
                     table[m, column + shift + 1] = np.uint64(length)
                     table[m, column + shift + 2] = code
@@ -129,10 +155,7 @@ def walk(
             if at + size * count > stop:
                 readable[m] = False
                 break
-            if operation == TAKE and taking:
-                for i in range(count):
-                    table[m, column + shift + i] = read_word(data, at + i * size, size, big)
-            elif operation == TAKE_SEQUENCE and taking:
+            if operation == TAKE_SEQUENCE and taking:
                 for i in range(min(count, capacity)):
                     table[m, column + shift + 1 + i] = read_word(data, at + i * size, size, big)
             at += size * count
@@ -143,5 +166,10 @@ def walk_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[
     """Return the table (n, columns) of a layout's fields for messages in `data`, and which of them were readable."""
     table = np.zeros((len(start), layout.columns), np.uint64)
     readable = np.empty(len(start), np.bool_)
-    walk(data, start, end, layout.program, layout.cdr, table, readable)
+    if layout.program[:, 2].max(initial=0) > len(data):
+        # A fixed array that is longer than all messages together: a definition that is not theirs. Its length times
+        # the size of an element may be more than an integer holds.
+        readable[:] = False
+    else:
+        walk(data, start, end, layout.program, layout.cdr, table, readable)
     return table, readable

@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.config import Config
-from icrtool.logio.sides import side_of, wheel_joints
+from icrtool.errors import DefinitionError
+from icrtool.logio.dynamic_joints import DYNAMIC_JOINT_STATE
+from icrtool.logio.position_sources import REFERENCE_WORDS
+from icrtool.logio.sides import wheel_joints
 from icrtool.logio.stamps import StampedRows, stamp_rows
 from icrtool.logio.topic_table import TopicTable
-from icrtool.tables import Floats, Ints
+from icrtool.tables import Bools, Floats, Ints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
-_NOT_WHEELS = re.compile(
-    r"filter|fused|ekf|ukf|visual|\bvo\b|lidar|laser|icp|gps|gnss|\bins\b|vectornav|slam|ground|truth|global|map", re.IGNORECASE
+_FUSED = re.compile(
+    r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
+    re.IGNORECASE,
 )
-_SPEED_WORDS = re.compile(r"vel|speed|rate|rpm|twist", re.IGNORECASE)
-_PLACE_WORDS = re.compile(r"tick|count|enc|pos|angle|travel|dist|odo", re.IGNORECASE)
-_BITS = {"Int8": 8, "UInt8": 8, "Int16": 16, "UInt16": 16, "Int32": 32, "UInt32": 32, "Int64": 64, "UInt64": 64}
-_RPM_TO_RADPS = 2 * np.pi / 60
+"""Odometry and twists that other sensors have a part in: better than nothing."""
+
+NEVER_MOVES = 60.0
+"""Taken off the score of wheels that stand still all the time: another topic that moves is the robot's."""
+
+SIDEWAYS_SHARE = 0.2
+"""A twist that goes this much sideways and never turns is a velocity east and north, not the body's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,253 +62,241 @@ class WheelMotion:
     why: str = ""
     problem: str = ""
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to use, even when it is asked for."""
+        return self.twist is None and self.position_left is None and self.speed_left is None
+
+
+_Paths = tuple[str, str, str]
+"""Of the joints' names, positions and speeds."""
+
+Sides = tuple[Floats | None, Floats | None]
+Reader = Callable[[TopicTable, Config], WheelMotion]
+_UNTOLD: Sides = (None, None)
+
+
+def no_motion(table: TopicTable, problem: str) -> WheelMotion:
+    """Return the motion that a topic is when it cannot be read."""
+    return WheelMotion(table.topic, table.message_type, stamp_rows(table), problem=problem)
+
+
+def motion_of(
+    topic: str, message_type: str, stamps: StampedRows, position: Sides = _UNTOLD, speed: Sides = _UNTOLD,
+    twist: Floats | None = None, units: tuple[Unit, Unit] = ("rad", "rad"), score: float = 0.0, why: str = "",
+    problem: str = "",
+) -> WheelMotion:  # fmt: skip
+    """Build a motion from left and right; what is told of one side only, or nowhere finite, is left out."""
+    told = [pair if all(side is not None and bool(np.isfinite(side).any()) for side in pair) else _UNTOLD
+            for pair in (position, speed)]  # fmt: skip
+    values = [side for pair in told for side in pair if side is not None] + ([twist] if twist is not None else [])
+    if not values and not problem:
+        problem = "tells neither position nor speed of both sides"
+    if values and not any(_changes(side) for side in told[0]) and not any(_nonzero(v) for v in (*told[1], twist)):
+        score, why = score - NEVER_MOVES, f"{why}, never moves"
+    return WheelMotion(topic, message_type, stamps, *told[0], units[0], *told[1], units[1], twist, score, why, problem)
+
+
+def _changes(side: Floats | None) -> bool:
+    return side is not None and float(np.ptp(side[np.isfinite(side)])) > 0.0
+
+
+def _nonzero(values: Floats | None) -> bool:
+    return values is not None and bool(np.any(values[np.isfinite(values)] != 0.0))
+
 
 def _header(*paths: str) -> tuple[str, ...]:
     return ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *paths)
 
 
-def _side_mean(values: NDArray[Any], places: list[int]) -> Floats | None:
-    """Return the mean over the joints of a side that say something; None where none ever does."""
-    chosen = np.atleast_2d(values)[:, places] if values.ndim == 2 and places else np.empty((len(values), 0))  # noqa: PLR2004
-    told = np.isfinite(chosen)
-    if not told.any():
-        return None
-    count = told.sum(axis=1)
-    total = np.where(told, chosen, 0.0).sum(axis=1)
-    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
+    """Return the mean over the joints of each side that ever say something; None where none does."""
+    means: list[Floats | None] = []
+    for places in (left, right):
+        told = [place for place in places if np.isfinite(values[:, place]).any()]
+        means.append(values[:, told].astype(np.float64).mean(axis=1) if told else None)
+    return means[0], means[1]
 
 
-def _joints(
-    table: TopicTable, config: Config, names: str, position: str, speed: str, score: float, what: str
-) -> WheelMotion | None:
-    """Read messages that list joints by name."""
-    codes = table.columns.get(names)
-    if codes is None or not len(codes) or codes.shape[1] == 0:
-        return None
-    texts = table.texts[names]
-    left, right = _joint_places(texts, config)
-    empty = np.full((len(table), codes.shape[1]), np.nan)
-    sides: dict[str, Floats | None] = {}
-    for path in (position, speed):
-        values = table.columns.get(path, empty)[:, : codes.shape[1]]
-        values = np.pad(values, ((0, 0), (0, codes.shape[1] - values.shape[1])), constant_values=np.nan)
-        for side, joints in (("left", left), ("right", right)):
-            wanted = np.isin(codes, sorted(joints))
-            sides[path + side] = _side_mean(np.where(wanted, values, np.nan), list(range(codes.shape[1])))
-    if not (left and right):
-        return WheelMotion(
-            table.topic, table.message_type, stamp_rows(table), score=score,
-            problem=f"no left and right wheel among its joints {', '.join(texts)}; name them in wheels.left_joints and wheels.right_joints",
-        )  # fmt: skip
-    both = {path: sides[path + "left"] is not None and sides[path + "right"] is not None for path in (position, speed)}
-    return WheelMotion(
-        table.topic,
-        table.message_type,
-        stamp_rows(table),
-        position_left=sides[position + "left"] if both[position] else None,
-        position_right=sides[position + "right"] if both[position] else None,
-        speed_left=sides[speed + "left"] if both[speed] else None,
-        speed_right=sides[speed + "right"] if both[speed] else None,
-        score=score,
+def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what: str) -> WheelMotion:
+    """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
+    codes, texts = table.words(paths[0])
+    left, right = _wheels_among(texts, config)
+    problem = ""
+    listed = np.zeros((len(table), len(texts)), np.bool_)
+    rows, places = np.nonzero(codes >= 0)
+    listed[rows, codes[rows, places]] = True
+    alike = _rows_alike(listed, left, right)
+    if not texts:
+        problem = "lists no joints"
+    elif not (left and right):
+        problem = (
+            f"no left and right wheel among its joints {', '.join(texts)}; name them in wheels.{{left,right}}_joints"
+        )
+    elif not alike.any():
+        problem = "left and right wheels come in different messages"
+    if problem:
+        return motion_of(table.topic, table.message_type, stamp_rows(table), score=score, problem=problem)
+    table, codes = table.rows(alike), codes[alike]
+    position, speed = (_by_joint(table.find(path), codes, len(texts)) for path in paths[1:])
+    return motion_of(
+        table.topic, table.message_type, stamp_rows(table), _side_means(position, left, right),
+        _side_means(speed, left, right), score=score,
         why=f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}",
-    )
-
-
-def _joint_places(texts: list[str], config: Config) -> tuple[list[int], list[int]]:
-    if config.wheels.left_joints or config.wheels.right_joints:
-        given = (config.wheels.left_joints, config.wheels.right_joints)
-        left, right = ([i for i, name in enumerate(texts) if name in names] for names in given)
-        return left, right
-    return wheel_joints(texts)
-
-
-def _joint_state(table: TopicTable, config: Config) -> WheelMotion | None:
-    return _joints(table, config, "name[*]", "position[*]", "velocity[*]", 100.0, "wheel joints by name")
-
-
-def _lynx(table: TopicTable, config: Config) -> WheelMotion | None:
-    prefix = "drivers_feedback[*]."
-    return _joints(
-        table, config, f"{prefix}joint_name", f"{prefix}travel", f"{prefix}velocity", 90.0, "motor driver feedback"
-    )
-
-
-def _two_drivers(position: str, speed: str) -> Callable[[TopicTable, Config], WheelMotion | None]:
-    """Read messages with drivers[2]: 0 is left, 1 is right (jackal_msgs/Drive.msg, clearpath_platform_msgs/Drive.msg)."""
-
-    def read(table: TopicTable, _: Config) -> WheelMotion | None:
-        position_values, speed_values = table.columns.get(position), table.columns.get(speed)
-        if position_values is None and speed_values is None:
-            return None
-
-        def side(values: NDArray[Any] | None, place: int) -> Floats | None:
-            return None if values is None or values.shape[1] < 2 else values[:, place].astype(np.float64)  # noqa: PLR2004
-
-        return WheelMotion(
-            table.topic, table.message_type, stamp_rows(table),
-            position_left=side(position_values, 0), position_right=side(position_values, 1),
-            speed_left=side(speed_values, 0), speed_right=side(speed_values, 1),
-            score=90.0, why="motor driver feedback: driver 0 left, 1 right",
-        )  # fmt: skip
-
-    return read
-
-
-def _four_wheels(table: TopicTable, _: Config) -> WheelMotion | None:
-    """Read leo_msgs/WheelStates: front left, rear left, front right, rear right."""
-    position, speed = table.columns.get("position[*]"), table.columns.get("velocity[*]")
-    if position is None or speed is None:
-        return None
-    return WheelMotion(
-        table.topic, table.message_type, stamp_rows(table, "stamp"),
-        position_left=_side_mean(position, [0, 1]), position_right=_side_mean(position, [2, 3]),
-        speed_left=_side_mean(speed, [0, 1]), speed_right=_side_mean(speed, [2, 3]),
-        score=90.0, why="four wheels: front left, rear left, front right, rear right",
     )  # fmt: skip
 
 
-def _scout(table: TopicTable, _: Config) -> WheelMotion | None:
-    """Read scout_msgs/ScoutStatus: the body twist the base reports (its motor rpm is integer, before the gearbox)."""
-    return _twist_motion(
-        table, "linear_velocity", "angular_velocity", 70.0, "the base's own speed and turn rate"
-    )
+def _wheels_among(texts: list[str], config: Config) -> tuple[list[int], list[int]]:
+    left, right = wheel_joints(texts)
+    given = config.wheels
+    if given.left_joints:
+        left = [i for i, name in enumerate(texts) if name in given.left_joints]
+    if given.right_joints:
+        right = [i for i, name in enumerate(texts) if name in given.right_joints]
+    return left, right
 
 
-def _segway(prefix: str) -> Callable[[TopicTable, Config], WheelMotion | None]:
-    def read(table: TopicTable, _: Config) -> WheelMotion | None:
-        if f"{prefix}left_wheel_velocity" not in table.columns:
-            return None
-        return WheelMotion(
-            table.topic, table.message_type, stamp_rows(table),
-            position_left=table.floats(f"{prefix}left_wheel_displacement"),
-            position_right=table.floats(f"{prefix}right_wheel_displacement"),
-            position_unit="m",
-            speed_left=table.floats(f"{prefix}left_wheel_velocity"),
-            speed_right=table.floats(f"{prefix}right_wheel_velocity"),
-            speed_unit="m",
-            score=90.0, why="the base's wheel displacement and speed",
+def _rows_alike(listed: Bools, left: list[int], right: list[int]) -> Bools:
+    """Return the rows (n,) that list the set of wheels most rows list, of those sets with both sides.
+
+    A mean over wheels that changes its members would jump.
+    """
+    both: Bools = np.logical_and(listed[:, left].any(axis=1), listed[:, right].any(axis=1))
+    if not both.any():
+        return both
+    sets, which, count = np.unique(listed[both][:, left + right], axis=0, return_inverse=True, return_counts=True)
+    if len(sets) > 1:
+        both[both] = which.reshape(-1) == int(np.argmax(count))
+    return both
+
+
+def _by_joint(values: NDArray[Any] | None, codes: Ints, joints: int) -> Floats:
+    """Return what each message tells of each joint (n, joints), NaN where nothing."""
+    sorted_values = np.full((len(codes), joints), np.nan)
+    if values is not None:
+        width = min(values.shape[1], codes.shape[1])
+        rows, places = np.nonzero(codes[:, :width] >= 0)
+        sorted_values[rows, codes[rows, places]] = values[rows, places]
+    return sorted_values
+
+
+def _by_name(paths: _Paths, score: float, what: str) -> Reader:
+    def read(table: TopicTable, config: Config) -> WheelMotion:
+        return _joints(table, config, paths, score, what)
+
+    return read
+
+
+def _by_place(
+    paths: tuple[str, str], left: list[int], right: list[int], why: str, stamp: str = "header.stamp"
+) -> Reader:
+    """Read messages whose lists of positions and of speeds have the sides at fixed places."""
+    length = max(left + right) + 1
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        position, speed = (table.column(path) for path in paths)
+        if min(position.shape[1], speed.shape[1]) < length:
+            raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
+        return motion_of(
+            table.topic, table.message_type, stamp_rows(table, stamp), _side_means(position, left, right),
+            _side_means(speed, left, right), score=90.0, why=why,
         )  # fmt: skip
 
     return read
 
 
-def _twist_motion(table: TopicTable, speed: str, turn: str, score: float, why: str) -> WheelMotion | None:
-    if speed not in table.columns or turn not in table.columns:
-        return None
-    twist = np.column_stack([table.floats(speed), table.floats(turn)])
+def _segway(prefix: str) -> Reader:
+    """Read the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        def sides(quantity: str) -> Sides:
+            left, right = (table.floats(f"{prefix}{side}_wheel_{quantity}") for side in ("left", "right"))
+            return left, right
+
+        return motion_of(
+            table.topic, table.message_type, stamp_rows(table), sides("displacement"), sides("velocity"),
+            units=("m", "m"), score=90.0, why="the base's wheel displacement and speed",
+        )  # fmt: skip
+
+    return read
+
+
+def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
+    twist = np.column_stack([table.column(speed), table.column(turn)]).astype(np.float64)
     if COMMANDED.search(table.topic):
         score, why = score - 40.0, f"{why} (commanded)"
-    return WheelMotion(table.topic, table.message_type, stamp_rows(table), twist=twist, score=score, why=why)
+    across = table.floats(sideways)
+    forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
+    problem = ""
+    if not _nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
+        problem = "goes sideways and never turns: a velocity east and north, not the body's"
+    return motion_of(
+        table.topic, table.message_type, stamp_rows(table), twist=twist, score=score, why=why, problem=problem
+    )
 
 
-def _odometry(table: TopicTable, _: Config) -> WheelMotion | None:
-    score = 60.0 - (50.0 if _NOT_WHEELS.search(table.topic) else 0.0)
-    why = "twist of the wheel odometry, undone with the track width"
-    return _twist_motion(table, "twist.twist.linear.x", "twist.twist.angular.z", score, why)
+def _scout(table: TopicTable, _: Config) -> WheelMotion:
+    """Read scout_msgs/ScoutStatus: the body twist the base reports (its motor rpm is integer, before the gearbox)."""
+    why = "the base's own speed and turn rate, undone with the track width"
+    return _twist_motion(table, "linear_velocity", "lateral_velocity", "angular_velocity", 70.0, why)
 
 
-def _twist(prefix: str, score: float) -> Callable[[TopicTable, Config], WheelMotion | None]:
-    def read(table: TopicTable, _: Config) -> WheelMotion | None:
-        lowered = score - (45.0 if _NOT_WHEELS.search(table.topic) or "fix" in table.topic else 0.0)
-        why = "body twist, undone with the track width"
-        return _twist_motion(table, f"{prefix}linear.x", f"{prefix}angular.z", lowered, why)
+def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Reader:
+    """Read a body twist; `fused` is taken off where the topic's name says that other sensors have a part in it."""
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        lowered = score - (fused if _FUSED.search(table.topic) else 0.0)
+        why = f"{what}, undone with the track width"
+        motion = _twist_motion(table, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", lowered, why)
+        if REFERENCE_WORDS.search(table.topic) and not motion.problem:
+            return replace(motion, problem="its name says that it is a reference's, not the wheels'")
+        return motion
 
     return read
 
 
-WHEEL_TYPES: dict[str, tuple[tuple[str, ...], Callable[[TopicTable, Config], WheelMotion | None]]] = {
-    "sensor_msgs/JointState": (_header("name[*]", "position[*]", "velocity[*]"), _joint_state),
-    "jackal_msgs/Feedback": (
-        _header("drivers[*].measured_travel", "drivers[*].measured_velocity"),
-        _two_drivers("drivers[*].measured_travel", "drivers[*].measured_velocity"),
-    ),
-    "clearpath_platform_msgs/Feedback": (
-        _header("drivers[*].measured_travel", "drivers[*].measured_velocity"),
-        _two_drivers("drivers[*].measured_travel", "drivers[*].measured_velocity"),
-    ),
-    "clearpath_motor_msgs/LynxMultiFeedback": (
-        _header("drivers_feedback[*].joint_name", "drivers_feedback[*].travel", "drivers_feedback[*].velocity"),
-        _lynx,
-    ),
-    "leo_msgs/WheelStates": (("stamp.sec", "stamp.nanosec", "position[*]", "velocity[*]"), _four_wheels),
-    "scout_msgs/ScoutStatus": (_header("linear_velocity", "angular_velocity"), _scout),
-    "nav_msgs/Odometry": (_header("twist.twist.linear.x", "twist.twist.angular.z"), _odometry),
-    "geometry_msgs/TwistStamped": (_header("twist.linear.x", "twist.angular.z"), _twist("twist.", 50.0)),
-    "geometry_msgs/TwistWithCovarianceStamped": (
-        _header("twist.twist.linear.x", "twist.twist.angular.z"),
-        _twist("twist.twist.", 50.0),
-    ),
-    "geometry_msgs/Twist": (("linear.x", "angular.z"), _twist("", 40.0)),
+def _twist_paths(prefix: str) -> tuple[str, ...]:
+    return (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
+
+
+_JOINTS = ("name[*]", "position[*]", "velocity[*]")
+_DRIVERS = ("drivers[*].measured_travel", "drivers[*].measured_velocity")
+_LYNX = ("drivers[*].joint_name", "drivers[*].travel", "drivers[*].velocity")
+_PUMA = ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed")
+_FOUR = ("position[*]", "velocity[*]")
+_SEGWAY = tuple(f"{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
+
+_joint_state = _by_name(_JOINTS, 100.0, "wheel joints by name")
+_dynamic_joint_state = _by_name(_JOINTS, 95.0, "wheel joints by name")
+_lynx = _by_name(_LYNX, 90.0, "motor driver feedback by joint name")
+_puma = _by_name(_PUMA, 90.0, "motor driver feedback by device name")
+# Drive.msg of jackal_msgs and of clearpath_platform_msgs: 0 is left, 1 is right.
+_two_drivers = _by_place(_DRIVERS, [0], [1], "motor driver feedback: driver 0 left, 1 right")
+_four_wheels = _by_place(
+    _FOUR, [0, 1], [2, 3], "four wheels: front left, rear left, front right, rear right", stamp="stamp"
+)
+_odometry = _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0)
+
+_SEGWAY_BARE = (_SEGWAY, _segway(""))
+_SEGWAY_STAMPED = (_header(*(f"segway.{field}" for field in _SEGWAY)), _segway("segway."))
+
+WHEEL_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "sensor_msgs/JointState": (_header(*_JOINTS), _joint_state),
+    DYNAMIC_JOINT_STATE: (_header(*_JOINTS), _dynamic_joint_state),
+    "jackal_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
+    "clearpath_platform_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
+    "clearpath_motor_msgs/LynxMultiFeedback": (_header(*_LYNX), _lynx),
+    "clearpath_motor_msgs/PumaMultiFeedback": (_header(*_PUMA), _puma),
+    "puma_motor_msgs/MultiFeedback": (_header(*_PUMA), _puma),
+    "leo_msgs/WheelStates": (("stamp.sec", "stamp.nanosec", *_FOUR), _four_wheels),
+    "scout_msgs/ScoutStatus": (_header("linear_velocity", "lateral_velocity", "angular_velocity"), _scout),
+    **dict.fromkeys(("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped"), _SEGWAY_STAMPED),
+    "segway_interfaces/Stamped": _SEGWAY_STAMPED,
+    **dict.fromkeys(("segway_rmp/SegwayStatus", "segway_rmp_ros2/SegwayStatus"), _SEGWAY_BARE),
+    "segway_interfaces/Segwaystatus": _SEGWAY_BARE,
+    "nav_msgs/Odometry": (_header(*_twist_paths("twist.twist.")), _odometry),
+    "geometry_msgs/TwistStamped": (_header(*_twist_paths("twist.")), _twist("twist.", 50.0)),
+    "geometry_msgs/TwistWithCovarianceStamped": (_header(*_twist_paths("twist.twist.")), _twist("twist.twist.", 50.0)),
+    "geometry_msgs/Twist": (_twist_paths(""), _twist("", 40.0)),
 }
 """By message type: the fields to take, and how to read them."""
-
-for _name, _prefix in (("segway_rmp/SegwayStatusStamped", "segway."), ("segway_rmp/SegwayStatus", "")):
-    WHEEL_TYPES[_name] = (
-        _header(*(f"{_prefix}{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))),
-        _segway(_prefix),
-    )
-
-PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
-"""Types that come as one topic per side."""
-
-
-def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMotion:
-    """Join a left and a right topic without headers: the right one is taken at the left one's stamps.
-
-    Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
-    """
-    name = left.message_type.partition("/")[2]
-    stamps = StampedRows(None, left.log_time_ns, "no header", 0)
-    topic = f"{left.topic} + {right.topic}"
-    values = [_unwrapped(table.columns["data"], _BITS.get(name)) for table in (left, right)]
-    commanded = bool(COMMANDED.search(left.topic))
-    score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
-    if not (len(left) and len(right)):
-        return WheelMotion(topic, left.message_type, stamps, score=score, problem="one of the two holds no message")
-    if _tells_position(left.topic, values[0], config, integer=name in _BITS):
-        unit: Unit = "counts" if name in _BITS or config.wheels.quantity == "counts" else "unknown"
-        other = np.interp(left.log_time_ns, right.log_time_ns, values[1])
-        return WheelMotion(
-            topic, left.message_type, stamps, position_left=values[0], position_right=other, position_unit=unit,
-            score=score, why=f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}",
-        )  # fmt: skip
-    place = np.clip(np.searchsorted(right.log_time_ns, left.log_time_ns + _half_interval(left), side="right") - 1, 0, None)
-    return WheelMotion(
-        topic, left.message_type, stamps, speed_left=values[0], speed_right=values[1][place], speed_unit="unknown",
-        score=score, why=f"{why}: speeds",
-    )  # fmt: skip
-
-
-def _half_interval(table: TopicTable) -> int:
-    """Two messages of one control cycle are logged one after the other: half an interval joins them."""
-    return int(np.median(np.diff(table.log_time_ns))) // 2 if len(table) > 1 else 0
-
-
-def _unwrapped(values: NDArray[Any], bits: int | None) -> Floats:
-    if bits is None or bits == 64 or not len(values):  # noqa: PLR2004 - float64 holds no more of a 64-bit count
-        return values.astype(np.float64)
-    span = 1 << bits
-    steps = (np.diff(values.astype(np.int64)) + span // 2) % span - span // 2
-    return np.concatenate([[0], np.cumsum(steps)]).astype(np.float64) + float(values[0])
-
-
-def _tells_position(topic: str, values: Floats, config: Config, *, integer: bool) -> bool:
-    """Say whether a pair's numbers are travelled positions (ticks, angles), not speeds."""
-    if config.wheels.quantity != "auto":
-        return config.wheels.quantity in ("position", "counts")
-    if _SPEED_WORDS.search(topic):
-        return False
-    if _PLACE_WORDS.search(topic):
-        return True
-    finite = values[np.isfinite(values)]
-    if len(finite) < 3 or np.ptp(finite) == 0:  # noqa: PLR2004 - too few to tell
-        return integer
-    # A position's steps add up to about its range; a speed goes up and down around few values.
-    return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)
-
-
-def left_topics(topics: list[str]) -> list[str]:
-    """Return the topics that may be the left one of a pair, surest first."""
-    return sorted(topics, key=lambda topic: (side_of(topic.rsplit("/", 1)[-1]) != "left" and side_of(topic) != "left", topic))
-
-

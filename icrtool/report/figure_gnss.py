@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import GATED, UNSEEN
-from icrtool.report.decimate import extremes
+from icrtool.report.decimate import extremes, percentiles
 from icrtool.report.figure_style import BAD_FIX_COLOR, BAR_COLOR, MEAN, inches, new_figure, shade_spans
 from icrtool.report.words import length_text, position_word, run_title
 from icrtool.tables import Floats
@@ -73,7 +73,7 @@ def _top(difference: Floats) -> float:
     """Return the upper end of the y axis [m]."""
     if not len(difference):
         return 1.0
-    typical = HEADROOM * float(np.percentile(difference, TYPICAL_PERCENT))
+    typical = HEADROOM * percentiles(difference, (TYPICAL_PERCENT,))[0]
     return max(min(typical, 1.1 * float(difference.max())), LEAST_RANGE_M)
 
 

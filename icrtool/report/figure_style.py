@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 PNG_DPI = 130
 
+TITLE_CHARACTERS_PER_INCH = 9.5
+
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -95,6 +97,8 @@ def new_figure(title: str, subtitle: str, *, width_in: float, height_in: float) 
     figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI)
     FigureCanvasAgg(figure)
     left = 0.09 / width_in
+    if len(title) > (most := int(TITLE_CHARACTERS_PER_INCH * width_in)):
+        title = f"{title[: most // 2]}…{title[-most // 2 :]}"
     figure.text(left, 1 - 0.09 / height_in, title, fontsize=10.5, fontweight="bold", va="top", ha="left")
     figure.text(left, 1 - 0.30 / height_in, subtitle, fontsize=8.5, color="0.3", va="top", ha="left")
     return figure

@@ -5,17 +5,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.ticker import ScalarFormatter
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.odometry import OdometryPath, icr_odometry, no_slip_odometry
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.report.decimate import places
 from icrtool.report.figure_style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
-from icrtool.report.words import duration_text, position_word, run_title
+from icrtool.report.words import duration_text, position_word, run_title, way_text
 from icrtool.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 WIDTH_IN = 7.2
@@ -26,6 +28,7 @@ LARGEST_DETOUR = 0.75
 """Odometry is shown this far outside the filter's path, in sizes of that path; what leads further is cut off."""
 
 SMALLEST_VIEW_M = 2.0
+FAR_M = 20_000.0
 CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
@@ -36,7 +39,9 @@ def draw_trajectory(run: FilterRun) -> Figure:
     icr, no_slip = icr_odometry(run), no_slip_odometry(run)
     lowest, highest = _view(run, icr, no_slip)
     lowest, highest, box_in = _fit_to_box(lowest, highest)
-    facts = f"Trajectory, {drive['distance_m']:.1f} m in {duration_text(drive['duration_s'])}; ICR odometry: final ICRs"
+    facts = (
+        f"Trajectory, {way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}; ICR odometry: final ICRs"
+    )
     height_in = box_in + MARGINS_IN["top"] + MARGINS_IN["bottom"]
     figure = new_figure(run_title(run), facts, width_in=WIDTH_IN, height_in=height_in)
     axes = figure.subplots()
@@ -50,7 +55,7 @@ def draw_trajectory(run: FilterRun) -> Figure:
         (no_slip, NO_SLIP, "no-slip odometry", 2),
     ):
         if path is not None:
-            label = f"{name}, ends {path.end_error_m:.1f} m off{_leaves(path, lowest, highest)}"
+            label = f"{name}, ends {way_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
             _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
     ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
     axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
@@ -59,8 +64,8 @@ def draw_trajectory(run: FilterRun) -> Figure:
     axes.set_xlim(lowest[1], highest[1])
     axes.set_ylim(lowest[0], highest[0])
     axes.set_aspect("equal")
-    axes.set_xlabel("East [m]")
-    axes.set_ylabel("North [m]")
+    axes.set_xlabel("East [m]" + _short_ticks(axes.xaxis, lowest[1]))
+    axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, lowest[0]))
     figure.legend(loc="lower center", ncols=2, columnspacing=3.0)
     return figure
 
@@ -89,6 +94,18 @@ def _fit_to_box(lowest: Floats, highest: Floats) -> tuple[Floats, Floats, float]
     metres_per_inch = max(north / box_in, east / width_in)
     middle, half = (lowest + highest) / 2, metres_per_inch * np.array([box_in, width_in]) / 2
     return middle - half, middle + half, box_in
+
+
+def _short_ticks(axis: Axis, lowest_m: float) -> str:
+    """Take whole kilometres off the ticks where coordinates are far from zero (UTM); return what the label adds."""
+    if abs(lowest_m) < FAR_M:
+        return ""
+    formatter = ScalarFormatter()
+    offset = float(np.floor(lowest_m / 1000) * 1000)
+    formatter.set_useOffset(offset)
+    axis.set_major_formatter(formatter)
+    axis.get_offset_text().set_visible(False)
+    return f"  {'+' if offset > 0 else '−'} {abs(offset):,.0f} m"
 
 
 def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import RUN_SCHEMA, FilterRun
 from icrtool.errors import RunError
 from icrtool.report.states_csv import StatesFileError, StatesFormat, file_sha256, read_states, write_states
@@ -89,11 +91,9 @@ def write_run(
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
         if plots:
-            from icrtool.report.figures import draw_figures
-
             (partial / "plots").mkdir()
-            draw_figures(run, partial / "plots", plots)
-        (partial / RUN_FILE).write_bytes(json_bytes(run_document(run)))
+            _draw(run, partial / "plots", plots)
+        (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
         sums = {RUN_FILE: file_sha256(partial / RUN_FILE), states_name: states_sum.result()}
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
 
@@ -128,6 +128,26 @@ def read_run(directory: Path) -> StoredRun:
         raise RunError(directory, f"cannot be read ({err})", "run icrtool fit again") from err
 
 
+def read_warm_start(directory: Path) -> WarmStart:
+    """Return the ICRs and their covariance that a run ended with.
+
+    Raises
+    ------
+    RunError
+        As `read_run`, or a run that did not record them.
+    """
+    document = read_run(directory).summary
+    try:
+        final = document["icr"]["final"]
+        icrs = np.array([final[column] for column in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")], np.float64)
+        covariance = np.array(document["icr"]["final_covariance_m2"], np.float64).reshape(3, 3)
+    except (KeyError, TypeError, ValueError) as err:
+        raise RunError(
+            directory, "does not say what ICRs and covariance it ended with", "run icrtool fit again"
+        ) from err
+    return WarmStart(icrs, covariance)
+
+
 def is_run_directory(directory: Path) -> bool:
     """Say whether a directory is a run of ours, of whatever version."""
     try:
@@ -137,22 +157,24 @@ def is_run_directory(directory: Path) -> bool:
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
 
 
-def run_document(run: FilterRun) -> dict[str, Any]:
-    """Return what run.json holds: the summary, and what `read_run` needs beside the states."""
-    stamps = run.table.stamp_ns
-    gaps = np.flatnonzero(run.in_gap)
-    needed = {
-        "outages_ns": run.outages_ns.tolist(),
-        "wheel_gaps_ns": np.column_stack([stamps[gaps], stamps[gaps + 1]]).tolist(),
-    }
-    return {**run.summary, **{key: value for key, value in needed.items() if key not in run.summary}}
-
-
 def json_bytes(document: Mapping[str, Any]) -> bytes:
     """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
     text = json.dumps(_plain(document), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
     return (text + "\n").encode("utf-8", errors="backslashreplace")
+
+
+def _draw(run: FilterRun, directory: Path, formats: tuple[str, ...]) -> None:
+    """Draw the figures; what matplotlib says of a home directory it cannot write is not our user's trouble."""
+    logger = logging.getLogger("matplotlib")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        from icrtool.report.figures import draw_figures
+
+        draw_figures(run, directory, formats)
+    finally:
+        logger.setLevel(level)
 
 
 def _plain(value: object) -> object:

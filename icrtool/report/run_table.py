@@ -6,7 +6,7 @@ import math
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
-from icrtool.report.words import duration_text, length_text, position_word, run_title
+from icrtool.report.words import duration_text, length_text, position_word, run_title, way_text
 
 WIDTH = 100
 LABEL = 12
@@ -60,7 +60,7 @@ def _drive_lines(run: FilterRun) -> list[str]:
     drive = run.summary["drive"]
     speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s"
     return [
-        _line("drive", f"{drive['distance_m']:.1f} m in {duration_text(drive['duration_s'])}, {speed} (mean ± std)")
+        _line("drive", f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed} (mean ± std)")
     ]
 
 
@@ -115,7 +115,9 @@ def _heading_lines(run: FilterRun) -> list[str]:
     check = run.heading_check
     if not math.isfinite(check.offset_rad):
         return [_line("heading", "could not be compared with the course: too little straight driving")]
-    offset = f"{math.degrees(check.offset_rad):+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
+    # Adding zero takes the sign off a rounded -0.0.
+    found = round(math.degrees(check.offset_rad), 1) + 0.0
+    offset = f"{found:+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
     applied = math.degrees(check.applied_offset_rad)
     return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
 

@@ -28,6 +28,11 @@ def length_text(metres: float) -> str:
     return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
+def way_text(metres: float) -> str:
+    """Return a length of way as ``398.5 m`` or ``36.00 km``."""
+    return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
+
+
 def duration_text(seconds: float) -> str:
     """Return a duration as ``12.3 s``, ``14:59 min`` or ``3:07:40 h``."""
     if seconds < 60:

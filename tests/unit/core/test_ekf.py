@@ -26,6 +26,7 @@ def parameters(**changes: object) -> FilterParameters:
         "rate_invariant": True,
         "gnss_gate": math.inf,
         "heading_gate": math.inf,
+        "heading_correlation": 1.0,
         "antenna_forward": 0.0,
         "antenna_right": 0.0,
         "wheel_gap_s": 0.5,
@@ -92,7 +93,9 @@ def test_twins_agree_with_lever_arm_gates_and_paper_noise() -> None:
     data, _ = drive(2)
     data.gnss_z[50::17] += 4.0
     data.heading_z[80::23] += 1.0
-    settings = parameters(antenna_forward=0.3, antenna_right=-0.2, gnss_gate=18.4, heading_gate=15.1)
+    settings = parameters(
+        antenna_forward=0.3, antenna_right=-0.2, gnss_gate=18.4, heading_gate=15.1, heading_correlation=40.0
+    )
     assert_twins(data, settings)
     assert_twins(data, settings._replace(rate_invariant=False))
 
@@ -211,7 +214,9 @@ def test_a_gap_in_the_wheel_data_makes_the_pose_uncertain_and_drives_nowhere() -
     assert out.variance[after, 0] > 9.0
 
 
-@pytest.mark.parametrize(("angle", "wrapped"), [(0.0, 0.0), (math.pi, math.pi), (-math.pi, math.pi), (7.0, 7.0 - 2 * math.pi)])
+@pytest.mark.parametrize(
+    ("angle", "wrapped"), [(0.0, 0.0), (math.pi, math.pi), (-math.pi, math.pi), (7.0, 7.0 - 2 * math.pi)]
+)
 def test_angles_wrap_to_the_half_open_turn(angle: float, wrapped: float) -> None:
     assert wrap(angle) == pytest.approx(wrapped, abs=1e-15)
 
