@@ -36,8 +36,8 @@ BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
-LARGEST_TABLE_BYTES = 96 << 20
-"""Errors of one model held at a time: horizons are taken in groups below it, whatever the length of the log."""
+LARGEST_TABLES_BYTES = 192 << 20
+"""Errors held at a time: horizons are taken in groups below it, whatever the length of the log."""
 
 STANDING_MPS = 0.01
 """Slower than this the robot stands."""
@@ -49,8 +49,8 @@ MOST_BULKS = 10.0
 STARTS_A_CALL = 1 << 16
 """Starts whose trial ends are held at a time."""
 
-MODELS_AT_ONCE = 2
-"""The kernels run beside each other; each holds a table of its own."""
+TASKS_AT_ONCE = 2
+"""Groups of horizons judged beside each other; each holds a table of its own."""
 
 
 class DrivenRun(Protocol):
@@ -212,14 +212,15 @@ def dropout(
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
     models = models if models is not None else models_of(run)
+    tasks = [(model, group) for model in models for group in _groups(len(horizons), len(run.table))]
+    judge = partial(_judge, drive=drive, horizons=horizons, seed=seed, sink=sink)
     counts: list[TrialCounts] = []
-    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
-    for group in _groups(len(horizons), len(run.table)):
-        counts.append(_count(drive, horizons[group]))
-        judge = partial(_judge, drive=drive, horizons=horizons[group], seed=seed, sink=sink)
-        with _side_by_side(wanted=sink is None) as spread:
-            for result in spread(judge, models):
-                parts[result.name].append(result)
+    parts: dict[str, list[ModelResult]] = {}
+    with _side_by_side(wanted=sink is None) as spread:
+        for result, count in spread(judge, tasks):
+            parts.setdefault(result.name, []).append(result)
+            if result.name == models[0].name:
+                counts.append(count)
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
@@ -298,49 +299,48 @@ def drive_of(run: DrivenRun) -> Drive:
 
 
 @contextmanager
-def _side_by_side(*, wanted: bool) -> Iterator[Callable[..., Iterable[ModelResult]]]:
-    """Give a `map` over threads; or the plain one, which holds one table at a time and keeps the order for a sink."""
+def _side_by_side(*, wanted: bool) -> Iterator[Callable[..., Iterable[tuple[ModelResult, TrialCounts]]]]:
+    """Give a `map` over threads; or the plain one, which keeps the order for a sink."""
     if not wanted:
         yield map
         return
-    with ThreadPoolExecutor(MODELS_AT_ONCE) as pool:
+    with ThreadPoolExecutor(TASKS_AT_ONCE) as pool:
         yield pool.map
 
 
 def _groups(horizons: int, states: int) -> list[slice]:
-    size = max(1, LARGEST_TABLE_BYTES // (8 * max(states, 1)))
+    """Cut the horizons into groups: one a thread, or more where their tables would be too large."""
+    size = max(1, min(-(-horizons // TASKS_AT_ONCE), LARGEST_TABLES_BYTES // (8 * TASKS_AT_ONCE * max(states, 1))))
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _ranges(states: int) -> Iterator[tuple[int, int]]:
-    return ((lo, min(lo + STARTS_A_CALL, states)) for lo in range(0, states, STARTS_A_CALL))
-
-
-def _count(drive: Drive, horizons: Floats) -> TrialCounts:
-    """Count trials, and starts that are none by kind, for each horizon."""
-    parts = [count_trials(trial_ends(drive, horizons, lo, hi)) for lo, hi in _ranges(len(drive.distance))]
-    return TrialCounts(*(np.sum(column, axis=0) for column in zip(*parts, strict=True)))
-
-
-def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats) -> Floats:
-    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
-    errors = np.empty((len(horizons), len(drive.distance)))
-    for lo, hi in _ranges(len(drive.distance)):
-        errors[:, lo:hi] = open_loop_errors(drive, icrs, trial_ends(drive, horizons, lo, hi), lo).T
-    return errors.T
-
-
-def _judge(model: Model, *, drive: Drive, horizons: Floats, seed: int, sink: ErrorSink | None) -> ModelResult:
-    errors = _errors(drive, model.icrs, horizons)
+def _judge(
+    task: tuple[Model, slice], *, drive: Drive, horizons: Floats, seed: int, sink: ErrorSink | None
+) -> tuple[ModelResult, TrialCounts]:
+    """Try one model over a group of horizons: what its errors say, and how many starts were a trial."""
+    model, group = task
+    errors, counts = _errors(drive, model.icrs, horizons[group])
     if sink is not None:
-        sink(model.name, horizons, errors)
+        sink(model.name, horizons[group], errors)
     summary = summarise(errors)
-    intervals = bootstrap_intervals(errors, drive.distance, horizons, seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
+    intervals = bootstrap_intervals(errors, drive.distance, horizons[group], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
     histograms = tuple(
         histogram(errors[:, h], _bin_width(float(summary.p95[h]), float(summary.largest[h])))
-        for h in range(len(horizons))
+        for h in range(errors.shape[1])
     )
-    return ModelResult(model.name, model.label, summary, intervals, histograms)
+    return ModelResult(model.name, model.label, summary, intervals, histograms), counts
+
+
+def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats) -> tuple[Floats, TrialCounts]:
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and the counts."""
+    errors = np.empty((len(horizons), len(drive.distance)))
+    counts = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
+    for lo in range(0, len(drive.distance), STARTS_A_CALL):
+        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+        ends = trial_ends(drive, horizons, lo, hi)
+        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends, lo).T
+        counts = TrialCounts(*(total + more for total, more in zip(counts, count_trials(ends), strict=True)))
+    return errors.T, counts
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:

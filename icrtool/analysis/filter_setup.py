@@ -43,6 +43,9 @@ GAP_TURN_STD_RADPS = 1.0
 GAP_IN_INTERVALS = 2.5
 """Slow wheel streams: an interval is a gap only when it is this many times the usual one."""
 
+LEAST_ICR_IN_HALF_WIDTHS = 0.2
+"""The ICRs lie outside the tracks (Pentzer 2014, Section 2); an antenna that is off centre may move them in by this."""
+
 RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
 """Rejected measurements that agree with each other for this long are believed."""
@@ -83,6 +86,7 @@ def set_up_filter(
     log: RobotLog,
     config: Config,
     *,
+    heading_mirrored: bool = False,
     heading_offset_rad: float = 0.0,
     heading_std_at_least_rad: float = 0.0,
     heading_correlation_at_least_s: float = 0.0,
@@ -95,7 +99,8 @@ def set_up_filter(
 
     Parameters
     ----------
-    heading_offset_rad : subtracted from every heading sample
+    heading_mirrored : take the heading turned the other way
+    heading_offset_rad : subtracted from every heading sample, after that
     heading_std_at_least_rad, heading_correlation_at_least_s : raise the noise of the heading samples
     process_position_mps : in place of the configured one
     changes_s : terrain changes, seconds since the first recorded state; the ICR covariance is inflated there
@@ -120,7 +125,7 @@ def set_up_filter(
         gnss_z=np.column_stack([log.gnss.north_m, log.gnss.east_m])[gnss_index],
         gnss_r=_gnss_variance(log.gnss, config.filter, paper=paper)[gnss_index],
         heading_t=_seconds(log.heading.stamp_ns[heading_index], epoch),
-        heading_z=log.heading.heading_rad[heading_index] - heading_offset_rad,
+        heading_z=(-1.0 if heading_mirrored else 1.0) * log.heading.heading_rad[heading_index] - heading_offset_rad,
         heading_r=heading_r[heading_index],
         change_t=np.empty(0),
     )
@@ -221,13 +226,20 @@ def _start_state(
 
 
 def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
-    """Return the ICRs at the start and their standard deviation [m]."""
+    """Return the ICRs at the start and their standard deviation [m].
+
+    In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
+    from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
+    """
     settings, half = config.filter, half_width_m(config)
     paper = settings.preset == "paper"
     preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
-    default_std = PAPER_INITIAL_ICR_STD_M if paper else half
+    if not paper:
+        right, left = max(right, half), min(left, -half)
+    away = max(abs(right - half), abs(left + half), abs(x))
+    default_std = PAPER_INITIAL_ICR_STD_M if paper else max(half, away)
     return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
 
 
@@ -280,4 +292,5 @@ def _parameters(
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=ICR_INFLATION_M2,
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config),
     )

@@ -9,31 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.analysis.filter_setup import (
-    FilterSetup,
-    WarmStart,
-    configured_process_position_mps,
-    set_up_filter,
-    wheel_gap_s,
-)
+from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
+from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
 from icrtool.config import Config
-from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput, run_filter
+from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
     import pandas as pd
 
 RUN_SCHEMA = "icrtool/run/1"
-
-TOLERATED_NIS = 2.5
-"""Mean NIS of the fixes: 2 is expected where the noises are right."""
-
-PROCESS_POSITION_STEP = 2.0
-LARGEST_PROCESS_POSITION_MPS = 10.0
-WORTHWHILE_SHARE = 0.9
-"""Doubling the position noise is worth it when it brings the mean NIS below this part of what it was."""
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
 """The state's entries, in the kernel's order."""
@@ -144,7 +131,8 @@ def fit(
     """
     config = config if config is not None else Config()
     check = check_heading(log, config)
-    setup, output, position_noise = _run(log, config, check, warm_start, changes_s)
+    adapted = run_adaptively(log, config, check, warm_start, changes_s)
+    log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
     table = _states(log, output)
     gnss = _outcome(
         log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
@@ -160,7 +148,7 @@ def fit(
         *log.warnings,
         *check.warnings,
         *_doubts(log.name, table, gnss),
-        *_noise_note(log.name, config, position_noise),
+        *_adaptation_notes(log.name, config, adapted),
     )
     summary = {
         "schema": RUN_SCHEMA,
@@ -180,6 +168,7 @@ def fit(
         "filter": {
             "preset": config.filter.preset,
             "process_position_mps": position_noise,
+            "reference_delay_s": adapted.reference_delay_s,
             "states": len(table),
             **nis_summary(gnss, heading),
         },
@@ -200,38 +189,6 @@ def fit(
         warnings=warnings,
         summary=summary,
     )
-
-
-def _run(
-    log: RobotLog, config: Config, check: HeadingCheck, warm_start: WarmStart | None, changes_s: tuple[float, ...]
-) -> tuple[FilterSetup, FilterOutput, float]:
-    """Run the filter; in preset ``field`` again with more position noise while the fixes contradict the wheels.
-
-    A contradiction (NIS of the fixes, each counted up to its gate) that falls as the noise grows comes from the wheels
-    or the clocks (held samples, delays, slip), or from fixes that err together: the larger noise is the honest one.
-    Bad fixes stay bad whatever the noise.
-    """
-
-    def run(speed: float) -> tuple[FilterSetup, FilterOutput, float]:
-        setup = set_up_filter(
-            log, config, heading_offset_rad=check.applied_offset_rad, heading_std_at_least_rad=check.applied_std_rad,
-            heading_correlation_at_least_s=check.applied_correlation_s,
-            process_position_mps=speed, warm_start=warm_start, changes_s=changes_s,
-        )  # fmt: skip
-        output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
-        nis = output.gnss_nis[output.gnss_code > UNSEEN]
-        contradiction = float(np.minimum(nis, setup.parameters.gnss_gate).mean()) if len(nis) else 0.0
-        return setup, output, contradiction
-
-    speed = configured_process_position_mps(config)
-    setup, output, contradiction = run(speed)
-    adapts = config.filter.preset == "field" and config.filter.process_position_mps == "auto"
-    while adapts and contradiction > TOLERATED_NIS and speed < LARGEST_PROCESS_POSITION_MPS:
-        next_setup, next_output, next_one = run(speed * PROCESS_POSITION_STEP)
-        if next_one > WORTHWHILE_SHARE * contradiction:
-            break
-        speed, setup, output, contradiction = speed * PROCESS_POSITION_STEP, next_setup, next_output, next_one
-    return setup, output, speed
 
 
 def _states(log: RobotLog, output: FilterOutput) -> States:
@@ -277,14 +234,21 @@ def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
     return np.array(spans, np.int64).reshape(-1, 2)
 
 
-def _noise_note(name: str, config: Config, position_noise: float) -> list[str]:
-    if position_noise == configured_process_position_mps(config):
-        return []
-    text = (
-        f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
-        f"position noise raised to {position_noise:.1f} m/s; filter.process_position_mps sets it"
-    )
-    return [text]
+def _adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
+    """Say what was done about clocks and wheels that contradict the position reference."""
+    notes = []
+    if config.frames.reference_delay_s == "auto" and adapted.reference_delay_s:
+        side = "late" if adapted.reference_delay_s > 0 else "early"
+        notes.append(
+            f"{name}: the position reference is {abs(adapted.reference_delay_s):.2f} s {side} against the wheels: "
+            "taken out; frames.reference_delay_s sets it"
+        )
+    if adapted.process_position_mps != configured_process_position_mps(config):
+        notes.append(
+            f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
+            f"position noise raised to {adapted.process_position_mps:.1f} m/s; filter.process_position_mps sets it"
+        )
+    return notes
 
 
 def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:

@@ -40,7 +40,8 @@ class HeadingCheck:
     offset_rad, offset_std_rad : heading minus course at no curvature; NaN when there was nothing to compare
     scatter_rad : robust standard deviation of the differences
     agreement, mirrored_agreement : mean resultant length of heading minus course, as given and turned the other way
-    applied_offset_rad : what `fit` subtracts
+    applied_mirror : `fit` takes the heading turned the other way
+    applied_offset_rad : what `fit` subtracts, after that
     applied_std_rad, applied_correlation_s : the least noise, and how long it errs alike, that `fit` gives the heading
     """
 
@@ -50,6 +51,7 @@ class HeadingCheck:
     scatter_rad: float
     agreement: float
     mirrored_agreement: float
+    applied_mirror: bool
     applied_offset_rad: float
     applied_std_rad: float
     applied_correlation_s: float
@@ -67,6 +69,7 @@ class HeadingCheck:
         numbers = {name: math.degrees(value) if math.isfinite(value) else None for name, value in degrees.items()}
         return {
             "windows": self.windows,
+            "applied_mirror": self.applied_mirror,
             **numbers,
             "agreement": self.agreement if math.isfinite(self.agreement) else None,
             "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
@@ -109,39 +112,72 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     fixed = 0.0 if paper or given == "auto" else math.radians(given)
     course = measure_course(log)
     if len(course.angle) < FEWEST_WINDOWS:
-        return HeadingCheck(len(course.angle), math.nan, math.nan, math.nan, math.nan, math.nan, fixed, 0.0, 0.0, ())
+        nan = math.nan
+        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, ())
     agreement = float(abs(np.exp(1j * course.angle).mean()))
     mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
-    offset, sigma, scatter = offset_at_no_curvature(course.angle, course.curvature)
+    turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
+    angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
+    offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
-    applied, raised, alike_s, warnings = fixed, 0.0, 0.0, []
-    found = f"{math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}°"
-    text = f"heading is {found} off the course ({len(course.angle)} windows)"
-    if agreement < EXPLAINED and mirrored >= EXPLAINED:
-        warnings.append(
-            f"{log.name}: the heading turns the other way than the course: "
-            "set frames.heading to the other of enu and ned"
+    applied, warnings = _choose_offset(
+        f"{math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}°",
+        offset,
+        sigma,
+        fixed,
+        free=given == "auto" and not paper,
+    )
+    if turned_over:
+        applied = offset if given == "auto" else fixed
+        warnings = [_name_turned_over(offset, len(angle))]
+    elif agreement < EXPLAINED and mirrored >= EXPLAINED:
+        applied, warnings = (
+            fixed,
+            ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"],
         )
     elif agreement < EXPLAINED:
-        warnings.append(
-            f"{log.name}: the heading does not follow the course (agreement {agreement:.2f} of 1): "
-            "do not trust the ICRs"
+        applied, warnings = (
+            fixed,
+            [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"],
         )
-    elif abs(offset - fixed) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
-        if given == "auto" and not paper:
-            applied = offset
-            warnings.append(f"{log.name}: {text}: applied; frames.heading_offset_deg sets it")
-        else:
-            warnings.append(f"{log.name}: {text}, {math.degrees(fixed):+.1f}° is applied")
-    if not paper and agreement >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
+    raised, alike_s = 0.0, 0.0
+    if not paper and max(agreement, mirrored if turned_over else 0.0) >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
         # The scatter is that of window means: the heading errs alike for as long as a window lasts.
         raised, alike_s = own_scatter, course.duration_s
         warnings.append(
-            f"{log.name}: the heading scatters by {math.degrees(own_scatter):.0f}° about the course, "
-            "over whole windows: its noise is raised accordingly"
+            f"the heading scatters by {math.degrees(own_scatter):.0f}° about the course, over whole windows: "
+            "its noise is raised accordingly"
         )
     return HeadingCheck(
-        len(course.angle), offset, sigma, own_scatter, agreement, mirrored, applied, raised, alike_s, tuple(warnings)
+        windows=len(angle),
+        offset_rad=offset,
+        offset_std_rad=sigma,
+        scatter_rad=own_scatter,
+        agreement=agreement,
+        mirrored_agreement=mirrored,
+        applied_mirror=turned_over,
+        applied_offset_rad=applied,
+        applied_std_rad=raised,
+        applied_correlation_s=alike_s,
+        warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
+    )
+
+
+def _choose_offset(text: str, offset: float, sigma: float, fixed: float, *, free: bool) -> tuple[float, list[str]]:
+    """Return the offset to apply, and what to say about it."""
+    if abs(math.remainder(offset - fixed, 2 * math.pi)) <= max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
+        return fixed, []
+    if free:
+        return offset, [f"heading is {text} off the course: applied; frames.heading_offset_deg sets it"]
+    return fixed, [f"heading is {text} off the course, {math.degrees(fixed):+.1f}° is applied"]
+
+
+def _name_turned_over(offset: float, windows: int) -> str:
+    """Say what a heading that turns the other way most likely is: yaw read in the other of ENU and NED."""
+    rest = math.degrees(math.remainder(offset + math.pi / 2, 2 * math.pi))
+    return (
+        f"the heading turns the other way than the course ({windows} windows): "
+        f"its yaw is of the other convention (ENU/NED), offset {rest:+.1f}°: applied; frames.heading sets it"
     )
 
 

@@ -10,6 +10,7 @@ from icrtool import __version__
 
 _COMMANDS = {
     "fit": "Learn the track ICRs of a robot from its logs.",
+    "dropout-report": "Say how far a robot can go blind, over 1 to 20 m from every recorded state.",
     "info": "Say what logs hold, which topics would be used, and what is wrong with them.",
 }
 

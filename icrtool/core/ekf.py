@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.core.compiled import njit
-from icrtool.core.ekf_step import DIAGONAL, Floats, correct, measured_column, predict, wrap
+from icrtool.core.ekf_step import DIAGONAL, Floats, correct, icr_column, measured_column, predict, wrap
 
 Codes = NDArray[np.uint8]
 
@@ -38,6 +38,7 @@ class FilterParameters(NamedTuple):
     gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
     recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
     icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
+    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
     """
 
     process_variance: tuple[float, float, float, float, float, float]
@@ -53,6 +54,7 @@ class FilterParameters(NamedTuple):
     recovery_count: int
     recovery_s: float
     icr_inflation_m2: float
+    least_icr: float
 
 
 class Measurements(NamedTuple):
@@ -124,6 +126,22 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
 
 
 @njit
+def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
+    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
+
+    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
+    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
+    """
+    for _ in range(2):
+        for place, bound in ((3, least), (4, -least)):
+            beyond = bound - x[place]
+            if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
+                variance = icr_column(P, place, PH)
+                for i in range(6):
+                    x[i] += PH[i] / variance * beyond
+
+
+@njit
 def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
     """Return the antenna's place relative to the body origin: a = R(psi) (forward, right), north and east [m].
 
@@ -163,6 +181,7 @@ def take_fix(
         correct(x, P, PH, S_nn, nu_n)
         S_ee = measured_column(P, 1, a_n, PH) + r_e
         correct(x, P, PH, S_ee, nu_e - (x[1] - E) - a_n * (x[2] - psi))
+        keep_sides(x, P, PH, parameters.least_icr)
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
     residual[0] = z_n - x[0] - a_n
     residual[1] = z_e - x[1] - a_e
@@ -191,6 +210,7 @@ def take_heading(
         run[0] = 0.0
         S = measured_column(P, 2, 0.0, PH) + r * parameters.heading_correlation
         correct(x, P, PH, S, nu)
+        keep_sides(x, P, PH, parameters.least_icr)
     return code, nis, nu
 
 

@@ -110,6 +110,14 @@ def _antenna(psi: float, parameters: FilterParameters) -> Floats:
     return np.array([c * forward - s * right, s * forward + c * right])
 
 
+def _keep_sides(x: Floats, P: Floats, least: float) -> Floats:
+    for _ in range(2):
+        for place, sign in ((3, 1.0), (4, -1.0)):
+            if sign * x[place] < least:
+                x = x + P[:, place] / P[place, place] * (sign * least - x[place])
+    return x
+
+
 def _measure(
     kind: int, i: int, t: float, x: Floats, P: Floats, data: Measurements, parameters: FilterParameters,
     run: list, out: FilterOutput,  # type: ignore[type-arg]  # count, time, innovation
@@ -143,6 +151,7 @@ def _measure(
         x = x + K @ nu
         P = (np.eye(6) - K @ H) @ P
         P = (P + P.T) / 2
+        x = _keep_sides(x, P, parameters.least_icr)
     if kind == 1:
         out.gnss_nis[i], out.gnss_code[i] = nis, code
         out.gnss_residual[i] = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)

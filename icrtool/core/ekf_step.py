@@ -115,6 +115,16 @@ def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
 
 
 @njit
+def icr_column(P: Floats, axis: int, PH: Floats) -> float:
+    """Fill PH (6,) with the column of P that belongs to y_icr_right (axis 3) or y_icr_left (4); return the variance."""
+    if axis == 3:
+        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[3], P[8], P[12], P[15], P[16], P[17]
+    else:
+        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[4], P[9], P[13], P[16], P[18], P[19]
+    return float(PH[axis])
+
+
+@njit
 def correct(x: Floats, P: Floats, PH: Floats, S: float, nu: float) -> None:
     """Apply a scalar innovation nu of variance S, with PH = P H^T (Eqs. 21, 24, 25)."""
     place = 0

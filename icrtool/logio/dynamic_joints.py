@@ -62,6 +62,7 @@ class DynamicJointCollector:
         self._channel = channel
         self._definitions, self._source = definitions_of(channel)
         self._collectors: dict[int, TopicCollector] = {}
+        self._tables: list[TopicTable] = []
         self._unreadable = 0
         layout = self._collector(1).layout
         kinds = {path: slot.kind for path, slot in layout.slots.items()}
@@ -82,14 +83,16 @@ class DynamicJointCollector:
         for number in np.unique(joints[readable]):
             alike = np.zeros(len(chosen), np.bool_)
             alike[places[readable & (joints == number)]] = True
-            self._collector(int(number)).feed(block, alike)
+            collector = self._collector(int(number))
+            collector.feed(block, alike)
+            # Taken at once: the names of all interfaces of a long log are many times what is kept of them.
+            self._tables.append(_as_joint_state(collector.table(), int(number)))
 
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time."""
-        tables = [_as_joint_state(each.table(), joints) for joints, each in self._collectors.items()]
         topic, message_type = self._channel.topic, self._channel.message_type
         nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
-        return merge_tables([nothing, *tables])[0]
+        return merge_tables([nothing, *self._tables])[0]
 
     def _collector(self, joints: int) -> TopicCollector:
         if joints not in self._collectors:

@@ -133,9 +133,9 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     )
     unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
-        f"{name}: {stream.topic}: {unreadable[stream.topic]} messages did not have their type's shape and were left out"
-        for stream in streams
-        if stream.topic in unreadable
+        f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
+        for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
+        if topic in unreadable
     ]
     return RobotLog(name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings))
 

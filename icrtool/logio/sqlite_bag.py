@@ -21,6 +21,8 @@ MAGIC = b"SQLite format 3\0"
 _FIRST_ROWS, _MOST_ROWS = 64, 4096
 _BLOCK_BYTES = 1 << 24
 _UNKNOWN_ROWS = 1 << 40
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError)
+"""What sqlite3 raises; the latter where a damaged name stands in its message."""
 
 Row = tuple[Any, Any, Any, int]
 """Topic id, log time [ns], message, row number. SQLite holds a column to no type."""
@@ -54,7 +56,7 @@ class SqliteBag:
             except BaseException:
                 self.close()
                 raise
-        except sqlite3.Error as err:
+        except _DAMAGE as err:
             found = "; ".join([printable(str(err)), *self.problems])
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
@@ -85,7 +87,7 @@ class SqliteBag:
             database = self._open("mode=ro")
             try:
                 database.execute("SELECT name FROM sqlite_master")
-            except sqlite3.OperationalError as err:
+            except _DAMAGE as err:
                 database.close()
                 self.problems.say(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
             else:
@@ -94,7 +96,7 @@ class SqliteBag:
         database = self._open("mode=ro&immutable=1")
         try:
             database.execute("SELECT name FROM sqlite_master")
-        except sqlite3.DatabaseError:
+        except _DAMAGE:
             # SQLite refuses a file that is shorter than its header says. With this it reads the pages that are there.
             database.execute("PRAGMA writable_schema = ON")
         return database
@@ -133,7 +135,7 @@ class SqliteBag:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         try:
             return {name: (encoding, str(text)) for name, encoding, text in self._database.execute(query)}
-        except sqlite3.Error as err:
+        except _DAMAGE as err:
             self.problems.say(f"its message definitions cannot be read ({err})")
             return {}
 
@@ -141,14 +143,14 @@ class SqliteBag:
         """Tell message compression by the first message: a serialised one never begins like a compressed one."""
         try:
             first = self._database.execute("SELECT data FROM messages LIMIT 1").fetchone()
-        except sqlite3.Error:
+        except _DAMAGE:
             return ""
         return "zstd" if first and isinstance(first[0], bytes) and first[0].startswith(ZSTD_MAGIC) else ""
 
     def _count_rows(self) -> int:
         try:
             return self._database.execute("SELECT max(rowid) FROM messages").fetchone()[0] or 0
-        except sqlite3.Error:
+        except _DAMAGE:
             return _UNKNOWN_ROWS
 
     def _stored(self, wanted: frozenset[int]) -> Iterator[Block]:
@@ -159,7 +161,7 @@ class SqliteBag:
         query = f"SELECT topic_id, timestamp, data, rowid FROM messages WHERE {of_topics} AND rowid > ?"  # noqa: S608
         after, step = 0, 1
         while after < self._rows:
-            damage: sqlite3.Error | None = None
+            damage: Exception | None = None
             for rows, damage in self._batches(query, after):  # noqa: B007 - the last one is looked at below
                 if rows:
                     self._last_row = after = max(after, rows[-1][3])
@@ -184,19 +186,19 @@ class SqliteBag:
         self.problems.say("cut off; what could be read of it was read")
         return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
-    def _batches(self, query: str, after: int) -> Iterator[tuple[list[Row], sqlite3.Error | None]]:
+    def _batches(self, query: str, after: int) -> Iterator[tuple[list[Row], Exception | None]]:
         """Yield rows, some megabytes at a time; at a damage those before it, and the damage."""
         count = _FIRST_ROWS
         try:
             cursor = self._database.execute(query, (after,))
-        except sqlite3.Error as err:
+        except _DAMAGE as err:
             yield [], err
             return
         while True:
             rows: list[Row] = []
             try:
                 rows.extend(islice(cursor, count))
-            except sqlite3.Error as err:
+            except _DAMAGE as err:
                 yield rows, err
                 return
             yield rows, None

@@ -45,9 +45,9 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     if f"{path}.sec" not in table.columns or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
     header = table.columns[f"{path}.sec"] * 1_000_000_000 + table.columns[f"{path}.nanosec"]
-    zero = np.count_nonzero(header == 0) / len(header)
-    if zero > LARGEST_SHARE_ZERO:
-        return StampedRows(None, log_ns, f"{100 * zero:.0f} % of the header stamps are 0", 0)
+    zeros = np.count_nonzero(header == 0)
+    if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
+        return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
     delay = int(np.median(log_ns - header))
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)

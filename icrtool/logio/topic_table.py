@@ -168,12 +168,15 @@ class TopicCollector:
         return np.stack(columns, axis=1) if columns else np.zeros((len(table), 0), np.uint64)
 
     def table(self) -> TopicTable:
-        """Return what was gathered, sorted by log time."""
+        """Return what was gathered since the last call, sorted by log time."""
         times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
+        self._times.clear()
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[str]] = {}
-        for path, parts in self._parts.items():
+        unreadable, self._unreadable = self._unreadable, 0
+        gathered, self._parts = self._parts, {}
+        for path, parts in gathered.items():
             values = _joined(parts)
             parts.clear()
             if path in self._texts:
@@ -185,7 +188,7 @@ class TopicCollector:
             times if order is None else times[order],
             columns,
             texts,
-            self._unreadable,
+            unreadable,
             self._source,
         )
 
@@ -207,7 +210,9 @@ def _merged(group: list[TopicTable]) -> TopicTable:
     columns: dict[str, NDArray[Any]] = {}
     texts: dict[str, list[str]] = {}
     # Publishers may have been built from different versions of the type: what all of them tell is kept.
-    for path in (path for path in group[0].columns if all(path in table.columns for table in group)):
+    for path in group[0].columns:
+        if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):
+            continue
         parts = [table.columns[path] for table in group]
         if path in group[0].texts:
             texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))

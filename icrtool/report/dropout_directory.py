@@ -20,7 +20,6 @@ from icrtool.core.open_loop_fast import TOLERANCE_M
 from icrtool.report.dropout_content import DropoutContent
 from icrtool.report.run_directory import json_bytes
 from icrtool.report.whole_directory import whole_directory
-from icrtool.tables import Floats
 
 REPORT_FILE = "report.json"
 DROPOUT_DIRECTORY = "dropout"
@@ -62,7 +61,7 @@ def write_content(content: DropoutContent, directory: Path) -> None:
         A file cannot be written.
     """
     summary = content.report.summary_columns()
-    (directory / "summary.csv").write_bytes(_csv(summary, zip(*(_cells(column) for column in summary.values()))))
+    (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
     (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(content.report)))
     (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(content.worst)))
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(content)))
@@ -173,7 +172,7 @@ def _drive_document(drive: BlindDrive) -> dict[str, Any]:
 def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
     for result in report.results:
         for horizon, bins in zip(report.horizons_m, result.histograms, strict=True):
-            for left, right, percent in zip(*(_cells(column) for column in bins), strict=True):
+            for left, right, percent in _rows(bins):
                 yield result.name, float(horizon), left, right, percent
 
 
@@ -184,7 +183,11 @@ def _worst_rows(worst: Sequence[BlindDrive]) -> Iterator[Sequence[Cell]]:
         yield *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)
 
 
-def _cells(column: Sequence[str] | Floats | np.ndarray[Any, Any]) -> list[Any]:
+def _rows(columns: Iterable[Sequence[str] | np.ndarray[Any, Any]]) -> Iterator[Sequence[Any]]:
+    return zip(*(_cells(column) for column in columns), strict=True)
+
+
+def _cells(column: Sequence[str] | np.ndarray[Any, Any]) -> list[Any]:
     """Return a column as plain values, None for what is not a number."""
     values = column.tolist() if isinstance(column, np.ndarray) else list(column)
     return [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]

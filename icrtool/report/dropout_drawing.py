@@ -9,15 +9,22 @@ import logging
 import multiprocessing
 import signal
 import sys
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from icrtool.analysis.blind_paths import BlindDrive
     from icrtool.analysis.dropout import DropoutReport
-    from icrtool.report.dropout_content import DropoutContent
+    from icrtool.analysis.outages import Outage
     from icrtool.tables import States
+
+Draw = Callable[..., None]
 
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
@@ -35,9 +42,8 @@ class DrawingProcess:
     def __init__(self, formats: tuple[str, ...]) -> None:
         self._formats = formats
         self._pool: ProcessPoolExecutor | None = None
-        self._pending: list[Future[None]] = []
 
-    def __enter__(self) -> DrawingProcess:
+    def __enter__(self) -> Self:
         if self._formats:
             method = "fork" if sys.platform == "linux" else None
             self._pool = ProcessPoolExecutor(1, multiprocessing.get_context(method), initializer=_begin)
@@ -50,37 +56,57 @@ class DrawingProcess:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def draw(self, name: str, directory: Path, *content: Any) -> None:
-        """Have the figure ``draw_NAME`` of `FIGURES` drawn from `content` into ``directory/NAME``."""
-        if self._pool is not None:
-            self._pending.append(self._pool.submit(_draw, name, directory, self._formats, content))
+    @contextmanager
+    def into(self, directory: Path) -> Iterator[Draw]:
+        """Give ``draw(name, *content)``, which has figure ``name`` drawn into a new directory; wait for all at the end.
 
-    def finish(self) -> None:
-        """Wait for all figures; the error of one that failed is raised here."""
-        pending, self._pending = self._pending, []
-        for drawn in pending:
-            drawn.result()
+        Raises
+        ------
+        OSError
+            A file cannot be written.
+        """
+        pending: list[Future[None]] = []
+
+        def draw(name: str, *content: Any) -> None:
+            if self._pool is not None:
+                directory.mkdir(exist_ok=True)
+                pending.append(self._pool.submit(_draw, name, directory, self._formats, content))
+
+        try:
+            yield draw
+            for drawn in pending:
+                drawn.result()
+        finally:
+            for drawn in pending:
+                drawn.cancel()
+            wait(pending)
 
 
-def draw_paths(drawer: DrawingProcess, content: DropoutContent, table: States, directory: Path) -> None:
-    """Have the pictures of single drives drawn."""
-    if content.examples:
-        drawer.draw(f"examples_{content.examples[0].horizon_m:02.0f}m", directory, content.title, content.examples)
-    if content.worst:
-        drawer.draw("worst", directory, content.title, content.worst)
-    if content.outages:
-        drawer.draw("outages", directory, content.title, table.north_m, table.east_m, content.outages)
+def draw_paths(
+    draw: Draw,
+    title: str,
+    table: States,
+    drives: tuple[Sequence[BlindDrive], Sequence[BlindDrive]],
+    outages: Sequence[Outage],
+) -> None:
+    """Have the pictures of single drives drawn: `drives` are the examples and the worst."""
+    examples, worst = drives
+    if examples:
+        draw(f"examples_{examples[0].horizon_m:02.0f}m", title, examples)
+    if worst:
+        draw("worst", title, worst)
+    if outages:
+        draw("outages", title, table.north_m, table.east_m, outages)
 
 
-def draw_statistics(drawer: DrawingProcess, content: DropoutContent, directory: Path) -> None:
+def draw_statistics(draw: Draw, title: str, report: DropoutReport, outages: Sequence[Outage]) -> None:
     """Have the summary and the histograms drawn, where there are trials."""
-    report: DropoutReport = content.report
     trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
     if any(trials.values()):
-        drawer.draw("summary", directory, content.title, report, content.outages)
+        draw("summary", title, report, outages)
     for horizon in HISTOGRAM_HORIZONS_M:
         if trials.get(horizon):
-            drawer.draw(f"histogram_{horizon:02.0f}m", directory, content.title, report, horizon)
+            draw(f"histogram_{horizon:02.0f}m", title, report, horizon)
 
 
 def _begin() -> None:
@@ -93,10 +119,9 @@ def _load_matplotlib() -> None:
     """Load what drawing needs, and fill the font cache, while there is nothing to draw yet."""
     from io import BytesIO
 
-    from icrtool.report import figure_dropout, figure_dropout_paths
     from icrtool.report.figure_style import new_figure, style
 
-    assert figure_dropout is not None and figure_dropout_paths is not None
+    _figures()
     with style():
         figure = new_figure("A", "b", width_in=1, height_in=1)
         figure.subplots().plot([0.0, 1.0], label="c")
@@ -105,15 +130,20 @@ def _load_matplotlib() -> None:
 
 
 def _draw(name: str, directory: Path, formats: tuple[str, ...], content: tuple[Any, ...]) -> None:
-    from icrtool.report import figure_dropout, figure_dropout_paths
     from icrtool.report.figure_style import save, style
 
-    draw = {
+    with style():
+        save(_figures()[name.partition("_")[0]](*content), directory / name, formats)
+
+
+def _figures() -> dict[str, Callable[..., Figure]]:
+    """Return the figures by the first word of their file's name."""
+    from icrtool.report import figure_dropout, figure_dropout_paths
+
+    return {
         "summary": figure_dropout.draw_summary,
         "histogram": figure_dropout.draw_histogram,
         "examples": figure_dropout_paths.draw_examples,
         "worst": figure_dropout_paths.draw_worst,
         "outages": figure_dropout_paths.draw_outages,
-    }[name.partition("_")[0]]
-    with style():
-        save(draw(*content), directory / name, formats)
+    }

@@ -17,7 +17,7 @@ ROWS_A_GROUP = 1 << 18
 
 @contextmanager
 def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
-    """Give a sink that appends the trials of a model and its horizons to a new Parquet file; starts without one are left out.
+    """Give a sink that appends trials to a new Parquet file; starts that are none are left out.
 
     Parameters
     ----------
@@ -33,9 +33,7 @@ def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
     import pyarrow.parquet as pq
 
     names = pa.dictionary(pa.int8(), pa.string())
-    schema = pa.schema(
-        {"model": names, "stamp_ns": pa.int64(), "horizon_m": pa.float64(), "error_m": pa.float64()}
-    )
+    schema = pa.schema({"model": names, "stamp_ns": pa.int64(), "horizon_m": pa.float64(), "error_m": pa.float64()})
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
 
         def append(model: str, horizons_m: Floats, errors_m: Floats) -> None:

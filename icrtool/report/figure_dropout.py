@@ -1,4 +1,4 @@
-"""How far off after how much blind way: the summary over all horizons, and histograms (Pentzer 2014, Figs. 28-32, 37)."""
+"""How far off after how much blind way: summary over the horizons, histograms (Pentzer 2014, Figs. 28-32, 37)."""
 
 from __future__ import annotations
 

@@ -190,9 +190,7 @@ def _outages_text(outages: Sequence[Outage]) -> str:
     return "Outages: " + "; ".join(said)
 
 
-def _number(
-    axes: Axes, one: Outage, number: int, norths: tuple[float, float], easts: tuple[float, float]
-) -> None:
+def _number(axes: Axes, one: Outage, number: int, norths: tuple[float, float], easts: tuple[float, float]) -> None:
     """Write the outage's number and end error beside its end, towards the middle of the picture."""
     right = one.east_m[-1] > sum(easts) / 2
     up = one.north_m[-1] < sum(norths) / 2

@@ -105,11 +105,17 @@ def test_a_clean_log_gives_no_warning() -> None:
     assert fit(make_log(), load_config(sets=[WIDTH])).warnings == ()
 
 
-def test_a_heading_that_turns_the_other_way_is_named() -> None:
+def test_a_heading_of_the_other_convention_is_turned_over_and_said() -> None:
     log = make_log()
-    log = replace(log, heading=replace(log.heading, heading_rad=-log.heading.heading_rad))
-    run = fit(log, load_config(sets=[WIDTH]))
-    assert any("turns the other way" in warning for warning in run.warnings)
+    other = math.pi / 2 - log.heading.heading_rad
+    wrong = replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * other))))
+    run = fit(wrong, load_config(sets=[WIDTH]))
+    assert run.heading_check.applied_mirror
+    assert any("other convention" in warning for warning in run.warnings)
+    assert run.table.y_icr_right_m[-1] == pytest.approx(ICRS[0], abs=ICR_TOLERANCE_M)
+    kept = fit(wrong, load_config(sets=[WIDTH, "frames.heading=enu"]))
+    assert not kept.heading_check.applied_mirror
+    assert any("set frames.heading" in warning for warning in kept.warnings)
 
 
 def test_a_configured_lever_arm_is_taken_off_the_fixes() -> None:

@@ -35,6 +35,7 @@ def parameters(**changes: object) -> FilterParameters:
         "recovery_count": 10,
         "recovery_s": 1.0,
         "icr_inflation_m2": 100.0,
+        "least_icr": -math.inf,
     }
     return FilterParameters(**(values | changes))  # type: ignore[arg-type]
 
@@ -108,6 +109,7 @@ def test_twins_agree_through_gaps_changes_and_inverted_starts() -> None:
     )
     assert_twins(data, parameters())
     assert_twins(data, parameters(), icrs=(-0.5, 0.5, 0.1))
+    assert_twins(data, parameters(least_icr=0.2), icrs=(-0.5, 0.5, 0.1))
 
 
 def test_twins_agree_where_stamps_coincide() -> None:

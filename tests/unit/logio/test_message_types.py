@@ -494,7 +494,7 @@ def test_a_damaged_message_is_left_out_and_counted(tmp_path: Path) -> None:
                 raw = bytes(store.serialize_cdr(draw(store, name, rng), name))
                 stamp_ns = START_NS + i * STEP_NS
                 writer.add_message(channel, stamp_ns, raw[:5] if i == 3 else raw, stamp_ns)
-                if twin != channel:
+                if message_type in PAIR_TYPES:
                     writer.add_message(twin, stamp_ns, raw, stamp_ns)
         writer.finish()
     tables = {table.topic: table for table in survey_log(path).tables}

@@ -1,0 +1,313 @@
+"""``icrtool dropout-report``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+from icrtool.cli.fit import RUNS, plot_formats, run_directories
+
+if TYPE_CHECKING:
+    from icrtool.analysis.dropout import DropoutReport, ErrorSink
+    from icrtool.analysis.fit import FilterRun
+    from icrtool.analysis.gates import Gate
+    from icrtool.analysis.outages import Outage
+    from icrtool.config import Config
+    from icrtool.report.dropout_content import DropoutContent
+    from icrtool.report.dropout_drawing import DrawingProcess
+    from icrtool.report.run_directory import StoredRun
+    from icrtool.tables import Ints
+
+EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is asked of every run.
+
+    Attributes
+    ----------
+    horizons_m, outage_s : empty: those of the run's configuration
+    config : what the options say; logs are fitted with it
+    """
+
+    config: Config
+    horizons_m: tuple[float, ...]
+    outage_s: tuple[float, ...]
+    outage_at_s: tuple[float, ...]
+    budgets_m: tuple[float, ...]
+    gates: tuple[Gate, ...]
+    trials: bool
+    seed: int
+    formats: tuple[str, ...]
+    quiet: bool
+    verbose: bool
+
+
+@click.command("dropout-report", epilog=EPILOG_GATE)
+@click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
+)
+@click.option("--budget", "budgets", metavar="METRES", type=float, multiple=True, default=(0.5,), show_default=True,
+              help="Say how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
+@click.option("--horizons", metavar="M,M,...", help="Distances driven blind [m], in place of the configured ones.")
+@click.option(
+    "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
+)
+@click.option("--outage", "outages", metavar="SECONDS", type=float, multiple=True,
+              help="Force outages of this length on the filter; repeatable.")  # fmt: skip
+@click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
+              help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
+@click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
+@click.option(
+    "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
+)
+@click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
+@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
+@options.configuration
+@options.verbosity
+def command(
+    sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
+    gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...], trials: bool,
+    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    """Say how far a robot can go blind: open loop from every recorded state, over 1 to 20 m.
+
+    RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
+    icrtool-runs/. The report is written into the run directory, as dropout/.
+
+    \b
+    Example:
+      icrtool dropout-report
+      icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
+      icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
+    """  # noqa: D301 - click wants the backspace character, not a backslash
+    from icrtool.report.dropout_drawing import DrawingProcess
+
+    formats = plot_formats(plots)
+    lengths = parse_horizons(horizons) if horizons is not None else ()
+    config = options.load(config_file, robot, sets)
+    with DrawingProcess(formats) as drawer:
+        # From here on numpy may be loaded: the second process is there.
+        from icrtool.analysis.dropout import DEFAULT_SEED
+        from icrtool.analysis.gates import parse_gate
+
+        request = Request(
+            config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
+            gates=tuple(parse_gate(text) for text in gates), trials=trials,
+            seed=seed if seed is not None else DEFAULT_SEED, formats=formats, quiet=quiet, verbose=verbose,
+        )  # fmt: skip
+        report_all(sources, output, request, drawer, junit=junit, markdown=markdown)
+
+
+def parse_horizons(text: str) -> tuple[float, ...]:
+    """Return the distances [m] of ``--horizons``."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    try:
+        lengths = tuple(float(part) for part in parts)
+    except ValueError as err:
+        raise click.BadParameter(f"{text!r} is not a list of metres", param_hint="--horizons") from err
+    if not lengths or not all(math.isfinite(length) and length > 0 for length in lengths):
+        raise click.BadParameter(f"{text!r} is not a list of distances", param_hint="--horizons")
+    return lengths
+
+
+def report_all(
+    sources: tuple[Path, ...], output: Path | None, request: Request, drawer: DrawingProcess, *,
+    junit: Path | None, markdown: Path | None,
+) -> None:  # fmt: skip
+    """Report on each source in turn, write the exports, and leave with the status that the outcomes ask for."""
+    from icrtool.errors import IcrToolError
+    from icrtool.report.dropout_exports import Outcome, check_parent, write_junit, write_markdown
+    from icrtool.report.dropout_source import newest_run
+    from icrtool.report.run_directory import RUN_FILE
+
+    for export in (junit, markdown):
+        if export is not None:
+            check_parent(export)
+    sources = sources or (newest_run(RUNS),)
+    logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
+    check_configuration(request.config, runs_only=not logs, output=output)
+    places = dict(zip(logs, run_directories(logs, output), strict=True))
+    outcomes: list[tuple[str, Outcome]] = []
+    for source in sources:
+        try:
+            outcomes.append((str(source), _report_one(source, places.get(source), request, drawer)))
+        except IcrToolError as err:
+            outcomes.append((str(source), err))
+            if len(sources) > 1:
+                click.echo(f"Error: {err}", err=True)
+    if junit is not None:
+        write_junit(junit, outcomes)
+    if markdown is not None:
+        write_markdown(markdown, outcomes)
+    failed = [outcome for _, outcome in outcomes if isinstance(outcome, IcrToolError)]
+    if failed:
+        what = f"{len(failed)} of {len(sources)} runs and logs"
+        raise failed[0] if len(sources) == 1 else IcrToolError(what, "could not be used", "the others were written")
+    if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
+        raise SystemExit(3)
+
+
+def check_configuration(config: Config, *, runs_only: bool, output: Path | None) -> None:
+    """Refuse options that would change nothing: a finished run keeps its configuration and its place."""
+    from icrtool.errors import ConfigError
+
+    given = sorted(config.model_fields_set - {"dropout"})
+    advice = "fit the log again with it, or name the log in place of its run"
+    if runs_only and given:
+        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+    if runs_only and output is not None:
+        raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
+
+
+def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutContent:
+    """Report on one source; `place` is the run directory of a log, None for a run."""
+    from icrtool.report.dropout_table import format_dropout
+
+    if place is None:
+        run: StoredRun | FilterRun = _read(source)
+        directory = source
+    else:
+        run, directory = _fit(source, place, request), place
+    content = _analyse(run, directory, request, drawer)
+    if not request.quiet:
+        click.echo(format_dropout(content))
+        click.echo(f"\nwritten to {directory / 'dropout'}\n")
+    return content
+
+
+def _read(directory: Path) -> StoredRun:
+    """Read a run; what the analysis needs is loaded beside it."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from icrtool.analysis.dropout import load_kernels
+    from icrtool.report.run_directory import read_run
+
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(read_run, directory)
+        load_kernels()
+        return reading.result()
+
+
+def _fit(log: Path, directory: Path, request: Request) -> FilterRun:
+    """Fit a log and write its run directory, as `icrtool fit` does."""
+    from icrtool.report.run_directory import check_target, write_run
+
+    check_target(directory)
+    with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
+        from icrtool.logio import read_log
+
+        measured = read_log(log, request.config, progress)
+    from icrtool.analysis.fit import fit
+
+    run = fit(measured, request.config)
+    write_run(run, directory, plots=request.formats)
+    options.warn(run.warnings, quiet=request.quiet)
+    if request.verbose:
+        for stream in measured.streams:
+            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+    return run
+
+
+def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, drawer: DrawingProcess) -> DropoutContent:
+    """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
+    from icrtool.analysis.blind_paths import example_drives, worst_drives
+    from icrtool.analysis.dropout import dropout
+    from icrtool.analysis.gates import budget_distances, judge_gate
+    from icrtool.analysis.outages import real_outages
+    from icrtool.report.dropout_content import DropoutContent, title_of
+    from icrtool.report.dropout_directory import dropout_directory, write_content
+    from icrtool.report.dropout_drawing import draw_paths, draw_statistics
+
+    title = title_of(run)
+    outages = (*_forced_outages(run, request), *real_outages(run))
+    with (
+        dropout_directory(directory) as partial,
+        drawer.into(partial / "plots") as draw,
+        _trials_sink(partial, run.table.stamp_ns, wanted=request.trials) as sink,
+    ):
+        examples, worst = example_drives(run), worst_drives(run)
+        draw_paths(draw, title, run.table, (examples, worst), outages)
+        report: DropoutReport = dropout(run, _horizons(run, request), seed=request.seed, sink=sink)
+        draw_statistics(draw, title, report, outages)
+        content = DropoutContent(
+            title=title,
+            run_summary=run.summary,
+            report=report,
+            budgets=tuple(one for budget in request.budgets_m for one in budget_distances(report, budget)),
+            verdicts=tuple(judge_gate(gate, report) for gate in request.gates),
+            worst=worst,
+            examples=examples,
+            outages=outages,
+        )
+        write_content(content, partial)
+    return content
+
+
+def _horizons(run: StoredRun | FilterRun, request: Request) -> list[float]:
+    """Return the horizons asked for: by option, else configured; and those that gates name."""
+    from icrtool.analysis.dropout import configured_horizons_m
+
+    dropout = request.config.dropout
+    configured = dropout.horizons_m if "horizons_m" in dropout.model_fields_set else configured_horizons_m(run)
+    horizons = list(request.horizons_m or configured)
+    for gate in request.gates:
+        if not any(math.isclose(gate.horizon_m, horizon, rel_tol=1e-9) for horizon in horizons):
+            horizons.append(gate.horizon_m)
+    return horizons
+
+
+def _forced_outages(run: StoredRun | FilterRun, request: Request) -> tuple[Outage, ...]:
+    """Force the outages asked for, by option or configuration; a stored run's log is read again for them."""
+    from icrtool.analysis.outages import force_outages, plan_outages
+    from icrtool.report.run_directory import StoredRun
+
+    dropout = request.config.dropout
+    stored = tuple(run.summary["config"]["dropout"]["forced_outage_s"])
+    configured = dropout.forced_outage_s if "forced_outage_s" in dropout.model_fields_set else stored
+    lengths = request.outage_s or configured
+    if request.outage_at_s and not lengths:
+        raise click.UsageError("--outage-at says when, and needs --outage to say how long")
+    if not lengths:
+        return ()
+    filtered = _fit_again(run, quiet=request.quiet) if isinstance(run, StoredRun) else run
+    plans = [plan_outages(filtered, length, request.outage_at_s) for length in lengths]
+    return tuple(outage for plan in plans for outage in force_outages(filtered, plan))
+
+
+def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
+    """Filter a stored run's log once more, for what the run directory does not hold: the measurements."""
+    from icrtool.analysis.fit import fit
+    from icrtool.logio import read_log
+    from icrtool.report.dropout_source import check_same_log, check_same_states, log_of, stored_config
+
+    config, path = stored_config(run), log_of(run)
+    with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
+        log = read_log(path, config, progress)
+    check_same_log(run, log)
+    again = fit(log, config)
+    check_same_states(run, again)
+    return again
+
+
+@contextmanager
+def _trials_sink(directory: Path, stamp_ns: Ints, *, wanted: bool) -> Iterator[ErrorSink | None]:
+    """Give a sink that writes trials.parquet, or None where it is not wanted."""
+    if not wanted:
+        yield None
+        return
+    from icrtool.report.dropout_trials import trials_file
+
+    with trials_file(directory / "trials.parquet", stamp_ns) as sink:
+        yield sink

@@ -1,0 +1,99 @@
+"""A finished run as the source of a dropout report: which one, with what configuration, from which log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from icrtool.analysis.fit import FilterRun
+from icrtool.config import Config
+from icrtool.errors import RunError
+from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory
+from icrtool.tables import RobotLog
+
+SAME_STATE_M = 1e-6
+"""States made again on another machine may differ by rounding, not by this much."""
+
+
+def stored_config(run: StoredRun) -> Config:
+    """Return the configuration a run was made with.
+
+    Raises
+    ------
+    RunError
+        It is not one that this version knows.
+    """
+    try:
+        return Config.model_validate(run.summary["config"])
+    except ValidationError as err:
+        problem = err.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in problem["loc"])
+        raise RunError(run.directory, f"its configuration is not ours ({key})", "run icrtool fit again") from err
+
+
+def log_of(run: StoredRun) -> Path:
+    """Return the log a run was made from: its file, or the bag directory its files lie in.
+
+    Raises
+    ------
+    RunError
+        It is not where it was when the run was made.
+    """
+    files = [Path(file["path"]) for file in run.summary["inputs"]]
+    gone = [file for file in files if not file.is_file()]
+    if gone or not files:
+        what = gone[0] if gone else "a list of inputs"
+        advice = "forced outages need the measurements: put the log back, or fit it where it is now"
+        raise RunError(run.directory, f"the log it was made from is gone ({what})", advice)
+    folder = files[0].parent
+    packed = files[0].suffix in {".zstd", ".zst"}
+    return folder if len(files) > 1 or packed or (folder / "metadata.yaml").is_file() else files[0]
+
+
+def check_same_log(run: StoredRun, log: RobotLog) -> None:
+    """Refuse a log that is not the one a run was made from.
+
+    Raises
+    ------
+    RunError
+        Its files have another size or content.
+    """
+    stored = sorted((file["bytes"], file["sha256"]) for file in run.summary["inputs"])
+    if stored != sorted((file.bytes, file.sha256) for file in log.inputs):
+        why = f"the log it was made from has changed since ({', '.join(file.path for file in log.inputs)})"
+        raise RunError(run.directory, why, "run icrtool fit again")
+
+
+def check_same_states(run: StoredRun, again: FilterRun) -> None:
+    """Refuse a run whose log and configuration give other states today.
+
+    Raises
+    ------
+    RunError
+        They do: another version of icrtool made the run.
+    """
+    ours, theirs = run.table, again.table
+    same = np.array_equal(ours.stamp_ns, theirs.stamp_ns) and all(
+        np.allclose(getattr(ours, column), getattr(theirs, column), rtol=0.0, atol=SAME_STATE_M)
+        for column in ("north_m", "east_m", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
+    )
+    if not same:
+        made_by = run.summary["tool_version"]
+        why = f"its log gives other states now (it was made by icrtool {made_by})"
+        raise RunError(run.directory, why, "run icrtool fit again")
+
+
+def newest_run(runs: Path) -> Path:
+    """Return the newest run directory below a folder, by the time of its run.json.
+
+    Raises
+    ------
+    RunError
+        There is none.
+    """
+    found = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
+    if not found:
+        raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
+    return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent

@@ -1,0 +1,451 @@
+"""Bad input through the command: one line that says what and why, exit status 1, and nothing left on disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
+
+START_NS = 1_760_000_000_000_000_000
+ROBOT = ("--set", "robot.track_width_m=0.55", "--set", "robot.wheel_radius_m=0.165")
+OPTIONS = WriteOptions(wheel_radius_m=0.165, track_width_m=0.55)
+NO_INTS, NO_FLOATS = np.zeros(0, np.int64), np.zeros(0)
+
+
+def drive(seconds: float = 20.0) -> SensorColumns:
+    """A robot on a circle: wheels and heading at 20 Hz, GNSS at 5 Hz."""
+    t = np.arange(0, seconds, 0.05)
+    stamps = START_NS + (t * 1e9).astype(np.int64)
+    speed, turn = 0.8, 0.3
+    heading = turn * t
+    north, east = np.cumsum(speed * np.cos(heading)) * 0.05, np.cumsum(speed * np.sin(heading)) * 0.05
+    fixes = slice(None, None, 4)
+    count = len(t[fixes])
+    return SensorColumns(
+        wheel_stamp_ns=stamps,
+        wheel_position_left_m=(speed + turn * 0.4) * t,
+        wheel_position_right_m=(speed - turn * 0.4) * t,
+        wheel_v_left_mps=np.full(len(t), speed + turn * 0.4),
+        wheel_v_right_mps=np.full(len(t), speed - turn * 0.4),
+        gnss_stamp_ns=stamps[fixes],
+        latitude_deg=47.0 + north[fixes] / 111_180,
+        longitude_deg=8.0 + east[fixes] / 76_060,
+        height_m=np.full(count, 400.0),
+        gnss_std_m=np.full(count, 0.02),
+        gnss_status=np.full(count, 2),
+        heading_stamp_ns=stamps,
+        heading_rad=heading,
+        yaw_rate_radps=np.full(len(t), turn),
+    )
+
+
+def without(columns: SensorColumns, *sensors: str) -> SensorColumns:
+    """The same drive with sensors that were never plugged in."""
+    fields = {
+        "wheel": ("wheel_position_left_m", "wheel_position_right_m", "wheel_v_left_mps", "wheel_v_right_mps"),
+        "gnss": ("latitude_deg", "longitude_deg", "height_m", "gnss_std_m"),
+        "heading": ("heading_rad", "yaw_rate_radps"),
+    }
+    changes = {name: NO_FLOATS for sensor in sensors for name in fields[sensor]}
+    changes |= {f"{sensor}_stamp_ns": NO_INTS for sensor in sensors}
+    return replace(columns, **changes, **({"gnss_status": NO_INTS} if "gnss" in sensors else {}))
+
+
+def first(columns: SensorColumns, **counts: int) -> SensorColumns:
+    """The first samples of a sensor only."""
+    of_sensor = {
+        "wheel": ("wheel_",),
+        "gnss": ("gnss_", "latitude", "longitude", "height"),
+        "heading": ("heading", "yaw"),
+    }
+    changes = {
+        name: getattr(columns, name)[: counts[sensor]]
+        for sensor, names in of_sensor.items()
+        if sensor in counts
+        for name in columns.__dataclass_fields__
+        if name.startswith(names)
+    }
+    return replace(columns, **changes)
+
+
+def log(folder: Path, columns: SensorColumns | None = None, **options: object) -> Path:
+    """Write the drive's log into a folder."""
+    options_ = replace(OPTIONS, **options)
+    name = {"mcap": "drive.mcap", "bag": "drive.bag", "db3": "drive"}[options_.container]
+    return write_log(folder / name, columns if columns is not None else drive(), options_)
+
+
+def rewritten(path: Path, edit: Callable[[str, int, bytes], tuple[int, bytes]], **options: object) -> Path:
+    """Write an MCAP log again with other log times and messages, without the library of the tool itself."""
+    content = path.read_bytes()
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2", "test")
+        schemas, channels = {}, {}
+        from io import BytesIO
+
+        for schema, channel, message in NonSeekingReader(BytesIO(content)).iter_messages(log_time_order=False):
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
+            stamp, data = edit(channel.topic, message.log_time, message.data)
+            writer.add_message(channels[channel.id], stamp, data, stamp)
+        writer.finish()
+    return path
+
+
+def with_header(data: bytes, stamp_ns: int) -> bytes:
+    """A CDR message that begins with a Header, stamped anew."""
+    seconds, rest = divmod(stamp_ns, 10**9)
+    return data[:4] + seconds.to_bytes(4, "little") + rest.to_bytes(4, "little") + data[12:]
+
+
+def zero_stamps(folder: Path) -> list[str]:
+    return [str(rewritten(log(folder), lambda _, stamp, data: (stamp, with_header(data, 0))))]
+
+
+def stamps_going_back(folder: Path) -> list[str]:
+    rng = np.random.default_rng(0)
+
+    def edit(_: str, stamp: int, data: bytes) -> tuple[int, bytes]:
+        return stamp, with_header(data, stamp - int(rng.integers(0, 300_000_000)))
+
+    return [str(rewritten(log(folder), edit))]
+
+
+def duplicated_stamps(folder: Path) -> list[str]:
+    def edit(_: str, stamp: int, data: bytes) -> tuple[int, bytes]:
+        held = stamp // 100_000_000 * 100_000_000
+        return held, with_header(data, held)
+
+    return [str(rewritten(log(folder), edit))]
+
+
+def truncated_mcap(folder: Path) -> list[str]:
+    path = rewritten(log(folder), lambda _, stamp, data: (stamp, data), chunk_size=8000)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    return [str(path)]
+
+
+def mcap_cut_before_anything(folder: Path) -> list[str]:
+    path = rewritten(log(folder), lambda _, stamp, data: (stamp, data))
+    path.write_bytes(path.read_bytes()[:60])
+    return [str(path)]
+
+
+def unindexed_bag(folder: Path) -> list[str]:
+    path = log(folder, container="bag", compression="lz4")
+    path.write_bytes(path.read_bytes()[:-2000])
+    return [str(path)]
+
+
+def truncated_db3(folder: Path) -> list[str]:
+    path = log(folder, container="db3")
+    (path / "drive.db3").write_bytes((path / "drive.db3").read_bytes()[:100_000])
+    return [str(path)]
+
+
+def unknown_compression(folder: Path) -> list[str]:
+    keep = {"enable_crcs": False, "index_types": IndexType.NONE, "compression": CompressionType.ZSTD}
+    path = rewritten(log(folder), lambda _, stamp, data: (stamp, data), **keep)
+    path.write_bytes(path.read_bytes().replace(b"\x04\0\0\0zstd", b"\x04\0\0\0oodl"))
+    return [str(path)]
+
+
+def missing_definitions(folder: Path) -> list[str]:
+    """ROS 1 messages in MCAP whose schemas are empty: nothing tells their layout."""
+    path = folder / "drive.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros1", "test")
+        for topic, kind in (("/joint_states", "sensor_msgs/JointState"), ("/fix", "sensor_msgs/NavSatFix")):
+            channel = writer.register_channel(topic, "ros1", writer.register_schema(kind, "ros1msg", b""))
+            writer.add_message(channel, START_NS, bytes(200), START_NS)
+        writer.finish()
+    return [str(path)]
+
+
+def other_serialization(folder: Path) -> list[str]:
+    path = folder / "drive.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        schema = writer.register_schema("sensor_msgs/msg/JointState", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/joint_states", "json", schema), START_NS, b"{}", START_NS)
+        writer.finish()
+    return [str(path)]
+
+
+def wrong_definition(folder: Path) -> list[str]:
+    """A schema that is not the messages': every message is too short for it."""
+    text = get_typestore(Stores.ROS2_HUMBLE).generate_msgdef("sensor_msgs/msg/NavSatFix", ros_version=2)[0]
+    path = log(folder)
+    path.write_bytes(
+        path.read_bytes().replace(text.encode()[:60], (b"float64[9999] nonsense\n" + b"#" * 99)[:59] + b"\n")
+    )
+    return [str(path)]
+
+
+def topics_with_line_breaks(folder: Path) -> list[str]:
+    path = folder / "drive.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "test")
+        schema = writer.register_schema("a\nb/msg/C\r\x1b[2J", "ros2msg", b"float64 data")
+        channel = writer.register_channel("/x\nError: forged\n", "cdr", schema)
+        writer.add_message(channel, START_NS, b"", START_NS)
+        writer.finish()
+    return [str(path)]
+
+
+def in_folder(folder: Path, name: str, content: bytes | None = None) -> list[str]:
+    target = folder / name
+    if content is None:
+        target.mkdir()
+    else:
+        target.write_bytes(content)
+    return [str(target)]
+
+
+def a_pipe(folder: Path) -> list[str]:
+    os.mkfifo(folder / "pipe.mcap")
+    return [str(folder / "pipe.mcap")]
+
+
+def a_file_in_the_way(folder: Path) -> list[str]:
+    (folder / "out").write_text("mine")
+    return [str(log(folder)), "-o", str(folder / "out")]
+
+
+def a_folder_below_a_file(folder: Path) -> list[str]:
+    (folder / "out").write_text("mine")
+    return [str(log(folder)), "-o", str(folder / "out" / "run")]
+
+
+def somebody_elses_folder(folder: Path) -> list[str]:
+    (folder / "out").mkdir()
+    (folder / "out" / "thesis.tex").write_text("mine")
+    return [str(log(folder)), "-o", str(folder / "out")]
+
+
+def two_logs_of_one_name(folder: Path) -> list[str]:
+    (folder / "a").mkdir()
+    (folder / "b").mkdir()
+    return [str(log(folder / "a")), str(log(folder / "b"))]
+
+
+def config_file(folder: Path, text: str) -> list[str]:
+    (folder / "robot.toml").write_text(text)
+    return [str(log(folder)), "--config", str(folder / "robot.toml")]
+
+
+def edited(**changes: object) -> Callable[[Path], list[str]]:
+    return lambda folder: [str(log(folder, replace(drive(), **changes)))]
+
+
+def made(change: Callable[[SensorColumns], SensorColumns]) -> Callable[[Path], list[str]]:
+    return lambda folder: [str(log(folder, change(drive())))]
+
+
+def asked(*arguments: str) -> Callable[[Path], list[str]]:
+    return lambda folder: [str(log(folder)), *arguments]
+
+
+FIXES, SAMPLES = len(drive().gnss_stamp_ns), len(drive().wheel_stamp_ns)
+
+REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
+    "no such file": (lambda folder: [str(folder / "drive.mcap")], "no such file or directory"),
+    "a text file": (lambda folder: in_folder(folder, "notes.mcap", b"hello\n" * 99), "not a log; a log is"),
+    "a picture": (lambda folder: in_folder(folder, "x.bag", b"\x89PNG\r\n\x1a\n" + bytes(999)), "not a log; a log is"),
+    "an empty file": (lambda folder: in_folder(folder, "x.mcap", b""), "an empty file"),
+    "an empty folder": (lambda folder: in_folder(folder, "bag"), "not a ROS 2 bag directory"),
+    "a folder of other things": (
+        lambda folder: [str(in_folder(folder, "x.txt", b"x") and folder)],
+        "not a ROS 2 bag dir",
+    ),
+    "a pipe": (a_pipe, "not a file"),
+    "an old bag": (
+        lambda folder: in_folder(folder, "x.bag", b"#ROSBAG V1.2\n" + bytes(99)),
+        "a bag of another version",
+    ),
+    "no database": (
+        lambda folder: in_folder(folder, "x.db3", b"SQLite format 3\0" + bytes(99)),
+        "not a readable rosbag2",
+    ),
+    "cut before anything": (mcap_cut_before_anything, "nothing in it can be read; drive.mcap: cut off"),
+    "an unknown compression": (unknown_compression, "compression 'oodl' is not known"),
+    "missing definitions": (missing_definitions, "definition"),
+    "another serialization": (other_serialization, "serialization 'json' is not read"),
+    "topics with line breaks": (topics_with_line_breaks, "/x\ufffdError: forged\ufffd"),
+    "no wheels": (made(lambda columns: without(columns, "wheel")), "no wheels"),
+    "no GNSS": (made(lambda columns: without(columns, "gnss")), "no position"),
+    "no heading": (made(lambda columns: without(columns, "heading")), "no heading"),
+    "nothing at all": (made(lambda columns: without(columns, "wheel", "gnss", "heading")), "no topic at all"),
+    "no position is a number": (edited(latitude_deg=np.full(FIXES, np.nan)), "no usable fix"),
+    "no position is infinite": (edited(longitude_deg=np.full(FIXES, np.inf)), "no usable fix"),
+    "no fix ever": (edited(gnss_status=np.full(FIXES, -1)), "no usable fix"),
+    "nowhere on earth": (edited(latitude_deg=np.full(FIXES, 4711.0)), "no usable fix"),
+    "at zero, zero": (edited(latitude_deg=np.zeros(FIXES), longitude_deg=np.zeros(FIXES)), "no usable fix"),
+    "no heading is a number": (edited(heading_rad=np.full(SAMPLES, np.nan)), "no valid quaternion"),
+    "no wheel speed is a number": (
+        edited(
+            wheel_v_left_mps=np.full(SAMPLES, np.nan),
+            wheel_v_right_mps=np.full(SAMPLES, np.nan),
+            wheel_position_left_m=np.full(SAMPLES, np.nan),
+            wheel_position_right_m=np.full(SAMPLES, np.nan),
+        ),
+        "",
+    ),
+    "one sample of each": (made(lambda columns: first(columns, wheel=1, gnss=1, heading=1)), ""),
+    "one wheel sample": (made(lambda columns: first(columns, wheel=1)), "1 usable wheel sample"),
+    "no overlap": (edited(gnss_stamp_ns=drive().gnss_stamp_ns + 10**12), ""),
+    "no overlap of the heading": (edited(heading_stamp_ns=drive().heading_stamp_ns - 10**12), ""),
+    "a topic that is not there": (asked("--set", "topics.gnss=/nope"), "topics.gnss: /nope is not in"),
+    "a topic of no use": (asked("--set", "topics.heading=/gps/fix"), "topics.heading: /gps/fix"),
+    "half a pair of topics": (asked("--set", "topics.wheel_left=/l"), "wheel_left and wheel_right come together"),
+    "an unknown key": (asked("--set", "topics.gps=/fix"), "topics.gps: unknown configuration key"),
+    "an unknown section": (asked("--set", "gps.topic=/fix"), "gps: unknown configuration key"),
+    "a word for a number": (asked("--set", "robot.track_width_m=wide"), "robot.track_width_m: "),
+    "a width below zero": (asked("--set", "robot.track_width_m=-1"), "robot.track_width_m: "),
+    "a width that is no number": (asked("--set", "robot.track_width_m=nan"), "robot.track_width_m: "),
+    "a setting without a value": (asked("--set", "robot.track_width_m"), "not of the form section.key=value"),
+    "an unknown robot": (asked("--robot", "marvin"), "robot 'marvin'"),
+    "no configuration file": (asked("--config", "nope.toml"), "nope.toml: cannot be read"),
+    "a configuration file with an unknown key": (
+        lambda folder: config_file(folder, "[robot]\nwheels = 4\n"),
+        "robot.wheels",
+    ),
+    "a configuration file that is none": (lambda folder: config_file(folder, "wheels: 4\n"), "not a TOML file"),
+    "a file in the way": (a_file_in_the_way, "a file is there"),
+    "a folder below a file": (a_folder_below_a_file, "is a file"),
+    "somebody else's folder": (somebody_elses_folder, "holds something that is not"),
+    "two logs of one name": (two_logs_of_one_name, "two logs have this name"),
+}
+
+RUNS: dict[str, tuple[Callable[[Path], list[str]], str]] = {
+    "a truncated MCAP": (truncated_mcap, "drive.mcap: cut off or damaged at byte "),
+    "an un-indexed bag": (unindexed_bag, "drive.bag: has no index"),
+    "a truncated db3": (truncated_db3, "drive.db3: "),
+    "zero in every header": (zero_stamps, "of the header stamps are 0; log time is used"),
+    "stamps that go back": (stamps_going_back, "go back"),
+    "duplicated stamps": (duplicated_stamps, "share a stamp"),
+    "a name that is no UTF-8": (
+        lambda folder: [shutil.move(log(folder), os.fsdecode(bytes(folder) + b"/\xff.mcap"))],
+        "",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Done:
+    status: int
+    out: str
+    err: list[str]
+    before: dict[str, int]
+    after: dict[str, int]
+
+
+def listing(folder: Path) -> dict[str, int]:
+    """Everything below a folder, hidden files too, with its size."""
+    return {str(path.relative_to(folder)): path.lstat().st_size for path in sorted(folder.rglob("*"))}
+
+
+def start(folder: Path, arguments: list[str]) -> subprocess.Popen[str]:
+    """Start ``icrtool fit`` in a folder of its own, which is also that of its temporary files."""
+    command = [sys.executable, "-m", "icrtool", "fit", *arguments]
+    if not {"--robot", "--config"} & set(arguments):
+        command += ROBOT if "robot.track_width_m" not in " ".join(arguments) else ()
+    environment = {**os.environ, "TMPDIR": str(folder), "PYTHONWARNINGS": "error::RuntimeWarning"}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        errors="replace",
+    )
+
+
+def run(folder: Path, make: Callable[[Path], list[str]]) -> Done:
+    folder.mkdir()
+    arguments = [*make(folder), "--plots", "none"]
+    before = listing(folder)
+    with start(folder, arguments) as process:
+        out, err = process.communicate(timeout=120)
+    return Done(process.returncode, out, err.splitlines(), before, listing(folder))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """Run all cases side by side; a test waits for its own."""
+    root = tmp_path_factory.mktemp("bad-input")
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        cases = (REFUSED | RUNS).items()
+        pending: dict[str, Future[Done]] = {
+            name: pool.submit(run, root / str(row), make) for row, (name, (make, _)) in enumerate(cases)
+        }
+        yield lambda name: pending[name].result()
+        pool.shutdown(cancel_futures=True)
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_used_is_refused_in_one_line_and_leaves_nothing(done, case):
+    found = done(case)
+    errors = [line for line in found.err if not line.startswith("Warning: ")]
+    assert found.status == 1, found
+    assert len(errors) == 1, found.err
+    assert errors[0].startswith("Error: ")
+    assert REFUSED[case][1] in errors[0]
+    assert found.out == ""
+    assert found.after == found.before
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_what_survives_is_used_and_what_was_lost_is_a_warning(done, case):
+    found = done(case)
+    assert found.status == 0, found.err
+    assert all(line.startswith("Warning: ") for line in found.err)
+    assert any(RUNS[case][1] in line for line in found.err) or not RUNS[case][1]
+    new = set(found.after) - set(found.before)
+    assert {Path(name).parts[0] for name in new} == {"icrtool-runs"}
+    assert {"run.json", "states.csv"} <= {Path(name).name for name in new}
+
+
+@pytest.mark.parametrize("options", [{}, {"container": "db3", "compression": "zstd-file"}], ids=["mcap", "db3.zstd"])
+def test_an_interrupted_run_leaves_nothing_behind(tmp_path, options):
+    finished = 0
+    for turn, seconds in enumerate((0.6, 1.0, 1.4, 1.8)):
+        folder = tmp_path / str(turn)
+        folder.mkdir()
+        path = log(folder, drive(120), **options)
+        before = listing(folder)
+        with start(folder, [str(path)]) as process:
+            time.sleep(seconds)
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=120)
+        finished += process.returncode == 0
+        after = set(listing(folder)) - set(before)
+        if process.returncode == 0:
+            assert {Path(name).parts[0] for name in after} == {"icrtool-runs"}
+        else:
+            assert after == set()
+    assert finished < 4
