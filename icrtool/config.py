@@ -66,8 +66,9 @@ class WheelsConfig(_Section):
 
 
 class FramesConfig(_Section):
-    """Where sensors sit and what their yaw means. `antenna_*`: the antenna from the body origin, forward and right.
+    """Where sensors sit and what their yaw means.
 
+    `antenna_*`: the antenna from the body origin; ``auto`` is what the log's own ``/tf_static`` says, else 0.
     `reference_delay_s`: how late the position reference is against the wheels; ``auto`` looks for it where the two
     contradict each other (preset ``field``).
     """
@@ -75,8 +76,8 @@ class FramesConfig(_Section):
     heading: Literal["auto", "enu", "ned"] = "auto"
     heading_offset_deg: Literal["auto"] | Finite = "auto"
     reference_delay_s: Literal["auto"] | Finite = "auto"
-    antenna_forward_m: Finite = 0.0
-    antenna_right_m: Finite = 0.0
+    antenna_forward_m: Literal["auto"] | Finite = "auto"
+    antenna_right_m: Literal["auto"] | Finite = "auto"
     datum: tuple[Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=360)]] | None = None
 
 

@@ -133,6 +133,7 @@ class RobotLog:
     datum : None where the position reference was metric already (total station, lidar, motion capture)
     rejected_fixes : fixes dropped at the door by reason (``no fix``, ``not finite`` ...)
     warnings : sentences for the user, in the order they were found
+    antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
     """
 
     name: str
@@ -144,6 +145,7 @@ class RobotLog:
     inputs: tuple[InputFile, ...]
     rejected_fixes: dict[str, int]
     warnings: tuple[str, ...]
+    antenna_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

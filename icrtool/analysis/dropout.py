@@ -332,7 +332,7 @@ def _judge(
 
 
 def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats) -> tuple[Floats, TrialCounts]:
-    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and the counts."""
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and counts."""
     errors = np.empty((len(horizons), len(drive.distance)))
     counts = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
     for lo in range(0, len(drive.distance), STARTS_A_CALL):

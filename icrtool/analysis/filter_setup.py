@@ -133,7 +133,7 @@ def set_up_filter(
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     correlation_s = max(config.filter.heading_correlation_s, heading_correlation_at_least_s)
-    parameters = _parameters(config, data, process_position_mps, correlation_s)
+    parameters = _parameters(config, data, antenna_m(log, config), process_position_mps, correlation_s)
     x0, P0 = _start_state(data, t0, config, parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
@@ -268,8 +268,22 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
 
 
+def antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
+    """Return the antenna's place in the body frame, forward and right [m]: configured, else the log's own, else 0."""
+    forward, right = log.antenna_m if log.antenna_m is not None else (0.0, 0.0)
+    given = config.frames
+    return (
+        forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
+        right if given.antenna_right_m == "auto" else given.antenna_right_m,
+    )
+
+
 def _parameters(
-    config: Config, data: Measurements, process_position_mps: float | None, heading_correlation_s: float
+    config: Config,
+    data: Measurements,
+    antenna: tuple[float, float],
+    process_position_mps: float | None,
+    heading_correlation_s: float,
 ) -> FilterParameters:
     settings = config.filter
     paper = settings.preset == "paper"
@@ -284,8 +298,8 @@ def _parameters(
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
         heading_correlation=1.0 if paper else _samples_that_err_alike(data.heading_t, heading_correlation_s),
-        antenna_forward=0.0 if paper else config.frames.antenna_forward_m,
-        antenna_right=0.0 if paper else config.frames.antenna_right_m,
+        antenna_forward=0.0 if paper else antenna[0],
+        antenna_right=0.0 if paper else antenna[1],
         wheel_gap_s=math.inf if paper else wheel_gap_s(config, data.wheel_t),
         gap_speed_variance=GAP_SPEED_STD_MPS**2,
         gap_turn_variance=GAP_TURN_STD_RADPS**2,

@@ -14,13 +14,16 @@ from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter
 from icrtool.core.open_loop import open_loop_path
-from icrtool.errors import ConfigError
+from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Floats
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""
 
 MOST_SPACED = 10
+
+SAME_M = 1e-6
+"""Before the first outage the disturbed run is the undisturbed one, to rounding."""
 
 OutageKind = Literal["forced", "real"]
 
@@ -80,15 +83,23 @@ def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) ->
 
 
 def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
-    """Run the filter again without GNSS and heading in the spans, and hold it against the undisturbed run."""
+    """Run the filter again without GNSS and heading in the spans, and hold it against the undisturbed run.
+
+    Raises
+    ------
+    DataError
+        The run cannot be made again: it began with what another run had learned.
+    """
     setup = set_up_filter(
         run.log,
         run.config,
+        heading_mirrored=run.heading_check.applied_mirror,
         heading_mirrored=run.heading_check.applied_mirror,
         heading_offset_rad=run.heading_check.applied_offset_rad,
         heading_std_at_least_rad=run.heading_check.applied_std_rad,
         heading_correlation_at_least_s=run.heading_check.applied_correlation_s,
         process_position_mps=run.process_position_mps,
+        changes_s=run.changes_s,
         outages_ns=tuple(spans_ns),
     )
     output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
@@ -97,6 +108,8 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]
     away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
     stamps, distance = run.table.stamp_ns[-rows:], run.table.distance_m[-rows:]
+    if (away[stamps < min(begin for begin, _ in spans_ns)] > SAME_M).any():
+        raise DataError(run.name, "a warm-started run cannot be made again for forced outages", "fit it without")
     origin = int(run.table.stamp_ns[0])
     outages = []
     for begin, end in spans_ns:

@@ -290,13 +290,19 @@ def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
     """Filter a stored run's log once more, for what the run directory does not hold: the measurements."""
     from icrtool.analysis.fit import fit
     from icrtool.logio import read_log
-    from icrtool.report.dropout_source import check_same_log, check_same_states, log_of, stored_config
+    from icrtool.report.dropout_source import (
+        check_same_log,
+        check_same_states,
+        log_of,
+        stored_config,
+        terrain_changes_s,
+    )
 
     config, path = stored_config(run), log_of(run)
     with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
         log = read_log(path, config, progress)
     check_same_log(run, log)
-    again = fit(log, config)
+    again = fit(log, config, changes_s=terrain_changes_s(run))
     check_same_states(run, again)
     return again
 

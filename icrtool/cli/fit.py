@@ -126,6 +126,6 @@ def _fit_one(
 
         click.echo(format_run(run))
         click.echo(f"\nwritten to {directory}")
-    if verbose:
-        for stream in measured.streams:
+    for stream in measured.streams:
+        if verbose or ("chosen over" in stream.why and not quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -19,8 +19,10 @@ from icrtool.logio.heading_sources import Convention, HeadingSource
 from icrtool.logio.open_log import open_log
 from icrtool.logio.position_sources import PositionSource
 from icrtool.logio.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
-from icrtool.logio.stamps import StampedRows, increasing, rate_and_jitter
+from icrtool.logio.stamps import increasing, rate_and_jitter
+from icrtool.logio.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logio.topic_table import TopicTable, merge_tables
+from icrtool.logio.wheel_sources import WheelMotion
 from icrtool.logio.wheel_speeds import wheel_samples
 from icrtool.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
 
@@ -116,7 +118,10 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     clock = common_clock(delays)
     warnings = list(survey.problems)
     if clock == "log" and any(delay is not None for delay in delays):
-        warnings.append(f"{name}: a stream without header stamps stands beside header stamps that are far from log time; all go by log time")
+        warnings.append(
+            f"{name}: a stream without header stamps stands beside header stamps that are far from log time; "
+            "all go by log time"
+        )
     for role, stamps in (("wheels", motion.stamps), ("gnss", position.stamps), ("heading", source.stamps)):
         if stamps.note and stamps.note != "no header":
             warnings.append(f"{name}: {role}: {stamps.note}; log time is used")
@@ -126,9 +131,10 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     warnings += wheel_warnings
     if source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
+    antenna = antenna_place(survey.tables, position.topic)
     streams = (
         _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
-        _stream("gnss", position, gnss.stamp_ns, clock, choice.why["gnss"]),
+        _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
         _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )
     unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
@@ -137,7 +143,13 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    return RobotLog(name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings))
+    return RobotLog(name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna)
+
+
+def _place_in_words(antenna: tuple[float, float] | None) -> str:
+    if antenna is None:
+        return ""
+    return f"; antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base (/tf_static)"
 
 
 def _collect(
@@ -147,7 +159,9 @@ def _collect(
     unread: dict[str, str] = {}
     collectors: dict[int, Collector] = {}
     by_id = {channel.id: channel for channel in container.channels}
-    for number, paths in fields_to_take(container.channels, config).items():
+    wanted = fields_to_take(container.channels, config)
+    wanted |= {channel.id: FIELDS for channel in container.channels if is_static(channel)}
+    for number, paths in wanted.items():
         try:
             collectors[number] = collector_for(by_id[number], paths)
         except DefinitionError as err:
@@ -179,9 +193,14 @@ def _input_of(file: Path, pending: Future[str]) -> InputFile:
     return InputFile(str(file), file.stat().st_size, pending.result())
 
 
-def _stream(role: Role, source: object, stamps: Ints, clock: Literal["header", "log"], why: str) -> StreamChoice:
-    assert hasattr(source, "stamps") and hasattr(source, "topic") and hasattr(source, "message_type")
-    rows: StampedRows = source.stamps
+def _stream(
+    role: Role,
+    source: WheelMotion | PositionSource | HeadingSource,
+    stamps: Ints,
+    clock: Literal["header", "log"],
+    why: str,
+) -> StreamChoice:
+    rows = source.stamps
     rate, jitter = rate_and_jitter(stamps)
     used: Literal["header", "log"] = "header" if clock == "header" and rows.header_ns is not None else "log"
     return StreamChoice(role, source.topic, source.message_type, len(stamps), rate, used, jitter, why)
@@ -192,7 +211,9 @@ def _fixes(
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
     """Bring positions to the local plane about the datum."""
     if not source.usable.any():
-        raise DataError(name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad"))
+        raise DataError(
+            name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
+        )
     stamps = source.stamps.on(clock)
     rows = np.flatnonzero(source.usable)
     rows = rows[np.argsort(stamps[rows], kind="stable")]
@@ -209,8 +230,7 @@ def _fixes(
             latitude, longitude, height, datum.latitude_deg, datum.longitude_deg, datum.height_m
         )
     else:
-        assert source.metric is not None
-        north, east = source.metric[rows].T
+        north, east = np.asarray(source.metric, np.float64)[rows].T
     variance = source.variance[rows]
     fixes = PositionFixes(
         stamps[rows],
@@ -226,7 +246,9 @@ def _headings(
 ) -> tuple[HeadingSamples, str]:
     """Bring headings to clockwise from north; say how the convention is known."""
     if not source.usable.any():
-        raise DataError(name, f"{source.topic}: {source.problem or 'no usable heading'}", "choose another with topics.heading")
+        raise DataError(
+            name, f"{source.topic}: {source.problem or 'no usable heading'}", "choose another with topics.heading"
+        )
     convention: Convention = source.convention
     why = source.convention_why
     if config.frames.heading != "auto":

@@ -28,6 +28,8 @@ _FUSED = re.compile(
 )
 """Odometry and twists that other sensors have a part in: better than nothing."""
 
+MOST_NAMED = 12
+
 NEVER_MOVES = 60.0
 """Taken off the score of wheels that stand still all the time: another topic that moves is the robot's."""
 
@@ -122,28 +124,28 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
     codes, texts = table.words(paths[0])
     left, right = _wheels_among(texts, config)
-    problem = ""
-    listed = np.zeros((len(table), len(texts)), np.bool_)
-    rows, places = np.nonzero(codes >= 0)
-    listed[rows, codes[rows, places]] = True
-    alike = _rows_alike(listed, left, right)
-    if not texts:
-        problem = "lists no joints"
-    elif not (left and right):
-        problem = (
-            f"no left and right wheel among its joints {', '.join(texts)}; name them in wheels.{{left,right}}_joints"
+    if not (left and right):
+        some = ", ".join([*texts[:MOST_NAMED], *(["…"] if len(texts) > MOST_NAMED else [])])
+        named = f"no left and right wheel among its joints {some}; name them in wheels.{{left,right}}_joints"
+        return no_motion(table, named if texts else "lists no joints")
+    lefts, rights = len(left), len(right)
+    # Joints by their place among the wheels, left ones first; -1 for all others.
+    wheel = np.full(len(texts) + 1, -1)
+    wheel[left + right] = np.arange(lefts + rights)
+    wheels = wheel[codes]
+    alike = _rows_alike(wheels, lefts, rights)
+    if not alike.any():
+        return no_motion(table, "left and right wheels come in different messages")
+    if not alike.all():
+        table, wheels = table.rows(alike), wheels[alike]
+    position, speed = (
+        _side_means(
+            _by_wheel(table.find(path), wheels, lefts + rights), [*range(lefts)], [*range(lefts, lefts + rights)]
         )
-    elif not alike.any():
-        problem = "left and right wheels come in different messages"
-    if problem:
-        return motion_of(table.topic, table.message_type, stamp_rows(table), score=score, problem=problem)
-    table, codes = table.rows(alike), codes[alike]
-    position, speed = (_by_joint(table.find(path), codes, len(texts)) for path in paths[1:])
-    return motion_of(
-        table.topic, table.message_type, stamp_rows(table), _side_means(position, left, right),
-        _side_means(speed, left, right), score=score,
-        why=f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}",
-    )  # fmt: skip
+        for path in paths[1:]
+    )
+    why = f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}"
+    return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
 
 
 def _wheels_among(texts: list[str], config: Config) -> tuple[list[int], list[int]]:
@@ -156,28 +158,30 @@ def _wheels_among(texts: list[str], config: Config) -> tuple[list[int], list[int
     return left, right
 
 
-def _rows_alike(listed: Bools, left: list[int], right: list[int]) -> Bools:
+def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
     """Return the rows (n,) that list the set of wheels most rows list, of those sets with both sides.
 
     A mean over wheels that changes its members would jump.
     """
-    both: Bools = np.logical_and(listed[:, left].any(axis=1), listed[:, right].any(axis=1))
-    if not both.any():
-        return both
-    sets, which, count = np.unique(listed[both][:, left + right], axis=0, return_inverse=True, return_counts=True)
-    if len(sets) > 1:
+    listed = np.zeros((len(wheels), lefts + rights), np.bool_)
+    rows, places = np.nonzero(wheels >= 0)
+    listed[rows, wheels[rows, places]] = True
+    both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
+    sets = listed[both]
+    if len(sets) and np.any(sets != sets[0]):
+        _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
         both[both] = which.reshape(-1) == int(np.argmax(count))
     return both
 
 
-def _by_joint(values: NDArray[Any] | None, codes: Ints, joints: int) -> Floats:
-    """Return what each message tells of each joint (n, joints), NaN where nothing."""
-    sorted_values = np.full((len(codes), joints), np.nan)
+def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats:
+    """Return what each message tells of each wheel (n, count), NaN where nothing."""
+    told = np.full((len(wheels), count), np.nan)
     if values is not None:
-        width = min(values.shape[1], codes.shape[1])
-        rows, places = np.nonzero(codes[:, :width] >= 0)
-        sorted_values[rows, codes[rows, places]] = values[rows, places]
-    return sorted_values
+        width = min(values.shape[1], wheels.shape[1])
+        rows, places = np.nonzero(wheels[:, :width] >= 0)
+        told[rows, wheels[rows, places]] = values[rows, places]
+    return told
 
 
 def _by_name(paths: _Paths, score: float, what: str) -> Reader:

@@ -80,9 +80,13 @@ def check_same_states(run: StoredRun, again: FilterRun) -> None:
         for column in ("north_m", "east_m", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
     )
     if not same:
-        made_by = run.summary["tool_version"]
-        why = f"its log gives other states now (it was made by icrtool {made_by})"
-        raise RunError(run.directory, why, "run icrtool fit again")
+        why = f"its log gives other states now (it was warm-started, or icrtool {run.summary['tool_version']} differed)"
+        raise RunError(run.directory, why, "forced outages need a run that can be made again: fit the log again")
+
+
+def terrain_changes_s(run: StoredRun) -> tuple[float, ...]:
+    """Return the terrain changes [s] that a run was made with."""
+    return tuple(float(segment["begin_s"]) for segment in run.summary.get("segments", [])[1:])
 
 
 def newest_run(runs: Path) -> Path:

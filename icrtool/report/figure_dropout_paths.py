@@ -32,6 +32,14 @@ FORCED = Pen(BAD_FIX_COLOR, width=1.8)
 REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
 WAY = Pen(FIX_COLOR, width=1.4)
 
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top [points]."""
+
+MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 4.9
+"""Half the size of a mark, height of a line of text, usual width of a character, in points."""
+LABEL_OFFSETS_PT = tuple(
+    (sign * dx, dy) for dx in (7.0, 16.0) for dy in (9.0, -9.0, 0.0, 18.0, -18.0) for sign in (1, -1)
+)
 SMALLEST_VIEW_M = 0.5
 CELLS = 1500.0
 
@@ -99,16 +107,16 @@ def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[
     cell = (east - west) / CELLS
     shown = places(north_m, east_m, cell)
     axes.plot(east_m[shown], north_m[shown], zorder=2, **WAY.keywords())
-    for number, one in enumerate(outages, start=1):
+    for one in outages:
         pen = FORCED if one.kind == "forced" else REAL
         shown = places(one.north_m, one.east_m, cell)
         axes.plot(one.east_m[shown], one.north_m[shown], zorder=3, **pen.keywords())
         axes.plot(one.east_m[:1], one.north_m[:1], zorder=4, **_mark("white"))
         axes.plot(one.east_m[-1:], one.north_m[-1:], zorder=4, **_mark("black"))
-        _number(axes, one, number, (south, north), (west, east))
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
     axes.set_aspect("equal")
+    _write_errors(axes, outages, (south, west), 72.0 * box_in / (north - south))
     axes.set_xlabel("East [m]")
     axes.set_ylabel("North [m]")
     keys = [Line2D([], [], label="filter", **WAY.keywords())]
@@ -190,17 +198,69 @@ def _outages_text(outages: Sequence[Outage]) -> str:
     return "Outages: " + "; ".join(said)
 
 
-def _number(axes: Axes, one: Outage, number: int, norths: tuple[float, float], easts: tuple[float, float]) -> None:
-    """Write the outage's number and end error beside its end, towards the middle of the picture."""
-    right = one.east_m[-1] > sum(easts) / 2
-    up = one.north_m[-1] < sum(norths) / 2
+def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, float], points_per_metre: float) -> None:
+    """Write each outage's number and end error beside its end where there is room; the tables have them all.
+
+    Parameters
+    ----------
+    axes : with its limits set
+    lowest : north and east [m] of the lower left corner
+    points_per_metre : scale of the picture
+    """
+
+    def point(one: Outage, row: int) -> tuple[float, float]:
+        east, north = float(one.east_m[row]), float(one.north_m[row])
+        return (east - lowest[1]) * points_per_metre, (north - lowest[0]) * points_per_metre
+
+    ends = [point(one, row) for one in outages for row in (0, -1)]
+    ways = [
+        point(one, int(row)) for one in outages for row in places(one.north_m, one.east_m, LINE_PT / points_per_metre)
+    ]
+    taken = [_box_about(place) for place in ends]
+    crossed = [_box_about(place) for place in ways]
+    upper = (axes.get_xlim()[1] - lowest[1]) * points_per_metre, (axes.get_ylim()[1] - lowest[0]) * points_per_metre
+    for number, one in enumerate(outages, start=1):
+        text = f"{number}: {length_text(one.end_error_m)}"
+        offset = _free_offset(point(one, -1), CHARACTER_PT * len(text), taken, crossed, upper)
+        if offset is not None:
+            taken.append(_label_box(point(one, -1), CHARACTER_PT * len(text), offset))
+            _write(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), offset)
+
+
+def _free_offset(
+    place: tuple[float, float], width: float, taken: list[Box], crossed: list[Box], upper: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Return where a label of this width can stand: off all that is taken, if it can off the lines it would cross."""
+    for obstacles in ([*taken, *crossed], taken):
+        for offset in LABEL_OFFSETS_PT:
+            box = _label_box(place, width, offset)
+            inside = box[0] > 0 and box[1] > 0 and box[2] < upper[0] and box[3] < upper[1]
+            if inside and not any(_overlap(box, other) for other in obstacles):
+                return offset
+    return None
+
+
+def _box_about(place: tuple[float, float]) -> Box:
+    return place[0] - MARK_PT, place[1] - MARK_PT, place[0] + MARK_PT, place[1] + MARK_PT
+
+
+def _label_box(place: tuple[float, float], width: float, offset: tuple[float, float]) -> Box:
+    left, bottom = place[0] + (offset[0] if offset[0] > 0 else offset[0] - width), place[1] + offset[1] - LINE_PT / 2
+    return left, bottom, left + width, bottom + LINE_PT
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _write(axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float]) -> None:
     axes.annotate(
-        f"{number}: {length_text(one.end_error_m)}",
-        (one.east_m[-1], one.north_m[-1]),
-        xytext=(-7 if right else 7, 6 if up else -6),
+        text,
+        place,
+        xytext=offset_pt,
         textcoords="offset points",
-        ha="right" if right else "left",
-        va="bottom" if up else "top",
+        ha="left" if offset_pt[0] > 0 else "right",
+        va="center",
         fontsize=8.0,
         zorder=6,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},

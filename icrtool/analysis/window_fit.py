@@ -1,0 +1,302 @@
+"""A calibration that predicts: constant parameters fitted to what they are for, the place after some way driven blind.
+
+The filter's momentary ICRs explain the last seconds; a constant fitted to open-loop displacements over 5-10 m predicts
+the next ones. Windows of way start every half metre of a run; their open-loop end points, in the body frame of their
+start, are held against the filter's estimates there. The loss is robust, the covariance that of stretches of way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
+from icrtool.core.open_loop import trial_ends
+from icrtool.core.window_fit import NEUTRAL, displace, move
+from icrtool.errors import DataError
+from icrtool.tables import Bools, Floats, Ints
+
+WINDOWS_M = (5.0, 10.0)
+"""Lengths of the windows. One length alone lets a circle of just that circumference say nothing."""
+
+EVERY_M = 0.5
+"""A window of each length starts every so much way."""
+
+HUBER_SIGMAS = 2.0
+"""Where the loss turns from square to straight, in robust standard deviations of the residuals."""
+
+REWEIGHTINGS = 3
+STRETCH_M = 20.0
+"""Way that errs alike, for the covariance: twice the longest window."""
+
+USUAL_MULTIPLIER = 1.4
+"""W / b of the prior: published skid factors are 1.1 to 1.9 (logs.md, section 1)."""
+
+TERMS = ("separation", "asymmetry", "x_icr", "scale", "scale_difference", "bend", "speed", "late")
+"""What can be fitted: W [m], (y_r + y_l) / 2 [m], x_icr [m], scale of both sides, left minus right, and ``bend``,
+``speed`` of `icrtool.core.window_fit`; ``late`` [s]: the wheels are read this much later than the pose."""
+
+_BASIS = np.array(
+    [
+        [0.5, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.5, -0.5, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Rows: what one unit of each term adds to (y_r, y_l, x, k_l, k_r, bend, speed, late)."""
+
+_PRIOR_STD = {"scale": 0.05, "scale_difference": 0.05, "bend": 0.3, "speed": 0.3, "late": 0.2}
+"""How far the terms stray on real robots: a drive that says nothing of a term leaves it where it belongs."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowModel:
+    """A model to fit: what is free, of `TERMS`; the rest is neutral."""
+
+    name: str
+    label: str
+    terms: tuple[str, ...]
+
+
+MULTIPLIER = WindowModel("multiplier", "best single multiplier", ("separation",))
+CONSTANT = WindowModel("window", "window fit", ("separation", "asymmetry", "x_icr"))
+EXTENDED = (
+    WindowModel("window_scale", "with scales", (*CONSTANT.terms, "scale", "scale_difference")),
+    WindowModel("window_late", "with delay", (*CONSTANT.terms, "late")),
+    WindowModel("window_scale_late", "with scales and delay", (*CONSTANT.terms, "scale", "scale_difference", "late")),
+    WindowModel("window_bend", "with scales and curvature", (*CONSTANT.terms, "scale", "scale_difference", "bend")),
+    WindowModel("window_speed", "with scales and speed", (*CONSTANT.terms, "scale", "scale_difference", "speed")),
+)
+"""Models that pay on some robots and not on others: cross-validation chooses."""
+
+
+class Windows(NamedTuple):
+    """Windows of a run, ready to be fitted.
+
+    Attributes
+    ----------
+    t, dt, v_left, v_right : (n,) wheel samples, `dt` 0 over gaps
+    knot_t : (m,) ascending [s]: times at which windows start or end
+    start, end : (w,) rows of `knot_t`
+    start_m, end_m : (w,) path length [m] at start and end
+    length_m : (w,)
+    reference : complex (w,), displacement in the body frame of the start [m]
+    width_m : b, or what stands for it
+    """
+
+    t: Floats
+    dt: Floats
+    v_left: Floats
+    v_right: Floats
+    knot_t: Floats
+    start: Ints
+    end: Ints
+    start_m: Floats
+    end_m: Floats
+    length_m: Floats
+    reference: np.ndarray[Any, np.dtype[np.complex128]]
+    width_m: float
+
+    def keep(self, kept: Bools) -> Windows:
+        """Return the windows marked in `kept` (w,)."""
+        return self._replace(
+            start=self.start[kept], end=self.end[kept], start_m=self.start_m[kept], end_m=self.end_m[kept],
+            length_m=self.length_m[kept], reference=self.reference[kept],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFit:
+    """Parameters that were fitted.
+
+    Attributes
+    ----------
+    terms : values of the model's terms, in its order
+    covariance : (k, k) of them, from stretches of way (sandwich)
+    parameters : (8,) y_icr_right, y_icr_left, x_icr [m], scale_left, scale_right, bend, speed [s/m], late [s]
+    parameter_covariance : (8, 8)
+    residual_m : robust standard deviation of a window's miss, per square root of metre
+    windows : how many were used
+    """
+
+    model: WindowModel
+    terms: Floats
+    covariance: Floats
+    parameters: Floats
+    parameter_covariance: Floats
+    residual_m: float
+    windows: int
+
+    @property
+    def icrs_m(self) -> tuple[float, float, float]:
+        """y_icr_right, y_icr_left, x_icr [m]."""
+        right, left, x = (float(value) for value in self.parameters[:3])
+        return right, left, x
+
+    @property
+    def icr_std_m(self) -> tuple[float, float, float]:
+        """One standard deviation of `icrs_m`."""
+        right, left, x = (float(value) for value in np.sqrt(np.diag(self.parameter_covariance)[:3]))
+        return right, left, x
+
+
+def cut_windows(run: DrivenRun, lengths_m: Iterable[float] = WINDOWS_M, every_m: float = EVERY_M) -> Windows:
+    """Cut a run into overlapping windows of way; those across a gap or ending in an outage are left out.
+
+    Raises
+    ------
+    DataError
+        The run holds fewer than ten windows.
+    """
+    drive, table = drive_of(run), run.table
+    place = drive.north + 1j * drive.east
+    begins = np.unique(np.searchsorted(table.distance_m, np.arange(0.0, float(table.distance_m[-1]), every_m)))
+    begins = begins[~drive.in_outage[begins]]
+    starts, ends, lengths = [], [], []
+    for length, column in zip(lengths_m, trial_ends(drive, np.array(list(lengths_m), np.float64)).T, strict=True):
+        end = column[begins]
+        whole = end >= 0
+        starts.append(begins[whole])
+        ends.append(end[whole])
+        lengths.append(np.full(np.count_nonzero(whole), length))
+    start, end, length_m = np.concatenate(starts), np.concatenate(ends), np.concatenate(lengths)
+    if len(start) < 10:
+        raise DataError(
+            run.name, f"only {len(start)} windows of {min(lengths_m):g} m of way", "a window fit needs a longer drive"
+        )
+    knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
+    return Windows(
+        t=table.t_s,
+        dt=np.where(drive.gap, 0.0, drive.dt_s),
+        v_left=table.v_left_mps,
+        v_right=table.v_right_mps,
+        knot_t=table.t_s[knots],
+        start=rows[: len(start)],
+        end=rows[len(start) :],
+        start_m=table.distance_m[start],
+        end_m=table.distance_m[end],
+        length_m=length_m,
+        reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
+        width_m=run.track_width_m if run.track_width_m is not None else 2.0 * DEFAULT_HALF_WIDTH_M,
+    )
+
+
+def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
+    """Fit a model's constants to windows of way.
+
+    Parameters
+    ----------
+    windows : of `cut_windows`, or some of them
+    model : what is free
+
+    Returns
+    -------
+    WindowFit
+
+    Notes
+    -----
+    Nonlinear least squares (trust region, analytic Jacobian) with the soft-L1 loss, whose scale is the residuals' own
+    (Huber 1964), under a wide prior: W about 1.4 b, no asymmetry, no x_icr, ± the robot's half width, terms beyond the
+    ICRs as far as they stray on real robots. A miss grows about as the root of the way, hence the weights. Windows
+    overlap: a stretch of way counts once in the covariance (sandwich, White 1982), and the prior as much as one.
+    """
+    from scipy.optimize import least_squares
+
+    chosen = [TERMS.index(term) for term in model.terms]
+    basis = _BASIS[chosen]
+    mean, std = _prior(windows.width_m, model)
+    base = np.array([*NEUTRAL, 0.0])
+    weight = 1.0 / np.sqrt(windows.length_m)
+    spread = max(len(windows.start) * EVERY_M / max(float(np.ptp(windows.start_m)), EVERY_M), 1.0)
+    overlap = spread * float(windows.length_m.mean()) / EVERY_M
+    problem = _Problem(windows, basis, base, weight)
+    terms, scale = mean.copy(), 1.0
+    for _ in range(REWEIGHTINGS):
+        misses, _ = problem(terms)
+        scale = max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
+        held = scale * np.sqrt(overlap) / std
+
+        def residuals(q: Floats, scale: float = scale, held: Floats = held) -> Floats:
+            return np.concatenate([problem(q)[0], (q - mean) * held]) / scale
+
+        def jacobian(q: Floats, scale: float = scale, held: Floats = held) -> Floats:
+            return np.concatenate([problem(q)[1], np.diag(held)]) / scale
+
+        terms = least_squares(
+            residuals, terms, jac=jacobian, loss="soft_l1", f_scale=HUBER_SIGMAS, x_scale=std, xtol=1e-6, ftol=1e-6
+        ).x
+    misses, slopes = problem(terms)
+    covariance = _sandwich(misses / scale, slopes / scale, np.sqrt(overlap) / std, np.tile(windows.start_m, 2))
+    return WindowFit(
+        model=model,
+        terms=terms,
+        covariance=covariance,
+        parameters=base + terms @ basis,
+        parameter_covariance=basis.T @ covariance @ basis,
+        residual_m=scale,
+        windows=len(windows.start),
+    )
+
+
+class _Problem:
+    """Weighted misses of all windows (2 w,) [m per root metre] and their derivatives (2 w, k), once per place."""
+
+    def __init__(self, windows: Windows, basis: Floats, base: Floats, weight: Floats) -> None:
+        self._windows, self._basis, self._base, self._weight = windows, basis, base, weight
+        self._last: tuple[bytes, tuple[Floats, Floats]] | None = None
+
+    def __call__(self, terms: Floats) -> tuple[Floats, Floats]:
+        key = terms.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._evaluate(self._base + terms @ self._basis)
+        return self._last[1]
+
+    def _evaluate(self, p: Floats) -> tuple[Floats, Floats]:
+        w = self._windows
+        motion = move(w.t, w.dt, w.v_left, w.v_right, p[:7], w.knot_t + p[7])
+        d, d_by, d_late = displace(motion, w.start, w.end)
+        miss = (d - w.reference) * self._weight
+        slope = (np.column_stack([d_by, d_late]) @ self._basis.T) * self._weight[:, None]
+        return np.concatenate([miss.real, miss.imag]), np.concatenate([slope.real, slope.imag])
+
+
+def _prior(width_m: float, model: WindowModel) -> tuple[Floats, Floats]:
+    """Return mean and standard deviation of the model's terms before any window is seen."""
+    means = {"separation": USUAL_MULTIPLIER * width_m}
+    stds = {"separation": width_m, "asymmetry": width_m / 2, "x_icr": width_m / 2, **_PRIOR_STD}
+    return np.array([means.get(term, 0.0) for term in model.terms]), np.array([stds[term] for term in model.terms])
+
+
+def _sandwich(misses: Floats, slopes: Floats, prior: Floats, way_m: Floats) -> Floats:
+    """Return the covariance of a robust fit whose misses, over each stretch of way, are one another's kin.
+
+    Parameters
+    ----------
+    misses : (m,), slopes : (m, k), in units of the residuals' scale
+    prior : (k,) square roots of the prior's information
+    way_m : (m,) [m] where each miss belongs
+
+    Notes
+    -----
+    H^-1 (sum g g^T) H^-1 with g the gradient of a stretch and H the Gauss-Newton matrix (White 1982; Liang and Zeger
+    1986 for clusters), with their B / (B - 1).
+    """
+    influence = 1.0 / np.sqrt(1.0 + (misses / HUBER_SIGMAS) ** 2)
+    H = (slopes * influence[:, None]).T @ slopes + np.diag(prior**2)
+    stretch = np.unique((way_m / STRETCH_M).astype(np.int64), return_inverse=True)[1]
+    gradients = np.zeros((int(stretch.max()) + 1, slopes.shape[1]))
+    np.add.at(gradients, stretch, slopes * (influence * misses)[:, None])
+    count = len(gradients)
+    meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(prior**2)
+    solved = np.linalg.solve(H, meat)
+    covariance: Floats = np.linalg.solve(H, solved.T)
+    return (covariance + covariance.T) / 2.0
