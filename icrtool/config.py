@@ -50,13 +50,17 @@ class TopicsConfig(_Section):
 
 
 class WheelsConfig(_Section):
-    """How wheel messages become speeds. Scales multiply the travel of a side (1.02: the wheel is 2 % larger)."""
+    """How wheel messages become speeds.
+
+    Scales multiply the travel of a side (1.02: the wheel is 2 % larger); ``auto`` is 1, or what the position reference
+    says of both sides where that is clear (preset ``field``).
+    """
 
     left_joints: tuple[str, ...] = ()
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
-    left_scale: Finite = 1.0
-    right_scale: Finite = 1.0
+    left_scale: Literal["auto"] | Finite = "auto"
+    right_scale: Literal["auto"] | Finite = "auto"
 
     @model_validator(mode="after")
     def _possible(self) -> WheelsConfig:

@@ -13,6 +13,7 @@ from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
+from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
@@ -130,6 +131,8 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
+    wheels = check_wheels(log, config)
+    log = wheels.log
     check = check_heading(log, config)
     adapted = run_adaptively(log, config, check, warm_start, changes_s)
     log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
@@ -146,6 +149,7 @@ def fit(
     convergence, outages = converge(table), _outages(table, gnss)
     warnings = (
         *log.warnings,
+        *wheels.warnings,
         *check.warnings,
         *_doubts(log.name, table, gnss),
         *_adaptation_notes(log.name, config, adapted),
@@ -163,6 +167,7 @@ def fit(
         "segments": segment_summary(table, changes_s),
         "gnss": gnss_summary(log, gnss),
         "heading": check.summary(),
+        "wheels": wheels.summary(),
         "outages_ns": outages.tolist(),
         "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(in_gap)],
         "filter": {

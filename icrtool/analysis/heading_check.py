@@ -84,6 +84,7 @@ class Course(NamedTuple):
     angle : (w,) heading minus course [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading that turns the other way
     curvature : (w,) heading change over way [rad/m]
+    ratio : (w,) displacement by the fixes over displacement by wheels and heading
     noise_rad : what the fixes' noise alone turns a course by
     duration_s : median duration of a window
     """
@@ -91,6 +92,7 @@ class Course(NamedTuple):
     angle: Floats
     mirrored: Floats
     curvature: Floats
+    ratio: Floats
     noise_rad: float
     duration_s: float
 
@@ -207,7 +209,7 @@ def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, flo
 def measure_course(log: RobotLog) -> Course:
     """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
     gnss, wheels = log.gnss, log.wheels
-    none = Course(np.empty(0), np.empty(0), np.empty(0), 0.0, 1.0)
+    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0.0, 0.0)
     if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:
         return none
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
@@ -238,6 +240,7 @@ def measure_course(log: RobotLog) -> Course:
         np.angle(told * np.conj(seen))[moved],
         np.angle(mirror * np.conj(seen))[moved],
         (turned / way)[moved],
+        (np.abs(seen) / np.where(moved, np.hypot(real, imaginary), 1.0))[moved],
         noise * math.sqrt(2.0) / length,
         float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,
     )

@@ -94,7 +94,6 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
         run.log,
         run.config,
         heading_mirrored=run.heading_check.applied_mirror,
-        heading_mirrored=run.heading_check.applied_mirror,
         heading_offset_rad=run.heading_check.applied_offset_rad,
         heading_std_at_least_rad=run.heading_check.applied_std_rad,
         heading_correlation_at_least_s=run.heading_check.applied_correlation_s,

@@ -13,7 +13,7 @@ from icrtool.analysis.filter_setup import FilterSetup, set_up_filter
 from icrtool.analysis.paths import Path
 from icrtool.analysis.simulate import Drive, Icrs, Readings, Sensors, Truth, move, sense
 from icrtool.config import Config
-from icrtool.core.study import Batch, BatchOutput, run_batch
+from icrtool.core.study import TOOL, Batch, BatchOutput, run_batch
 from icrtool.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
 
 Progress = Callable[[float], None]
@@ -31,7 +31,7 @@ class Scenario:
     config : its filter section is used, and its robot for the start of preset ``field``
     vary_path : every run of a ``curved`` path begins elsewhere in its rhythms
     inflate : tell the filter of the drive's ICR changes (Section 5.2)
-    guarded : with the sign guard of Eqs. 32-34
+    guard : which kernel, see `icrtool.core.study`
     """
 
     plan: Drive
@@ -39,7 +39,7 @@ class Scenario:
     config: Config
     vary_path: bool = True
     inflate: bool = False
-    guarded: bool = True
+    guard: int = TOOL
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float,
     data = setup.data
     stops = np.unique(np.append(np.searchsorted(data.wheel_t, stops_s, side="right") - 1, len(data.wheel_t) - 1))
     batch = stack(readings, setup, stops[data.wheel_t[stops] >= setup.t0])
-    out = run_batch(batch, setup.parameters, guarded=scenario.guarded)
+    out = run_batch(batch, setup.parameters, scenario.guard)
     times = readings[0].wheel_t[len(data.wheel_t) - out.x.shape[1] :]
     at_stops = readings[0].wheel_t[batch.stops]
     return Chunk(

@@ -30,6 +30,14 @@ HUBER_SIGMAS = 2.0
 """Where the loss turns from square to straight, in robust standard deviations of the residuals."""
 
 REWEIGHTINGS = 3
+"""The loss takes its scale from the residuals this often, at most."""
+
+SETTLED = 1e-4
+"""In standard deviations of the prior: a smaller change of a term is none."""
+
+COARSE_STEP_S = 0.1
+"""Wheel samples are joined to steps of this length to get near the solution."""
+
 STRETCH_M = 20.0
 """Way that errs alike, for the covariance: twice the longest window."""
 
@@ -209,33 +217,22 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
     ICRs as far as they stray on real robots. A miss grows about as the root of the way, hence the weights. Windows
     overlap: a stretch of way counts once in the covariance (sandwich, White 1982), and the prior as much as one.
     """
-    from scipy.optimize import least_squares
-
     chosen = [TERMS.index(term) for term in model.terms]
-    basis = _BASIS[chosen]
+    basis, base = _BASIS[chosen], np.array([*NEUTRAL, 0.0])
     mean, std = _prior(windows.width_m, model)
-    base = np.array([*NEUTRAL, 0.0])
-    weight = 1.0 / np.sqrt(windows.length_m)
-    spread = max(len(windows.start) * EVERY_M / max(float(np.ptp(windows.start_m)), EVERY_M), 1.0)
-    overlap = spread * float(windows.length_m.mean()) / EVERY_M
-    problem = _Problem(windows, basis, base, weight)
-    terms, scale = mean.copy(), 1.0
-    for _ in range(REWEIGHTINGS):
-        misses, _ = problem(terms)
-        scale = max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
-        held = scale * np.sqrt(overlap) / std
-
-        def residuals(q: Floats, scale: float = scale, held: Floats = held) -> Floats:
-            return np.concatenate([problem(q)[0], (q - mean) * held]) / scale
-
-        def jacobian(q: Floats, scale: float = scale, held: Floats = held) -> Floats:
-            return np.concatenate([problem(q)[1], np.diag(held)]) / scale
-
-        terms = least_squares(
-            residuals, terms, jac=jacobian, loss="soft_l1", f_scale=HUBER_SIGMAS, x_scale=std, xtol=1e-6, ftol=1e-6
-        ).x
+    way_m = max(float(np.ptp(windows.start_m)), EVERY_M)
+    alike = max(float(windows.length_m.sum()) / way_m, 1.0)
+    held = np.sqrt(alike) / std
+    terms = mean
+    # far from the solution a tenth of the samples tells the way there
+    for problem in (_Problem(_thinned(windows), basis, base), _Problem(windows, basis, base)):
+        for _ in range(REWEIGHTINGS):
+            before, terms = terms, _step(problem, terms, mean, held, std)
+            if np.all(np.abs(terms - before) < SETTLED * std):
+                break
     misses, slopes = problem(terms)
-    covariance = _sandwich(misses / scale, slopes / scale, np.sqrt(overlap) / std, np.tile(windows.start_m, 2))
+    scale = _scale(misses)
+    covariance = _sandwich(misses / scale, slopes / scale, held, np.tile(windows.start_m, 2))
     return WindowFit(
         model=model,
         terms=terms,
@@ -247,11 +244,50 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
     )
 
 
+def _step(problem: _Problem, terms: Floats, mean: Floats, held: Floats, std: Floats) -> Floats:
+    """Return the terms that minimise the loss whose scale is that of the residuals at `terms`."""
+    from scipy.optimize import least_squares
+
+    scale = _scale(problem(terms)[0])
+    found: Floats = least_squares(
+        lambda q: np.concatenate([problem(q)[0] / scale, (q - mean) * held]),
+        terms,
+        jac=lambda q: np.concatenate([problem(q)[1] / scale, np.diag(held)]),
+        loss="soft_l1",
+        f_scale=HUBER_SIGMAS,
+        x_scale=std,
+        xtol=SETTLED,
+        ftol=1e-5,
+    ).x
+    return found
+
+
+def _scale(misses: Floats) -> float:
+    """Return the robust standard deviation of misses about zero."""
+    return max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
+
+
+def _thinned(windows: Windows) -> Windows:
+    """Return the windows with wheel samples joined in groups, mean speeds over their time."""
+    usual = float(np.median(windows.dt[windows.dt > 0.0])) if (windows.dt > 0.0).any() else COARSE_STEP_S
+    first = np.arange(0, len(windows.t), max(int(COARSE_STEP_S / usual), 1))
+    dt = np.add.reduceat(windows.dt, first)
+    left, right = (np.add.reduceat(windows.dt * v, first) for v in (windows.v_left, windows.v_right))
+    moving = dt > 0.0
+    return windows._replace(
+        t=windows.t[first],
+        dt=dt,
+        v_left=np.divide(left, dt, out=np.zeros(len(dt)), where=moving),
+        v_right=np.divide(right, dt, out=np.zeros(len(dt)), where=moving),
+    )
+
+
 class _Problem:
     """Weighted misses of all windows (2 w,) [m per root metre] and their derivatives (2 w, k), once per place."""
 
-    def __init__(self, windows: Windows, basis: Floats, base: Floats, weight: Floats) -> None:
-        self._windows, self._basis, self._base, self._weight = windows, basis, base, weight
+    def __init__(self, windows: Windows, basis: Floats, base: Floats) -> None:
+        self._windows, self._basis, self._base = windows, basis, base
+        self._weight = 1.0 / np.sqrt(windows.length_m)
         self._last: tuple[bytes, tuple[Floats, Floats]] | None = None
 
     def __call__(self, terms: Floats) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Many filter runs in one compiled call, and what only a study needs: no sign guard, and a truth that obeys the model."""
+"""Many filter runs in one compiled call, and what only a study needs: other guards, and a truth that obeys the model."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from icrtool.core.ekf import (
     FilterOutput,
     FilterParameters,
     Measurements,
-    advance,
     filter_loop,
     take_fix,
     take_heading,
 )
 from icrtool.core.ekf_step import DIAGONAL
-from icrtool.core.kinematics import body_velocity
+from icrtool.core.kinematics import MIN_ICR_SEPARATION_M, body_velocity
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+TOOL, UNGUARDED, GUARDED, PRINTED = 0, 1, 2, 3
+"""The filter as it is, and kernels for Section 5.1: Eqs. 8-10; Eqs. 32-34 with their true derivatives, or the printed."""
 
 
 class Batch(NamedTuple):
@@ -71,12 +73,12 @@ class BatchOutput(NamedTuple):
     heading_nis: Floats
 
 
-def run_batch(batch: Batch, parameters: FilterParameters, *, guarded: bool = True) -> BatchOutput:
+def run_batch(batch: Batch, parameters: FilterParameters, guard: int = TOOL) -> BatchOutput:
     """Run the filter over every run of a batch, in one compiled call that frees the GIL.
 
     Parameters
     ----------
-    guarded : with the sign guard of Eqs. 32-34; without, Eqs. 8-10 as they stand, ungated (Fig. 6)
+    guard : TOOL is `icrtool.core.ekf`; the others are kernels of this module, see `free_predict`
     """
     runs, first = len(batch.x0), int(np.searchsorted(batch.wheel_t, batch.t0))
     rows = len(batch.wheel_t) - first
@@ -87,12 +89,12 @@ def run_batch(batch: Batch, parameters: FilterParameters, *, guarded: bool = Tru
         gnss_nis=np.full((runs, len(batch.gnss_t)), np.nan),
         heading_nis=np.full((runs, len(batch.heading_t)), np.nan),
     )
-    _filter_runs(batch, parameters, guarded, first, out)
+    _filter_runs(batch, parameters, guard, first, out)
     return out
 
 
 @njit
-def _filter_runs(batch: Batch, parameters: FilterParameters, guarded: bool, first: int, out: BatchOutput) -> None:  # noqa: FBT001 - compiled
+def _filter_runs(batch: Batch, parameters: FilterParameters, guard: int, first: int, out: BatchOutput) -> None:
     n_gnss, n_heading = len(batch.gnss_t), len(batch.heading_t)
     gnss_code, heading_code = np.zeros(n_gnss, np.uint8), np.zeros(n_heading, np.uint8)
     residual, innovation, distance = np.zeros((n_gnss, 2)), np.zeros(n_heading), np.zeros(len(batch.wheel_t))
@@ -115,26 +117,61 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, guarded: bool, firs
                 out.x[run, begin - first : end - first], out.variance[run, begin - first : end - first], distance,
                 out.gnss_nis[run], gnss_code, residual, out.heading_nis[run], heading_code, innovation, P,
             )  # fmt: skip
-            if guarded:
+            if guard == TOOL:
                 filter_loop(data, t, begin, start, x, P, parameters, piece)
             else:
-                unguarded_loop(data, t, begin, start, x, P, parameters, piece)
+                free_loop(data, t, begin, start, x, P, parameters, guard, piece)
             out.P[run, s] = P
             begin, t = end, batch.wheel_t[end - 1]
 
 
 @njit
-def unguarded_loop(
-    data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
-    parameters: FilterParameters, out: FilterOutput,
-) -> None:  # fmt: skip
-    """Do what `filter_loop` does without the sign guard: Eqs. 8-10 divide by y_r - y_l, whatever its sign.
+def free_predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, guard: int) -> None:
+    """Propagate state and covariance over dt [s] as `icrtool.core.ekf_step.predict` does, but with another guard.
 
     Notes
     -----
-    Eqs. 8-10 are linear in the track speeds and odd in W = y_r - y_l. So where the ICRs are inverted they are Eqs.
-    32-34 with both speeds negated, and so are their derivatives (Eqs. 17, 27-29). No gaps, no terrain changes, no gates.
+    Eqs. 14, 16, 17, in matrices. UNGUARDED divides by y_r - y_l as it is, PRINTED by its absolute value but takes the
+    derivatives of y_r - y_l (Eq. 28 with the difference of Eqs. 32-34 put in), GUARDED those of the absolute value.
     """
+    N, E, psi, y_r, y_l, x_v = x[0], x[1], x[2], x[3], x[4], x[5]
+    W, sign = y_r - y_l, 1.0
+    if guard == GUARDED and W < 0.0:
+        sign = -1.0
+    if guard != UNGUARDED:
+        W = abs(W)
+    if abs(W) < MIN_ICR_SEPARATION_M:
+        W = -MIN_ICR_SEPARATION_M if W < 0.0 else MIN_ICR_SEPARATION_M
+    omega = (v_left - v_right) / W
+    v_x, v_y = (v_left * y_r - v_right * y_l) / W, -omega * x_v
+    c, s = math.cos(psi), math.sin(psi)
+    F = np.eye(6)
+    F[0, 2], F[1, 2] = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
+    F[2, 3], F[2, 4] = -dt * sign * omega / W, dt * sign * omega / W
+    forward = ((v_left - sign * v_x) / W, (sign * v_x - v_right) / W, 0.0)
+    rightward = (sign * omega * x_v / W, -sign * omega * x_v / W, -omega)
+    for i in range(3):
+        F[0, 3 + i] = dt * (forward[i] * c - rightward[i] * s)
+        F[1, 3 + i] = dt * (forward[i] * s + rightward[i] * c)
+    full, place = np.empty((6, 6)), 0
+    for i in range(6):
+        for k in range(i, 6):
+            full[i, k] = full[k, i] = P[place]
+            place += 1
+    full, place = F @ full @ F.T, 0
+    for i in range(6):
+        for k in range(i, 6):
+            P[place] = full[i, k]
+            place += 1
+    x[0], x[1], x[2] = N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega
+
+
+@njit
+def free_loop(
+    data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
+    parameters: FilterParameters, guard: int, out: FilterOutput,
+) -> None:  # fmt: skip
+    """Do what `filter_loop` does with another guard; no gaps, no terrain changes."""
     j, h, _ = start
     gnss_run, heading_run, PH = np.zeros(4), np.zeros(4), np.zeros(6)
     t = t0
@@ -148,8 +185,10 @@ def unguarded_loop(
             if h < len(data.heading_t):
                 t_next = min(t_next, data.heading_t[h])
             if t_next > t:
-                sign = 1.0 if x[3] >= x[4] else -1.0
-                advance(t_next - t, False, sign * data.v_left[held], sign * data.v_right[held], x, P, parameters)  # noqa: FBT003 - compiled
+                free_predict(x, P, data.v_left[held], data.v_right[held], t_next - t, guard)
+                scale = REFERENCE_STEP_S * (t_next - t) if parameters.rate_invariant else (t_next - t) ** 2
+                for i in range(6):
+                    P[DIAGONAL[i]] += scale * parameters.process_variance[i]
                 t = t_next
             while j < len(data.gnss_t) and data.gnss_t[j] <= t:
                 out.gnss_code[j], out.gnss_nis[j] = take_fix(
@@ -171,7 +210,7 @@ def unguarded_loop(
 
 @njit
 def model_states(
-    x0: Floats, wheel_t: Floats, v_left: Floats, v_right: Floats, std: Floats, rate_invariant: bool, noise: Floats  # noqa: FBT001 - compiled
+    x0: Floats, wheel_t: Floats, v_left: Floats, v_right: Floats, std: Floats, rate_invariant: bool, noise: Floats
 ) -> Floats:
     """Return states (n, 6) that obey the filter's own model: Eq. 14 with its process noise.
 

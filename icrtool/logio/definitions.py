@@ -73,10 +73,10 @@ def parse_definition(channel: Channel) -> Definitions:
         types: dict[str, Any] = {}
         for part in parts:
             types.update(get_types_from_idl(part.split("\n", 1)[1]))
-        return types
     except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
         first = str(err).partition("\n")[0]
         raise DefinitionError(channel.message_type, "the definition in the log cannot be parsed", first) from err
+    return types
 
 
 @cache

@@ -38,7 +38,10 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
         if role in chosen:
             stream = chosen[role]
             lines.append(f"  -> {stream.topic}: {stream.why}")
-            lines.append(f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, jitter {stream.jitter_ms:.3g} ms")
+            lines.append(
+                f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, "
+                f"jitter {stream.jitter_ms:.3g} ms"
+            )
     if measured is not None:
         spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
         overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
@@ -75,7 +78,7 @@ def _topics(survey: Survey, *, everything: bool) -> list[str]:
 
 def _gaps(stamps: Ints) -> str:
     """Say how many intervals are far longer than usual, and the longest."""
-    if len(stamps) < 3:  # noqa: PLR2004 - fewer have no usual interval
+    if len(stamps) < 3:
         return ""
     interval = np.diff(stamps) / 1e9
     long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
@@ -91,6 +94,7 @@ def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource],
     for source in sources:
         mark = "*" if source.topic == chosen else "-"
         clock = source.stamps.note or f"header stamps, {source.stamps.delay_ns / 1e6:.1f} ms before log time"
-        verdict = f"cannot be used: {source.problem}" if source.problem else source.why
+        refused = "used all the same, as configured" if source.topic == chosen else "cannot be used"
+        verdict = f"{refused}: {source.problem}" if source.problem else source.why
         lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
     return lines

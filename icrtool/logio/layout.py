@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ SKIP, TAKE, SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE, BEGIN_LOOP, 
 
 Definitions = Mapping[str, tuple[Any, Any]]
 """``package/msg/Name`` to (constants, fields), as rosbags parses it."""
+
+FieldDetail: TypeAlias = Any
+"""Name and length of a field's type; rosbags nests them by the kind of type."""
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """Kinds of field types, the numbers of rosbags' Nodetype."""
@@ -117,7 +120,7 @@ class _Compiler:
         for field, (node, detail) in self._definitions[name][1]:
             self.field(f"{prefix}{field}", int(node), detail, loop)
 
-    def field(self, path: str, node: int, detail: Any, loop: tuple[int, int, int]) -> None:
+    def field(self, path: str, node: int, detail: FieldDetail, loop: tuple[int, int, int]) -> None:
         """Write one field."""
         if node == NAME:
             self.message(detail, f"{path}.", loop)
@@ -180,7 +183,9 @@ class _Compiler:
         else:
             self._emit(SKIP_SEQUENCE, size)
 
-    def _loop(self, path: str, element: int, inner: Any, fixed: int | None, outer: tuple[int, int, int]) -> None:
+    def _loop(
+        self, path: str, element: int, inner: FieldDetail, fixed: int | None, outer: tuple[int, int, int]
+    ) -> None:
         """Write a loop over the elements of an array or sequence of strings or messages."""
         takes = not outer[1] and any(name == path or name.startswith(f"{path}.") for name in self._wanted)
         repeat = min(fixed, self._capacity) if fixed is not None else self._capacity
@@ -200,7 +205,7 @@ class _Compiler:
             self.columns = first + stride * repeat
             self._last_take = len(self.rows)
 
-    def _body_width(self, element: int, inner: Any, path: str) -> int:
+    def _body_width(self, element: int, inner: FieldDetail, path: str) -> int:
         """Return the columns one element takes, by a trial run."""
         trial = _Compiler(self._definitions, tuple(self._wanted), cdr=self._cdr, capacity=self._capacity)
         if element == BASE:

@@ -60,7 +60,7 @@ def hash_text(data: Bytes, at: int, length: int) -> np.uint64:
 
 
 @njit
-def walk(
+def walk(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
     data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools
 ) -> None:
     """Fill a row of `table` (n, columns) per message; `readable` (n,) says which messages had the program's shape.
@@ -86,7 +86,7 @@ def walk(
         while step < len(program):
             operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
             capacity = program[step, 4]
-            if operation == SKIP or operation == TAKE:
+            if operation in (SKIP, TAKE):
                 if cdr:
                     at += (base - at) & (size - 1)
                 if at + size * count > stop:

@@ -21,8 +21,6 @@ FEWEST_WINDOWS = 8
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
-LARGEST_SCALE_ERROR = 0.05
-
 
 @dataclass(frozen=True, slots=True)
 class Scale:
@@ -54,37 +52,39 @@ def wheel_samples(
     if backwards:
         warnings.append(f"{log_name}: {motion.topic}: {backwards} wheel stamps go back; sorted")
     if dropped > len(stamps) // 100:
-        warnings.append(f"{log_name}: {motion.topic}: {dropped} of {len(stamps)} wheel samples share a stamp with another; the last was kept")
+        warnings.append(
+            f"{log_name}: {motion.topic}: {dropped} of {len(stamps)} wheel samples share a stamp with another; "
+            "the last was kept"
+        )
     left, right, unit, is_position = _pick(motion, config)
     left, right = left[rows], right[rows]
     told = np.isfinite(left) & np.isfinite(right)
     stamps, left, right = stamps[rows][told], left[told], right[told]
-    if len(stamps) < 2:  # noqa: PLR2004 - an interval needs two ends
+    if len(stamps) < 2:
         raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     if is_position:
         interval = np.diff(stamps) / 1e9
         left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
         left[-1], right[-1] = left[-2], right[-2]
     factor, how = _metres_per_unit(motion, unit, stamps, left, right, gnss, config)
-    left = left * factor * config.wheels.left_scale
-    right = right * factor * config.wheels.right_scale
+    left = left * factor * _side_scale(config.wheels.left_scale)
+    right = right * factor * _side_scale(config.wheels.right_scale)
     samples = WheelSamples(stamps, left, right)
-    scale = reference_scale(samples.stamp_ns, left, right, gnss)
-    if scale is not None and abs(scale.value - 1.0) > max(LARGEST_SCALE_ERROR, 4.0 * scale.std):
-        warnings.append(
-            f"{log_name}: the wheels tell {100 / scale.value:.0f} % of the way the position reference tells "
-            f"({scale.windows} straight windows): check wheel radius and units"
-        )
     quantity = "position" if is_position else "speed"
     return samples, f"{quantity}{how}", warnings
 
 
+def _side_scale(scale: float | str) -> float:
+    """Return a side's configured scale; ``auto`` is 1 here, and judged where position and heading are known."""
+    return scale if isinstance(scale, float | int) else 1.0
+
+
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
     """Compare the reference's way with the wheels' over straight windows; None where too few are straight."""
-    if len(gnss.stamp_ns) < 2:  # noqa: PLR2004 - an interval
+    if len(gnss.stamp_ns) < 2:
         return None
     edges = np.arange(max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9))
-    if len(edges) < 2:  # noqa: PLR2004 - an interval
+    if len(edges) < 2:
         return None
     places = np.searchsorted(gnss.stamp_ns, edges)
     places = places[places < len(gnss.stamp_ns)]
@@ -111,36 +111,38 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
     if motion.twist is not None:
         width = config.robot.track_width_m
         if width is None:
-            raise ConfigError("robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME")
+            raise ConfigError(
+                "robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME"
+            )
         speed, turn = motion.twist.T
         return speed - turn * width / 2, speed + turn * width / 2, "m", False
     wanted = config.wheels.quantity
-    position, speed_left, speed_right = motion.position_left, motion.speed_left, motion.speed_right
-    has_position = position is not None and motion.position_right is not None
-    has_speed = speed_left is not None and speed_right is not None
-    if wanted in ("position", "counts") and not has_position:
+    positions = _both(motion.position_left, motion.position_right)
+    speeds = _both(motion.speed_left, motion.speed_right)
+    by_position = positions is not None and wanted != "velocity" and (wanted != "auto" or _alive(positions, speeds))
+    if wanted in ("position", "counts") and positions is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} tells no {wanted}", "leave it on auto")
-    if wanted == "velocity" and not has_speed:
-        raise ConfigError("wheels.quantity", f"{motion.topic} tells no velocity", "leave it on auto")
-    use_position = has_position and wanted != "velocity" and (wanted != "auto" or _alive(motion))
-    if use_position or not has_speed:
-        assert position is not None and motion.position_right is not None
-        unit: Unit = "counts" if wanted == "counts" else motion.position_unit
-        return position, motion.position_right, unit, True
-    assert speed_left is not None and speed_right is not None
-    return speed_left, speed_right, motion.speed_unit, False
+    if speeds is not None and not by_position:
+        return *speeds, motion.speed_unit, False
+    if positions is None or wanted == "velocity":
+        raise ConfigError("wheels.quantity", f"{motion.topic} tells no velocity of both sides", "leave it on auto")
+    unit: Unit = "counts" if wanted == "counts" else motion.position_unit
+    return *positions, unit, True
 
 
-def _alive(motion: WheelMotion) -> bool:
+def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | None:
+    return (left, right) if left is not None and right is not None else None
+
+
+def _alive(positions: tuple[Floats, Floats], speeds: tuple[Floats, Floats] | None) -> bool:
     """Say whether the positions move where the speeds do: some drivers leave the position at zero."""
-    assert motion.position_left is not None and motion.position_right is not None
-    finite = np.isfinite(motion.position_left) & np.isfinite(motion.position_right)
+    finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
     if np.count_nonzero(finite) < len(finite) / 2:
         return False
-    if motion.speed_left is None or motion.speed_right is None:
+    if speeds is None:
         return True
-    still = [float(np.ptp(side[finite])) == 0.0 for side in (motion.position_left, motion.position_right)]
-    moves = [float(np.nanmax(np.abs(side))) > 0.0 for side in (motion.speed_left, motion.speed_right)]
+    still = [float(np.ptp(side[finite])) == 0.0 for side in positions]
+    moves = [float(np.nanmax(np.abs(side))) > 0.0 for side in speeds]
     return not any(s and m for s, m in zip(still, moves, strict=True))
 
 
@@ -164,6 +166,8 @@ def _metres_per_unit(
     if scale is None:
         needed = "robot.encoder_counts_per_rev" if unit == "counts" and radius is not None else "robot.wheel_radius_m"
         raise ConfigError(
-            needed, f"needed to read {motion.topic} in {unit}", "give it, or --robot NAME; the log has no straight driving to find it from"
+            needed,
+            f"needed to read {motion.topic} in {unit}",
+            "give it, or --robot NAME; the log has no straight driving to find it from",
         )
     return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"

@@ -19,6 +19,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from icrtool.cli import main
 from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
@@ -352,6 +353,11 @@ RUNS: dict[str, tuple[Callable[[Path], list[str]], str]] = {
 }
 
 
+AS_A_USER = ("an empty file", "a pipe", "topics with line breaks", "no GNSS", "an unknown key", "a file in the way",
+             "a truncated MCAP", "a name that is no UTF-8")  # fmt: skip
+"""Run as a process of their own, which takes a second each; the others call the command where they are."""
+
+
 @dataclass(frozen=True)
 class Done:
     status: int
@@ -366,28 +372,23 @@ def listing(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.lstat().st_size for path in sorted(folder.rglob("*"))}
 
 
+def words(arguments: list[str]) -> list[str]:
+    """The arguments of the command: without plots, and of a robot that is known unless the case is about that."""
+    named = {"--robot", "--config"} & set(arguments) or "robot." in " ".join(arguments)
+    return ["fit", *arguments, "--plots", "none", *(() if named else ROBOT)]
+
+
 def start(folder: Path, arguments: list[str]) -> subprocess.Popen[str]:
-    """Start ``icrtool fit`` in a folder of its own, which is also that of its temporary files."""
-    command = [sys.executable, "-m", "icrtool", "fit", *arguments]
-    if not {"--robot", "--config"} & set(arguments):
-        command += ROBOT if "robot.track_width_m" not in " ".join(arguments) else ()
+    """Start the command in a folder, which is also that of its temporary files."""
+    command = [sys.executable, "-m", "icrtool", *words(arguments)]
     environment = {**os.environ, "TMPDIR": str(folder), "PYTHONWARNINGS": "error::RuntimeWarning"}
-    pipe = subprocess.PIPE
-    return subprocess.Popen(
-        command,
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=pipe,
-        stderr=pipe,
-        text=True,
-        errors="replace",
-    )
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, cwd=folder, env=environment, text=True, errors="replace", **streams)
 
 
-def run(folder: Path, make: Callable[[Path], list[str]]) -> Done:
+def run_as_a_user(folder: Path, make: Callable[[Path], list[str]]) -> Done:
     folder.mkdir()
-    arguments = [*make(folder), "--plots", "none"]
+    arguments = make(folder)
     before = listing(folder)
     with start(folder, arguments) as process:
         out, err = process.communicate(timeout=120)
@@ -395,21 +396,41 @@ def run(folder: Path, make: Callable[[Path], list[str]]) -> Done:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """Run all cases side by side; a test waits for its own."""
-    root = tmp_path_factory.mktemp("bad-input")
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        cases = (REFUSED | RUNS).items()
+def user(tmp_path_factory):
+    """Run the cases of a user side by side; a test waits for its own."""
+    root = tmp_path_factory.mktemp("user")
+    with ThreadPoolExecutor(2) as pool:
         pending: dict[str, Future[Done]] = {
-            name: pool.submit(run, root / str(row), make) for row, (name, (make, _)) in enumerate(cases)
+            case: pool.submit(run_as_a_user, root / str(row), (REFUSED | RUNS)[case][0])
+            for row, case in enumerate(AS_A_USER)
         }
-        yield lambda name: pending[name].result()
+        yield lambda case: pending[case].result()
         pool.shutdown(cancel_futures=True)
 
 
+@pytest.fixture
+def run(user, tmp_path, monkeypatch, capsys):
+    """Run a case, in this process or as a user."""
+
+    def run_here(case: str) -> Done:
+        if case in AS_A_USER:
+            return user(case)
+        arguments = (REFUSED | RUNS)[case][0](tmp_path)
+        before = listing(tmp_path)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+        monkeypatch.setattr("sys.argv", ["icrtool", *words(arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        out, err = capsys.readouterr()
+        return Done(int(left.value.code or 0), out, err.splitlines(), before, listing(tmp_path))
+
+    return run_here
+
+
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_used_is_refused_in_one_line_and_leaves_nothing(done, case):
-    found = done(case)
+def test_what_cannot_be_used_is_refused_in_one_line_and_leaves_nothing(run, case):
+    found = run(case)
     errors = [line for line in found.err if not line.startswith("Warning: ")]
     assert found.status == 1, found
     assert len(errors) == 1, found.err
@@ -420,8 +441,8 @@ def test_what_cannot_be_used_is_refused_in_one_line_and_leaves_nothing(done, cas
 
 
 @pytest.mark.parametrize("case", RUNS)
-def test_what_survives_is_used_and_what_was_lost_is_a_warning(done, case):
-    found = done(case)
+def test_what_survives_is_used_and_what_was_lost_is_a_warning(run, case):
+    found = run(case)
     assert found.status == 0, found.err
     assert all(line.startswith("Warning: ") for line in found.err)
     assert any(RUNS[case][1] in line for line in found.err) or not RUNS[case][1]
@@ -433,7 +454,7 @@ def test_what_survives_is_used_and_what_was_lost_is_a_warning(done, case):
 @pytest.mark.parametrize("options", [{}, {"container": "db3", "compression": "zstd-file"}], ids=["mcap", "db3.zstd"])
 def test_an_interrupted_run_leaves_nothing_behind(tmp_path, options):
     finished = 0
-    for turn, seconds in enumerate((0.6, 1.0, 1.4, 1.8)):
+    for turn, seconds in enumerate((0.7, 1.2, 1.7)):
         folder = tmp_path / str(turn)
         folder.mkdir()
         path = log(folder, drive(120), **options)
@@ -448,4 +469,4 @@ def test_an_interrupted_run_leaves_nothing_behind(tmp_path, options):
             assert {Path(name).parts[0] for name in after} == {"icrtool-runs"}
         else:
             assert after == set()
-    assert finished < 4
+    assert finished < 3

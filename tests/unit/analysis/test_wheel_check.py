@@ -1,0 +1,87 @@
+"""The wheel doctor: what wheel data get wrong is found, named, and put right where it is certain."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.analysis.fit import fit
+from icrtool.analysis.wheel_check import check_wheels
+from icrtool.config import load_config
+from icrtool.tables import RobotLog
+
+sys.path.insert(0, str(Path(__file__).parent))
+from drives import ICRS, make_log
+
+CONFIG = load_config(sets=["robot.track_width_m=0.8"])
+ICR_TOLERANCE_M = 0.05
+
+
+def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
+    return replace(log, wheels=replace(log.wheels, v_left_mps=left, v_right_mps=right))
+
+
+def test_good_wheels_are_left_as_they_are() -> None:
+    log = make_log(seconds=120.0)
+    check = check_wheels(log, CONFIG)
+    assert check.warnings == ()
+    assert check.log is log
+    assert check.scale == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda left, right: (right, left), "swapped"),
+        (lambda left, right: (-left, right), "left wheels count backwards"),
+        (lambda left, right: (left, -right), "right wheels count backwards"),
+        (lambda left, right: (-left, -right), "both wheels count backwards"),
+        (lambda left, right: (1.07 * left, 1.07 * right), "goes 93"),
+        (lambda left, right: (0.95 * left, 0.95 * right), "goes 105"),
+    ],
+)
+def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
+    log = make_log(seconds=120.0)
+    spoilt = with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps))
+    run = fit(spoilt, CONFIG)
+    assert any(words in warning for warning in run.warnings)
+    final = run.summary["icr"]["final"]
+    assert (final["y_icr_right_m"], final["y_icr_left_m"]) == pytest.approx(ICRS[:2], abs=ICR_TOLERANCE_M)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda left, right: (0 * left, right), "left wheels hardly ever move"),
+        (lambda left, right: (left, left), "copy"),
+        (lambda left, right: (2 * left, 2 * right), "twice the way"),
+        (
+            lambda left, right: (np.repeat(left[::10], 10)[: len(left)], np.repeat(right[::10], 10)[: len(right)]),
+            "held",
+        ),
+    ],
+)
+def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
+    log = make_log(seconds=120.0)
+    check = check_wheels(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
+    assert any(words in warning for warning in check.warnings)
+    assert check.applied_scale == 1.0
+
+
+def test_preset_paper_corrects_nothing() -> None:
+    log = make_log(seconds=120.0)
+    spoilt = with_wheels(log, log.wheels.v_right_mps, log.wheels.v_left_mps)
+    check = check_wheels(spoilt, load_config(sets=["filter.preset=paper"]))
+    assert check.log is spoilt
+
+
+def test_a_configured_scale_is_not_touched() -> None:
+    log = make_log(seconds=120.0)
+    spoilt = with_wheels(log, 1.07 * log.wheels.v_left_mps, 1.07 * log.wheels.v_right_mps)
+    check = check_wheels(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"]))
+    assert check.applied_scale == 1.0
+    assert any("check wheel radius" in warning for warning in check.warnings)
