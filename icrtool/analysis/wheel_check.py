@@ -65,6 +65,7 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     """
     corrects = config.filter.preset == "field"
     notes = [f"{log.name}: {note}" for note in _dead_or_copied(log)]
+    sound = not notes
     found = _reversed_or_swapped(log)
     if found is not None:
         wheels, note = found
@@ -78,7 +79,7 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     if significant and len(course.ratio) >= FEWEST_SCALE_WINDOWS:
         text = f"the robot goes {100 * scale:.1f} ± {100 * sigma:.1f} % of the way the wheels tell"
         given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-        if corrects and not given and error <= LARGEST_SCALE_CORRECTION and scatter <= LARGEST_SCALE_SCATTER:
+        if corrects and sound and not given and error <= LARGEST_SCALE_CORRECTION and scatter <= LARGEST_SCALE_SCATTER:
             applied = scale
             wheels = log.wheels
             log = replace(
