@@ -29,10 +29,11 @@ $(READY): pyproject.toml constraints.txt
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
-demo: $(READY)  ## learn the ICRs of the sample robot and say where the plots are
+demo: $(READY)  ## learn the ICRs of the sample robot, report its GPS dropouts, say where the plots are
 	$(BIN)/icrtool fit $(DEMO_LOG) $(DEMO_OPTIONS)
 	@echo
-	@echo "Plots: $(DEMO_RUN)/plots/"
+	$(BIN)/icrtool dropout-report $(DEMO_RUN)
+	@echo "Plots: $(DEMO_RUN)/plots/ and $(DEMO_RUN)/dropout/plots/"
 
 format: $(READY)  ## format the code and sort the imports
 	$(BIN)/ruff format .

@@ -40,7 +40,9 @@ cd "$scratch"
 "$bin/python" -I -c 'import icrtool, sys; sys.exit(not icrtool.__file__.startswith(sys.prefix))'
 "$bin/icrtool" --help >/dev/null
 "$bin/icrtool" fit "$demo_log" ${demo_options[@]+"${demo_options[@]}"} -o run
-for result in run/run.json run/states.csv run/plots/trajectory.png run/plots/icr_estimates.png; do
+"$bin/icrtool" dropout-report run
+for result in run/run.json run/states.csv run/plots/trajectory.png run/plots/icr_estimates.png \
+    run/dropout/summary.csv run/dropout/plots/summary.png; do
     [[ -s $result ]] || { echo "check-wheel: $result is missing" >&2; exit 1; }
 done
 echo "check-wheel: the wheel works"
