@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -36,7 +34,7 @@ BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
-LARGEST_TABLES_BYTES = 192 << 20
+LARGEST_TABLE_BYTES = 64 << 20
 """Errors held at a time: horizons are taken in groups below it, whatever the length of the log."""
 
 STANDING_MPS = 0.01
@@ -46,11 +44,11 @@ BULK_IN_P95 = 3.0
 MOST_BULKS = 10.0
 """A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
 
-STARTS_A_CALL = 1 << 16
-"""Starts whose trial ends are held at a time."""
+STARTS_A_CALL = 1 << 15
+"""Starts tried by a thread at a time."""
 
-TASKS_AT_ONCE = 2
-"""Groups of horizons judged beside each other; each holds a table of its own."""
+THREADS = 2
+"""The kernels run beside each other; more threads would need more memory and find little more to do."""
 
 
 class DrivenRun(Protocol):
@@ -212,15 +210,17 @@ def dropout(
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
     models = models if models is not None else models_of(run)
-    tasks = [(model, group) for model in models for group in _groups(len(horizons), len(run.table))]
-    judge = partial(_judge, drive=drive, horizons=horizons, seed=seed, sink=sink)
     counts: list[TrialCounts] = []
-    parts: dict[str, list[ModelResult]] = {}
-    with _side_by_side(wanted=sink is None) as spread:
-        for result, count in spread(judge, tasks):
-            parts.setdefault(result.name, []).append(result)
-            if result.name == models[0].name:
-                counts.append(count)
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
+    with ThreadPoolExecutor(THREADS) as pool:
+        for group in _groups(len(horizons), len(run.table)):
+            for model in models:
+                errors, count = _errors(drive, model.icrs, horizons[group], pool)
+                if sink is not None:
+                    sink(model.name, horizons[group], errors)
+                parts[model.name].append(_judge(model, errors, drive, horizons[group], seed, pool))
+                if model is models[0]:
+                    counts.append(count)
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
@@ -298,49 +298,40 @@ def drive_of(run: DrivenRun) -> Drive:
     )
 
 
-@contextmanager
-def _side_by_side(*, wanted: bool) -> Iterator[Callable[..., Iterable[tuple[ModelResult, TrialCounts]]]]:
-    """Give a `map` over threads; or the plain one, which keeps the order for a sink."""
-    if not wanted:
-        yield map
-        return
-    with ThreadPoolExecutor(TASKS_AT_ONCE) as pool:
-        yield pool.map
-
-
 def _groups(horizons: int, states: int) -> list[slice]:
-    """Cut the horizons into groups: one a thread, or more where their tables would be too large."""
-    size = max(1, min(-(-horizons // TASKS_AT_ONCE), LARGEST_TABLES_BYTES // (8 * TASKS_AT_ONCE * max(states, 1))))
+    """Cut the horizons into groups whose table of errors is not too large."""
+    size = max(1, LARGEST_TABLE_BYTES // (8 * max(states, 1)))
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _judge(
-    task: tuple[Model, slice], *, drive: Drive, horizons: Floats, seed: int, sink: ErrorSink | None
-) -> tuple[ModelResult, TrialCounts]:
-    """Try one model over a group of horizons: what its errors say, and how many starts were a trial."""
-    model, group = task
-    errors, counts = _errors(drive, model.icrs, horizons[group])
-    if sink is not None:
-        sink(model.name, horizons[group], errors)
-    summary = summarise(errors)
-    intervals = bootstrap_intervals(errors, drive.distance, horizons[group], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
-    histograms = tuple(
-        histogram(errors[:, h], _bin_width(float(summary.p95[h]), float(summary.largest[h])))
-        for h in range(errors.shape[1])
-    )
-    return ModelResult(model.name, model.label, summary, intervals, histograms), counts
-
-
-def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats) -> tuple[Floats, TrialCounts]:
+def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats, pool: Executor) -> tuple[Floats, TrialCounts]:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and counts."""
-    errors = np.empty((len(horizons), len(drive.distance)))
-    counts = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
-    for lo in range(0, len(drive.distance), STARTS_A_CALL):
-        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+    states = len(drive.distance)
+    errors = np.empty((len(horizons), states))
+
+    def fill(lo: int) -> TrialCounts:
+        hi = min(lo + STARTS_A_CALL, states)
         ends = trial_ends(drive, horizons, lo, hi)
         errors[:, lo:hi] = open_loop_errors(drive, icrs, ends, lo).T
-        counts = TrialCounts(*(total + more for total, more in zip(counts, count_trials(ends), strict=True)))
-    return errors.T, counts
+        return count_trials(ends)
+
+    counts = pool.map(fill, range(0, states, STARTS_A_CALL))
+    return errors.T, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+
+
+def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: int, pool: Executor) -> ModelResult:
+    """Say what the errors of one model tell, horizon by horizon."""
+
+    def judge(h: int) -> ModelResult:
+        column = errors[:, h : h + 1]
+        summary = summarise(column)
+        intervals = bootstrap_intervals(
+            column, drive.distance, horizons[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL
+        )
+        bins = histogram(column[:, 0], _bin_width(float(summary.p95[0]), float(summary.largest[0])))
+        return ModelResult(model.name, model.label, summary, intervals, (bins,))
+
+    return _joined(list(pool.map(judge, range(len(horizons)))))
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:
@@ -351,7 +342,7 @@ def _bin_width(p95_m: float, largest_m: float) -> float:
 
 
 def _joined(parts: list[ModelResult]) -> ModelResult:
-    """Join what the groups of horizons gave for one model."""
+    """Join what several horizons, or groups of them, gave for one model."""
     return ModelResult(
         parts[0].name,
         parts[0].label,

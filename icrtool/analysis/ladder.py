@@ -25,6 +25,7 @@ from icrtool.analysis.window_fit import (
     Windows,
     cut_windows,
     fit_windows,
+    thin_windows,
 )
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
@@ -188,7 +189,8 @@ def _fit_side_by_side(windows: Windows, wanted: Mapping[Key, tuple[WindowModel, 
 def clear_of(windows: Windows, edges_m: Floats, block: int) -> Bools:
     """Say which windows share no way with a block; `edges_m` are the inner borders of the blocks [m]."""
     borders = np.concatenate([[-math.inf], edges_m, [math.inf]])
-    return (windows.end_m <= borders[block]) | (windows.start_m >= borders[block + 1])
+    clear: Bools = (windows.end_m <= borders[block]) | (windows.start_m >= borders[block + 1])
+    return clear
 
 
 def _trials(
@@ -217,7 +219,7 @@ def _choose(trials: _Trials, windows: Windows, clear: Sequence[Bools], choice: i
     if blocks < 3:
         return (CONSTANT.name,) * blocks
     pairs = _fit_side_by_side(
-        windows,
+        thin_windows(windows),
         {
             (model.name, pair): (model, clear[pair[0]] & clear[pair[1]])
             for model in (CONSTANT, *EXTENDED)
@@ -327,7 +329,7 @@ def predict_with_heading(trials: _Trials, psi: Floats, icrs: FrozenIcrs, p: Sequ
         mean = (parameters[3] * drive.v_left + parameters[4] * drive.v_right) / 2.0
         way = np.concatenate([[0.0], np.cumsum(dt * mean)[:-1]])
         place = np.concatenate([[0.0], np.cumsum(np.diff(np.interp(t + parameters[7], t, way)) * middle)])
-        for h in range(errors.shape[1]):
+        for h in range(trials.ends.shape[1]):
             start = np.flatnonzero((trials.ends[:, h] >= 0) & (trials.block == block))
             end = trials.ends[start, h]
             arm = offset if len(offset) == 1 else offset[start]
@@ -342,7 +344,7 @@ def _rungs(
     """Judge the models that are not fitted here, put all in order, and repeat them with measured heading."""
     table, width, blocks = run.table, run.track_width_m, len(held_out[CONSTANT.name])
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    final = FrozenIcrs.constant(*(float(c[-1]) for c in momentary))
+    final = FrozenIcrs(momentary.y_icr_right[-1:], momentary.y_icr_left[-1:], momentary.x_icr[-1:])
     neutral = [np.array([*NEUTRAL, 0.0])] * blocks
     plain: list[tuple[str, str, str, FrozenIcrs]] = []
     if width is not None:

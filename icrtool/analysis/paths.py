@@ -19,7 +19,7 @@ up to 1.7 rad and never repeats soon."""
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class PathPlan:
     """What the body shall do.
 
     Attributes
@@ -40,7 +40,7 @@ class Path:
     phase_rad: float = 0.0
 
 
-def plan_body(path: Path, t: Floats, icrs_m: tuple[float, float, float]) -> tuple[Floats, Floats]:
+def plan_body(path: PathPlan, t: Floats, icrs_m: tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Return forward velocity [m/s] and turn rate [rad/s], clockwise positive, at times t (n,) [s]; (n,) each."""
     speed = np.full(len(t), path.speed_mps)
     way = path.speed_mps * t

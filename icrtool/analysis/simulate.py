@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from icrtool.analysis.paths import Path, plan_body, track_speeds
+from icrtool.analysis.paths import PathPlan, plan_body, track_speeds
 from icrtool.core.simulate import drive, follow, poses_at
 from icrtool.errors import ConfigError
 from icrtool.tables import Floats, Ints
@@ -50,7 +50,7 @@ class Drive:
 
     icrs_m: Icrs = PAPER_ICRS_M
     changes: tuple[tuple[float, Icrs], ...] = ()
-    path: Path | TrackSpeeds = Path()
+    path: PathPlan | TrackSpeeds = field(default_factory=PathPlan)
     duration_s: float = 100.0
     start_heading_rad: float = 0.5
     command_rate_hz: float | None = None
@@ -167,7 +167,7 @@ def check_drive(plan: Drive, sensors: Sensors) -> None:
                 "y is positive to the right",
             )
     if (
-        isinstance(plan.path, Path)
+        isinstance(plan.path, PathPlan)
         and plan.path.radius_m == 0
         and plan.path.kind not in ("circle", "spins", "straight")
     ):
@@ -185,7 +185,7 @@ def check_drive(plan: Drive, sensors: Sensors) -> None:
 
 
 def move(plan: Drive, tail_s: float) -> Truth:
-    """Drive: the true motion of a plan, for its duration and `tail_s` more (the last wheel speed needs a next sample)."""
+    """Drive a plan for its duration and `tail_s` more: the last wheel speed needs a next sample."""
     end = plan.duration_s + tail_s + 2 * plan.step_s
     given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
@@ -206,9 +206,10 @@ def move(plan: Drive, tail_s: float) -> Truth:
     icrs = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)], np.float64)
     which = np.searchsorted(edges, t, side="right").astype(np.int64)
     step = np.diff(t)
-    travels = (np.concatenate([[0.0], np.cumsum(speed[:-1] * step)]) for speed in (v_left, v_right))
+    travel_left, travel_right = (np.concatenate([[0.0], np.cumsum(speed[:-1] * step)]) for speed in (v_left, v_right))
     start = np.array([0.0, 0.0, plan.start_heading_rad])
-    return Truth(t, left, right, v_left, v_right, *travels, icrs, which, drive(t, v_left, v_right, icrs, which, start))
+    pose = drive(t, v_left, v_right, icrs, which, start)
+    return Truth(t, left, right, v_left, v_right, travel_left, travel_right, icrs, which, pose)
 
 
 def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:

@@ -1,4 +1,4 @@
-"""Many simulated runs through the filter, chunk by chunk on all cores, each chunk reduced to what a study asks of it."""
+"""Many simulated runs through the filter, chunk by chunk on all cores, each reduced to what a study asks of it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from icrtool.analysis.filter_setup import FilterSetup, set_up_filter
-from icrtool.analysis.paths import Path
+from icrtool.analysis.paths import PathPlan
 from icrtool.analysis.simulate import Drive, Icrs, Readings, Sensors, Truth, move, sense
 from icrtool.config import Config
 from icrtool.core.study import TOOL, Batch, BatchOutput, run_batch
@@ -53,6 +54,7 @@ class Chunk:
     true_icrs_m : (k, 3), the same in every run
     stops_s : (s,) times at which the whole covariance was kept; P : (runs, s, 6, 6)
     true_pose : (runs, s, 3) there
+    truths : the true motion of every run
     gnss_nis : (runs, m), heading_nis : (runs, h), NaN where unseen
     """
 
@@ -64,10 +66,13 @@ class Chunk:
     stops_s: Floats
     P: Floats
     true_pose: Floats
+    truths: tuple[Truth, ...]
     gnss_nis: Floats
     heading_nis: Floats
 
 
+Job = TypeVar("Job")
+Done = TypeVar("Done")
 Measure = Callable[[Chunk], dict[str, Floats]]
 """Reduces a chunk to columns, one row a run."""
 
@@ -104,23 +109,41 @@ def run_scenarios(
     list of the columns of `measure`, (runs, ...), a scenario each
     """
     jobs = [
-        (number, first, min(first + size, runs))
+        (number, part)
         for number, scenario in enumerate(scenarios)
-        for size in [max(1, int(CHUNK_STATES / (scenario.plan.duration_s * scenario.sensors.wheel_rate_hz)))]
-        for first in range(0, runs, size)
+        for part in chunks(runs, int(scenario.plan.duration_s * scenario.sensors.wheel_rate_hz))
     ]
 
-    def work(job: tuple[int, int, int]) -> dict[str, Floats]:
-        number, first, last = job
-        return measure(_run_chunk(scenarios[number], range(first, last), seed, stops_s))
+    def work(job: tuple[int, range]) -> dict[str, Floats]:
+        number, part = job
+        return measure(_run_chunk(scenarios[number], part, seed, stops_s))
 
     parts: list[list[dict[str, Floats]]] = [[] for _ in scenarios]
+    for (number, _), found in zip(jobs, on_all_cores(work, jobs, progress), strict=True):
+        parts[number].append(found)
+    return [joined(some) for some in parts]
+
+
+def chunks(runs: int, states: int) -> list[range]:
+    """Cut runs of so many states each into chunks."""
+    size = max(1, CHUNK_STATES // max(states, 1))
+    return [range(first, min(first + size, runs)) for first in range(0, runs, size)]
+
+
+def on_all_cores(work: Callable[[Job], Done], jobs: Sequence[Job], progress: Progress | None) -> list[Done]:
+    """Do every job, in threads (the kernels free the GIL); results in the order of the jobs."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, (job, part) in enumerate(zip(jobs, pool.map(work, jobs), strict=True), start=1):
-            parts[job[0]].append(part)
+        done = []
+        for result in pool.map(work, jobs):
+            done.append(result)
             if progress is not None:
-                progress(done / len(jobs))
-    return [{name: np.concatenate([part[name] for part in some]) for name in some[0]} for some in parts]
+                progress(len(done) / len(jobs))
+    return done
+
+
+def joined(parts: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
+    """Put the columns of chunks one below the other."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float, ...]) -> Chunk:
@@ -142,6 +165,7 @@ def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float,
         stops_s=at_stops,
         P=square(out),
         true_pose=np.array([truth.poses(at_stops) for truth in truths]),
+        truths=truths,
         gnss_nis=out.gnss_nis,
         heading_nis=out.heading_nis,
     )
@@ -150,7 +174,7 @@ def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float,
 def _simulate(scenario: Scenario, run: int, seed: int) -> tuple[Truth, Readings]:
     rng = np.random.default_rng((seed, run))
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
-    if scenario.vary_path and isinstance(plan.path, Path):
+    if scenario.vary_path and isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
     truth = move(plan, 1 / scenario.sensors.wheel_rate_hz)
     return truth, sense(truth, scenario.sensors, plan.duration_s, rng)
@@ -164,10 +188,11 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
 
     fixes, headings = len(readings.gnss_t), len(readings.heading_t)
     variance = np.full(fixes, sensors.gnss_std_m**2)
+    north, east = readings.gnss_m.T
     return RobotLog(
         name="study",
         wheels=WheelSamples(stamps(readings.wheel_t), readings.v_left_mps, readings.v_right_mps),
-        gnss=PositionFixes(stamps(readings.gnss_t), *readings.gnss_m.T, variance, variance, np.zeros(fixes)),
+        gnss=PositionFixes(stamps(readings.gnss_t), north, east, variance, variance, np.zeros(fixes)),
         heading=HeadingSamples(
             stamps(readings.heading_t), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
         ),

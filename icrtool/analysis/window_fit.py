@@ -29,7 +29,7 @@ EVERY_M = 0.5
 HUBER_SIGMAS = 2.0
 """Where the loss turns from square to straight, in robust standard deviations of the residuals."""
 
-REWEIGHTINGS = 3
+REWEIGHTINGS = 6
 """The loss takes its scale from the residuals this often, at most."""
 
 SETTLED = 1e-4
@@ -212,10 +212,11 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
 
     Notes
     -----
-    Nonlinear least squares (trust region, analytic Jacobian) with the soft-L1 loss, whose scale is the residuals' own
-    (Huber 1964), under a wide prior: W about 1.4 b, no asymmetry, no x_icr, ± the robot's half width, terms beyond the
-    ICRs as far as they stray on real robots. A miss grows about as the root of the way, hence the weights. Windows
-    overlap: a stretch of way counts once in the covariance (sandwich, White 1982), and the prior as much as one.
+    Levenberg-Marquardt (More 1978, MINPACK) with analytic Jacobian, reweighted for the soft-L1 loss, whose scale is
+    the residuals' own (Huber 1964), under a wide prior: W about 1.4 b, no asymmetry, no x_icr, ± the robot's half
+    width, terms beyond the ICRs as far as they stray on real robots. A miss grows about as the root of the way, hence
+    the weights. Windows overlap: a stretch of way counts once in the covariance (sandwich, White 1982), and the prior
+    as much as one.
     """
     chosen = [TERMS.index(term) for term in model.terms]
     basis, base = _BASIS[chosen], np.array([*NEUTRAL, 0.0])
@@ -225,7 +226,7 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
     held = np.sqrt(alike) / std
     terms = mean
     # far from the solution a tenth of the samples tells the way there
-    for problem in (_Problem(_thinned(windows), basis, base), _Problem(windows, basis, base)):
+    for problem in (_Problem(thin_windows(windows), basis, base), _Problem(windows, basis, base)):
         for _ in range(REWEIGHTINGS):
             before, terms = terms, _step(problem, terms, mean, held, std)
             if np.all(np.abs(terms - before) < SETTLED * std):
@@ -248,16 +249,18 @@ def _step(problem: _Problem, terms: Floats, mean: Floats, held: Floats, std: Flo
     """Return the terms that minimise the loss whose scale is that of the residuals at `terms`."""
     from scipy.optimize import least_squares
 
-    scale = _scale(problem(terms)[0])
+    misses, _ = problem(terms)
+    scale = _scale(misses)
+    # soft L1 by reweighting: rho'(z) = (1 + z)^(-1/2)
+    weight = (1.0 + (misses / (HUBER_SIGMAS * scale)) ** 2) ** -0.25 / scale
     found: Floats = least_squares(
-        lambda q: np.concatenate([problem(q)[0] / scale, (q - mean) * held]),
+        lambda q: np.concatenate([problem(q)[0] * weight, (q - mean) * held]),
         terms,
-        jac=lambda q: np.concatenate([problem(q)[1] / scale, np.diag(held)]),
-        loss="soft_l1",
-        f_scale=HUBER_SIGMAS,
+        jac=lambda q: np.concatenate([problem(q)[1] * weight[:, None], np.diag(held)]),
+        method="lm",
         x_scale=std,
-        xtol=SETTLED,
-        ftol=1e-5,
+        xtol=SETTLED / 10.0,
+        ftol=1e-6,
     ).x
     return found
 
@@ -267,8 +270,8 @@ def _scale(misses: Floats) -> float:
     return max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
 
 
-def _thinned(windows: Windows) -> Windows:
-    """Return the windows with wheel samples joined in groups, mean speeds over their time."""
+def thin_windows(windows: Windows) -> Windows:
+    """Return the windows with wheel samples joined to steps of a tenth of a second, mean speeds over their time."""
     usual = float(np.median(windows.dt[windows.dt > 0.0])) if (windows.dt > 0.0).any() else COARSE_STEP_S
     first = np.arange(0, len(windows.t), max(int(COARSE_STEP_S / usual), 1))
     dt = np.add.reduceat(windows.dt, first)
@@ -300,9 +303,9 @@ class _Problem:
         w = self._windows
         motion = move(w.t, w.dt, w.v_left, w.v_right, p[:7], w.knot_t + p[7])
         d, d_by, d_late = displace(motion, w.start, w.end)
-        miss = (d - w.reference) * self._weight
-        slope = (np.column_stack([d_by, d_late]) @ self._basis.T) * self._weight[:, None]
-        return np.concatenate([miss.real, miss.imag]), np.concatenate([slope.real, slope.imag])
+        weight, miss, by = np.tile(self._weight, 2), d - w.reference, np.column_stack([d_by, d_late])
+        slopes = np.concatenate([by.real, by.imag]) @ self._basis.T
+        return np.concatenate([miss.real, miss.imag]) * weight, slopes * weight[:, None]
 
 
 def _prior(width_m: float, model: WindowModel) -> tuple[Floats, Floats]:

@@ -9,9 +9,13 @@ import click
 from icrtool import __version__
 
 _COMMANDS = {
+    "calibrate": "Estimate antenna, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.",
+    "export": "Print a run's calibration for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Say how far a robot can go blind, over 1 to 20 m from every recorded state.",
     "info": "Say what logs hold, which topics would be used, and what is wrong with them.",
+    "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
+    "study": "Simulate and filter many drives: how well, how soon, how surely are the ICRs learned?",
 }
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +23,11 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.report.dropout_content import DropoutContent
     from icrtool.report.dropout_drawing import DrawingProcess
+    from icrtool.report.dropout_exports import Outcome
     from icrtool.report.run_directory import StoredRun
     from icrtool.tables import Ints
 
+POSITIVE = click.FloatRange(min=0, min_open=True)
 EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
 
 
@@ -56,13 +59,13 @@ class Request:
 @click.option(
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
 )
-@click.option("--budget", "budgets", metavar="METRES", type=float, multiple=True, default=(0.5,), show_default=True,
+@click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Say how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option("--horizons", metavar="M,M,...", help="Distances driven blind [m], in place of the configured ones.")
 @click.option(
     "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
 )
-@click.option("--outage", "outages", metavar="SECONDS", type=float, multiple=True,
+@click.option("--outage", "outages", metavar="SECONDS", type=POSITIVE, multiple=True,
               help="Force outages of this length on the filter; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
               help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
@@ -92,22 +95,24 @@ def command(
       icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click wants the backspace character, not a backslash
-    from icrtool.report.dropout_drawing import DrawingProcess
-
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    with DrawingProcess(formats) as drawer:
-        # From here on numpy may be loaded: the second process is there.
-        from icrtool.analysis.dropout import DEFAULT_SEED
-        from icrtool.analysis.gates import parse_gate
+    # No kernel of ours uses BLAS, and a process with threads should not be forked.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from icrtool.analysis.dropout import DEFAULT_SEED
+    from icrtool.analysis.gates import parse_gate
+    from icrtool.report.dropout_drawing import DrawingProcess
 
-        request = Request(
-            config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
-            gates=tuple(parse_gate(text) for text in gates), trials=trials,
-            seed=seed if seed is not None else DEFAULT_SEED, formats=formats, quiet=quiet, verbose=verbose,
-        )  # fmt: skip
-        report_all(sources, output, request, drawer, junit=junit, markdown=markdown)
+    request = Request(
+        config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
+        gates=tuple(parse_gate(text) for text in gates), trials=trials,
+        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, quiet=quiet, verbose=verbose,
+    )  # fmt: skip
+    sources, places = plan_sources(sources, output, config, (junit, markdown))
+    with DrawingProcess(formats) as drawer:
+        outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
+    leave(outcomes, junit=junit, markdown=markdown)
 
 
 def parse_horizons(text: str) -> tuple[float, ...]:
@@ -122,39 +127,56 @@ def parse_horizons(text: str) -> tuple[float, ...]:
     return lengths
 
 
-def report_all(
-    sources: tuple[Path, ...], output: Path | None, request: Request, drawer: DrawingProcess, *,
-    junit: Path | None, markdown: Path | None,
-) -> None:  # fmt: skip
-    """Report on each source in turn, write the exports, and leave with the status that the outcomes ask for."""
-    from icrtool.errors import IcrToolError
-    from icrtool.report.dropout_exports import Outcome, check_parent, write_junit, write_markdown
+def plan_sources(
+    sources: tuple[Path, ...], output: Path | None, config: Config, exports: tuple[Path | None, ...]
+) -> tuple[tuple[Path, ...], dict[Path, Path]]:
+    """Return the sources, the newest run where none is named, and the run directory of each that is a log.
+
+    Whatever can be refused at once is refused here, before any work.
+    """
+    from icrtool.report.dropout_exports import check_parent
     from icrtool.report.dropout_source import newest_run
     from icrtool.report.run_directory import RUN_FILE
 
-    for export in (junit, markdown):
+    for export in exports:
         if export is not None:
             check_parent(export)
     sources = sources or (newest_run(RUNS),)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
-    check_configuration(request.config, runs_only=not logs, output=output)
-    places = dict(zip(logs, run_directories(logs, output), strict=True))
-    outcomes: list[tuple[str, Outcome]] = []
+    check_configuration(config, runs_only=not logs, output=output)
+    return sources, dict(zip(logs, run_directories(logs, output), strict=True))
+
+
+def report_all(
+    sources: tuple[Path, ...], places: dict[Path, Path], request: Request, drawer: DrawingProcess
+) -> Iterator[tuple[Path, Outcome]]:
+    """Report on each source in turn; one that cannot be used does not stop the others."""
+    from icrtool.errors import IcrToolError
+
     for source in sources:
         try:
-            outcomes.append((str(source), _report_one(source, places.get(source), request, drawer)))
+            yield source, _report_one(source, places.get(source), request, drawer)
         except IcrToolError as err:
-            outcomes.append((str(source), err))
             if len(sources) > 1:
                 click.echo(f"Error: {err}", err=True)
+            yield source, err
+
+
+def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdown: Path | None) -> None:
+    """Write the exports, and leave with the status that the outcomes ask for."""
+    from icrtool.errors import IcrToolError
+    from icrtool.report.dropout_exports import write_junit, write_markdown
+
     if junit is not None:
         write_junit(junit, outcomes)
     if markdown is not None:
         write_markdown(markdown, outcomes)
     failed = [outcome for _, outcome in outcomes if isinstance(outcome, IcrToolError)]
+    if len(failed) == len(outcomes) == 1:
+        raise failed[0]
     if failed:
-        what = f"{len(failed)} of {len(sources)} runs and logs"
-        raise failed[0] if len(sources) == 1 else IcrToolError(what, "could not be used", "the others were written")
+        what = f"{len(failed)} of {len(outcomes)} runs and logs"
+        raise IcrToolError(what, "could not be used", "the others were written")
     if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
         raise SystemExit(3)
 
@@ -192,10 +214,10 @@ def _read(directory: Path) -> StoredRun:
     from concurrent.futures import ThreadPoolExecutor
 
     from icrtool.analysis.dropout import load_kernels
-    from icrtool.report.run_directory import read_run
+    from icrtool.report.dropout_source import read_source
 
     with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(read_run, directory)
+        reading = pool.submit(read_source, directory)
         load_kernels()
         return reading.result()
 
@@ -228,7 +250,7 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
     from icrtool.analysis.outages import real_outages
     from icrtool.report.dropout_content import DropoutContent, title_of
     from icrtool.report.dropout_directory import dropout_directory, write_content
-    from icrtool.report.dropout_drawing import draw_paths, draw_statistics
+    from icrtool.report.dropout_drawing import draw_histograms, draw_paths, draw_summary
 
     title = title_of(run)
     outages = (*_forced_outages(run, request), *real_outages(run))
@@ -239,8 +261,12 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
     ):
         examples, worst = example_drives(run), worst_drives(run)
         draw_paths(draw, title, run.table, (examples, worst), outages)
-        report: DropoutReport = dropout(run, _horizons(run, request), seed=request.seed, sink=sink)
-        draw_statistics(draw, title, report, outages)
+        horizons = _horizons(run, request)
+        # The three histograms are drawn while all the rest is computed.
+        if request.formats and (preview := _preview(run, horizons)) is not None:
+            draw_histograms(draw, title, preview)
+        report = dropout(run, horizons, seed=request.seed, sink=sink)
+        draw_summary(draw, title, report, outages)
         content = DropoutContent(
             title=title,
             run_summary=run.summary,
@@ -253,6 +279,16 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
         )
         write_content(content, partial)
     return content
+
+
+def _preview(run: StoredRun | FilterRun, horizons: list[float]) -> DropoutReport | None:
+    """Compute what the histograms show ahead of all else; None where none of their horizons is asked for."""
+    from icrtool.analysis.dropout import dropout, models_of
+    from icrtool.report.dropout_drawing import HISTOGRAM_HORIZONS_M, HISTOGRAM_MODELS
+
+    shown = [horizon for horizon in HISTOGRAM_HORIZONS_M if horizon in horizons]
+    models = [model for model in models_of(run) if model.name in HISTOGRAM_MODELS]
+    return dropout(run, shown, models=models) if shown else None
 
 
 def _horizons(run: StoredRun | FilterRun, request: Request) -> list[float]:

@@ -1,4 +1,4 @@
-"""Many filter runs in one compiled call, and what only a study needs: other guards, and a truth that obeys the model."""
+"""Many filter runs in one compiled call; and what only a study needs: other guards, a truth that obeys the model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TOOL, UNGUARDED, GUARDED, PRINTED = 0, 1, 2, 3
-"""The filter as it is, and kernels for Section 5.1: Eqs. 8-10; Eqs. 32-34 with their true derivatives, or the printed."""
+"""The filter as it is; and kernels for Section 5.1: Eqs. 8-10, Eqs. 32-34 with their true derivatives or as printed."""
 
 
 class Batch(NamedTuple):
@@ -109,9 +109,9 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, guard: int, first: 
                 batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t,
             )  # fmt: skip
             start = (
-                np.searchsorted(batch.gnss_t, t, side="right"),
-                np.searchsorted(batch.heading_t, t, side="right"),
-                np.searchsorted(batch.change_t, t, side="right"),
+                int(np.searchsorted(batch.gnss_t, t, side="right")),
+                int(np.searchsorted(batch.heading_t, t, side="right")),
+                int(np.searchsorted(batch.change_t, t, side="right")),
             )
             piece = FilterOutput(
                 out.x[run, begin - first : end - first], out.variance[run, begin - first : end - first], distance,
@@ -225,7 +225,7 @@ def model_states(
     states = np.empty((len(wheel_t), 6))
     states[0] = x0
     for k in range(len(wheel_t) - 1):
-        N, E, psi, y_r, y_l, x_v = states[k]
+        psi, y_r, y_l, x_v = states[k, 2], states[k, 3], states[k, 4], states[k, 5]
         dt = wheel_t[k + 1] - wheel_t[k]
         v_x, v_y, omega = body_velocity(v_left[k], v_right[k], y_r, y_l, x_v)
         c, s = math.cos(psi), math.sin(psi)

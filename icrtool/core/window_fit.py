@@ -135,8 +135,10 @@ def move(t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, time
         np.empty(m), np.empty(m, np.complex128), np.empty((m, 7)), np.empty((m, 7), np.complex128),
         np.empty(m), np.empty(m, np.complex128),
     )  # fmt: skip
-    columns = (np.require(column, np.float64, ["C", "A", "W"]) for column in (t, dt, v_left, v_right, p, times))
-    march(*columns, *out)
+    stamps, held, left, right, parameters, wanted = (
+        np.require(column, np.float64, ["C", "A", "W"]) for column in (t, dt, v_left, v_right, p, times)
+    )
+    march(stamps, held, left, right, parameters, wanted, *out)
     return out
 
 

@@ -16,6 +16,9 @@ Bytes = NDArray[np.uint8]
 
 MOST_PROBLEMS = 20
 
+LATEST_NS = 1 << 62
+"""The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
@@ -101,6 +104,16 @@ class Problems(list[str]):
         text = printable(f"{self._name}: {problem}")
         if text not in self and len(self) <= MOST_PROBLEMS:
             self.append(text if len(self) < MOST_PROBLEMS else printable(f"{self._name}: and more of the kind"))
+
+
+def with_possible_times(block: Block, problems: Problems) -> Block:
+    """Return a block without the messages whose log time cannot be one."""
+    possible = (block.log_time_ns >= 0) & (block.log_time_ns < LATEST_NS)
+    if possible.all():
+        return block
+    problems.say("messages with an impossible log time left out")
+    _, *columns = block
+    return Block(block.data, *(column[possible] for column in columns))
 
 
 def printable(text: str) -> str:

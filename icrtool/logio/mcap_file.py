@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Bytes, Channel, Problems, printable, ros_type_name
+from icrtool.logio.channel import Block, Bytes, Channel, Problems, printable, ros_type_name, with_possible_times
 from icrtool.logio.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress, unpack_messages
 from icrtool.logio.records import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
 
@@ -101,9 +101,7 @@ class McapFile:
     def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int]) -> Iterator[Block]:
         for chunk in chunks:
             if chunk.channels is None or chunk.channels & wanted:
-                block = self._read_chunk(chunk)
-                if block is not None:
-                    yield block
+                yield from self._read_chunk(chunk)
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -238,13 +236,13 @@ class McapFile:
             left = self._size - at - _HEAD_BYTES
             if opcode in (_FOOTER, _DATA_END):
                 return
-            block = None
             if opcode == _CHUNK:
-                block = self._read_chunk(_Chunk(at + _HEAD_BYTES, min(length, left)), learn=learn, cut=length > left)
+                chunk = _Chunk(at + _HEAD_BYTES, min(length, left))
+                yield from self._read_chunk(chunk, learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
-            if block is not None:
-                yield block
+                if block is not None:
+                    yield block
             if opcode == 0 or length > left:
                 break
             at += _HEAD_BYTES + length
@@ -262,7 +260,7 @@ class McapFile:
         self.problems.say(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Block | None:
+    def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         try:
             if chunk.length > LARGEST_CHUNK_BYTES:
                 raise DecompressionError(f"it claims {chunk.length} bytes")
@@ -271,12 +269,15 @@ class McapFile:
         except DecompressionError as err:
             if not cut:
                 self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
-            return None
-        rows, stop = self._table.scan_mcap(records)
+            return
+        stop, begin = 0, -1
+        while begin < stop < len(records):
+            begin = stop
+            rows, stop = self._table.scan_mcap(records, begin)
+            yield self._messages(records, rows, learn=learn)
         if stop < len(records) and not cut:
             lost = f"{len(records) - stop} of {len(records)} bytes left out, damaged"
             self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES}: {lost}")
-        return self._messages(records, rows, learn=learn)
 
     def _messages(self, data: Bytes, rows: NDArray[np.int64], *, learn: bool) -> Block:
         is_message = rows[:, 0] == MCAP_MESSAGE
@@ -284,7 +285,8 @@ class McapFile:
             for row in rows[~is_message]:
                 self._learn(int(row[0]), bytes(data[row[3] : row[4]]))
         rows = rows[is_message]
-        return Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
+        block = Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
+        return with_possible_times(block, self.problems)
 
     def _learn(self, opcode: int, content: bytes) -> None:
         """Remember a schema or channel record that the walk came upon."""

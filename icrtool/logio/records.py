@@ -11,6 +11,7 @@ from icrtool.tables import Ints
 
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
+MOST_ROWS = 1 << 18
 
 
 @njit
@@ -100,22 +101,17 @@ def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int
 
 
 class RecordTable:
-    """A reusable table for a scan's rows; it grows to the fullest chunk."""
+    """A reusable table for a scan's rows, which bounds them: where it is full, the scan stops and can go on."""
 
     def __init__(self) -> None:
-        self._rows: Ints = np.empty((1 << 14, 5), np.int64)
+        self._rows: Ints = np.empty((MOST_ROWS, 5), np.int64)
 
     def scan_mcap(self, data: Bytes, begin: int = 0) -> tuple[Ints, int]:
-        """Return the rows of all records from `begin`, and the first byte not consumed."""
-        return self._scan(scan_mcap, data, begin)
+        """Return the rows of the records from `begin`, and the first byte not consumed."""
+        count, stop = scan_mcap(data, begin, self._rows)
+        return self._rows[:count], stop
 
     def scan_bag(self, data: Bytes, begin: int = 0) -> tuple[Ints, int]:
-        """Return the rows of all records from `begin`, and the first byte not consumed."""
-        return self._scan(scan_bag, data, begin)
-
-    def _scan(self, kernel: object, data: Bytes, begin: int) -> tuple[Ints, int]:
-        while True:
-            count, stop = kernel(data, begin, self._rows)  # type: ignore[operator]  # numba dispatchers have no type
-            if count < len(self._rows):
-                return self._rows[:count], stop
-            self._rows = np.empty((2 * len(self._rows), 5), np.int64)
+        """Return the rows of the records from `begin`, and the first byte not consumed."""
+        count, stop = scan_bag(data, begin, self._rows)
+        return self._rows[:count], stop

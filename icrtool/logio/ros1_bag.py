@@ -10,9 +10,10 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Channel, Problems, printable, ros_type_name
+from icrtool.logio.channel import Block, Bytes, Channel, Problems, printable, ros_type_name
 from icrtool.logio.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress
 from icrtool.logio.records import BAG_CONNECTION, BAG_MESSAGE, RecordTable
+from icrtool.tables import Ints
 
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
@@ -95,9 +96,7 @@ class Ros1Bag:
             if record is None or record.op != _CHUNK:
                 self.problems.say(f"no chunk at byte {chunk.at}, where the index says one is")
                 continue
-            block = self._read_chunk(record)
-            if block is not None:
-                yield block
+            yield from self._read_chunk(record)
 
     def _check_start(self) -> None:
         start = self._stream.read(len(MAGIC))
@@ -168,9 +167,7 @@ class Ros1Bag:
                 break
             cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                block = self._read_chunk(record, learn=learn, cut=cut)
-                if block is not None:
-                    yield block
+                yield from self._read_chunk(record, learn=learn, cut=cut)
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_HEADER_BYTES:
@@ -180,7 +177,7 @@ class Ros1Bag:
         if at < self._size:
             self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
 
-    def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Block | None:
+    def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         size = record.number(b"size")
         try:
             if record.length > LARGEST_CHUNK_BYTES:
@@ -191,10 +188,16 @@ class Ros1Bag:
         except DecompressionError as err:
             if not cut:
                 self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")
-            return None
-        rows, stop = self._table.scan_bag(data)
+            return
+        stop, begin = 0, -1
+        while begin < stop < len(data):
+            begin = stop
+            rows, stop = self._table.scan_bag(data, begin)
+            yield self._messages(data, rows, learn=learn)
         if stop < len(data) and not cut:
             self.problems.say(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+
+    def _messages(self, data: Bytes, rows: Ints, *, learn: bool) -> Block:
         if learn:
             for _, number, header, start, end in rows[rows[:, 0] == BAG_CONNECTION].tolist():
                 topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")

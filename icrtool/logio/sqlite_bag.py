@@ -14,7 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logio.channel import Block, Channel, Problems, printable, ros_type_name
+from icrtool.logio.channel import Block, Channel, Problems, printable, ros_type_name, with_possible_times
 from icrtool.logio.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
 
 MAGIC = b"SQLite format 3\0"
@@ -209,11 +209,12 @@ class SqliteBag:
 
     def _block(self, rows: list[Row]) -> Block:
         try:
-            return _packed(rows)
+            block = _packed(rows)
         except (TypeError, ValueError, OverflowError):
             sound = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
-            self.problems.say(f"{len(rows) - len(sound)} rows without a time or a message left out")
-            return _packed(sound)
+            self.problems.say("rows without a time or a message left out")
+            block = _packed(sound)
+        return with_possible_times(block, self.problems)
 
 
 def _packed(rows: list[Row]) -> Block:

@@ -26,13 +26,14 @@ if TYPE_CHECKING:
 
 Draw = Callable[..., None]
 
+HISTOGRAM_MODELS = ("icr", "no_slip")
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
 class DrawingProcess:
     """A process that draws figures; it lives as long as its ``with`` block.
 
-    Enter the block before numpy is loaded: on Linux the process is forked, and a fork wants no other threads.
+    On Linux it is forked: what was loaded before is there at once, but a process with threads should not be forked.
 
     Parameters
     ----------
@@ -99,14 +100,18 @@ def draw_paths(
         draw("outages", title, table.north_m, table.east_m, outages)
 
 
-def draw_statistics(draw: Draw, title: str, report: DropoutReport, outages: Sequence[Outage]) -> None:
-    """Have the summary and the histograms drawn, where there are trials."""
+def draw_histograms(draw: Draw, title: str, report: DropoutReport) -> None:
+    """Have the histograms drawn, where there are trials; `report` needs the models of `HISTOGRAM_MODELS` only."""
     trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
-    if any(trials.values()):
-        draw("summary", title, report, outages)
     for horizon in HISTOGRAM_HORIZONS_M:
         if trials.get(horizon):
             draw(f"histogram_{horizon:02.0f}m", title, report, horizon)
+
+
+def draw_summary(draw: Draw, title: str, report: DropoutReport, outages: Sequence[Outage]) -> None:
+    """Have the summary over all horizons drawn, where there are trials."""
+    if report.counts.trials.any():
+        draw("summary", title, report, outages)
 
 
 def _begin() -> None:

@@ -10,11 +10,26 @@ from pydantic import ValidationError
 from icrtool.analysis.fit import FilterRun
 from icrtool.config import Config
 from icrtool.errors import RunError
-from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory
+from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run
 from icrtool.tables import RobotLog
 
 SAME_STATE_M = 1e-6
 """States made again on another machine may differ by rounding, not by this much."""
+
+
+def read_source(directory: Path) -> StoredRun:
+    """Read a run; what reading it took beyond the states goes back to the system.
+
+    Raises
+    ------
+    RunError
+        As `read_run`.
+    """
+    import pyarrow as pa
+
+    run = read_run(directory)
+    pa.default_memory_pool().release_unused()
+    return run
 
 
 def stored_config(run: StoredRun) -> Config:

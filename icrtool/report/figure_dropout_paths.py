@@ -80,7 +80,7 @@ def draw_worst(title: str, worst: Sequence[BlindDrive]) -> Figure:
     figure.supxlabel("East of start [m]", fontsize=9.0, y=0.42 / figure.get_figheight())
     figure.supylabel("North of start [m]", fontsize=9.0, x=0.12 / figure.get_figwidth())
     for rank, (axes, drive) in enumerate(zip(panels, worst, strict=False), start=1):
-        _draw_drive(axes, drive, box=(1.0, 1.0))
+        _draw_drive(axes, drive, box=(1.0, 1.0), ticks=4)
         axes.set_title(
             f"{rank}.  {length_text(drive.errors_m['icr'])}\n"
             f"{drive.t_s:.1f} s, {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s",
@@ -128,7 +128,7 @@ def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[
     return figure
 
 
-def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float]) -> None:
+def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float], ticks: int = 5) -> None:
     """Draw one blind drive about its start; the view has the shape of `box` (width, height), metres are square."""
     north0, east0 = drive.north_m, drive.east_m
     lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, 2.0)]
@@ -145,7 +145,7 @@ def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float]) -> None
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
     axes.set_aspect("equal")
-    axes.locator_params(nbins=5, steps=[1, 2, 5, 10])
+    axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
 
 
 def _add_keys(figure: Figure, drives: Sequence[BlindDrive]) -> None:

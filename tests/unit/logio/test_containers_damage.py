@@ -136,7 +136,7 @@ def test_mcap_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path, compre
     assert len(chunk_places(whole)) > 5
     data_end = whole.rindex(b"\x0f" + (4).to_bytes(8, "little"))
     path = tmp_path / "cut.mcap"
-    for length in [*range(1, 120, 7), *range(120, data_end, 397), *range(data_end - 12, data_end + 30), len(whole) - 1]:
+    for length in [*range(1, 120, 13), *range(120, data_end, 797), *range(data_end - 12, data_end + 30), len(whole) - 1]:
         path.write_bytes(whole[:length])
         found, problems = read_log(path)
         assert found == messages[: len(found)]
@@ -379,6 +379,20 @@ def test_mcap_record_that_is_too_short_for_its_kind_is_left_out_and_said(tmp_pat
     assert problems[0].startswith("log.mcap: record at byte ")
 
 
+def test_messages_of_an_impossible_time_are_left_out_and_said(tmp_path):
+    times = [START_NS, 0, (1 << 62) - 1, 1 << 62, (1 << 63) - 1]
+    path = loose_mcap(
+        tmp_path / "log.mcap",
+        Schema(1, b"float64 data", "ros2msg", "std_msgs/msg/Float64"),
+        Channel(1, "/a", "cdr", {}, 1),
+        *(Message(1, stamp, b"x", stamp, 0) for stamp in [*times, 1 << 63, (1 << 64) - 1]),
+    )
+    expected = [("/a", stamp, b"x") for stamp in times[:3]]
+    assert read_log(path) == (expected, ["log.mcap: messages with an impossible log time left out"])
+    path = write_directory(tmp_path / "log", [("/a", stamp, b"x") for stamp in [*times, -1, -(1 << 63)]])
+    assert read_log(path) == (expected, ["log.db3: messages with an impossible log time left out"])
+
+
 def test_mcap_with_many_damages_does_not_drown_the_user(tmp_path):
     short = b"\x05" + (3).to_bytes(8, "little") + bytes(3)
     path = loose_mcap(
@@ -398,7 +412,7 @@ def test_ros_1_bag_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path, c
     whole = write_bag(tmp_path / "log.bag", messages, compression).read_bytes()
     path = tmp_path / "cut.bag"
     most = 0
-    for length in [*range(1, 4200, 211), *range(4200, len(whole) - 300, 397), *range(len(whole) - 300, len(whole), 13)]:
+    for length in [*range(1, 4200, 211), *range(4200, len(whole) - 300, 797), *range(len(whole) - 300, len(whole), 29)]:
         path.write_bytes(whole[:length])
         found, problems = read_log(path)
         assert found == messages[: len(found)]
@@ -571,14 +585,14 @@ def test_db3_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path):
     whole = path.read_bytes()
     cut = tmp_path / "cut.db3"
     counts = []
-    for length in [1, 17, 100, 4096, *range(5000, len(whole) - 1, 24_001), len(whole) - 1]:
+    for length in [1, 17, 100, 4096, *range(5000, len(whole) - 1, 48_001), len(whole) - 1]:
         cut.write_bytes(whole[:length])
         found, problems = read_log(cut)
         assert [message for message in messages if message in found] == found
         assert problems or len(found) == len(messages)
         counts.append(len(found))
     assert counts == sorted(counts)
-    assert counts[len(counts) // 2] > 700
+    assert counts[-2] > 1500
 
 
 @pytest.mark.parametrize("pages", [1, 5])
@@ -616,12 +630,14 @@ def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
     )
     database.close()
     expected = [*messages, ("/huge", 8, b"\1"), ("/\ufffd\ufffd", 9, b"\2")]
-    problems = ["log.db3: 5 rows without a time or a message left out"]
+    problems = ["log.db3: rows without a time or a message left out"]
     for log in (path, path.parent):
         assert read_log(log) == (expected, problems)
 
 
-@pytest.mark.parametrize("tables", ["", "CREATE TABLE topics(id); CREATE VIEW messages AS SELECT 1", "CREATE TABLE t(x)"])
+@pytest.mark.parametrize(
+    "tables", ["", "CREATE TABLE topics(id); CREATE VIEW messages AS SELECT 1", "CREATE TABLE t(x)"]
+)
 def test_an_sqlite_file_that_is_no_bag_is_refused(tmp_path, tables):
     path = tmp_path / "log.db3"
     database = sqlite3.connect(path)
@@ -709,7 +725,7 @@ YAML_BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     [
         f"{YAML_BOMB}rosbag2_bagfile_information:\n  relative_file_paths: *i\n",
         "rosbag2_bagfile_information:\n  relative_file_paths: [log.db3, 7, null, [x], '', '..', '/etc/passwd']\n",
-        "[" * 2000,
+        "[" * 1500,
         "rosbag2_bagfile_information: {relative_file_paths: 2026-99-99}",
         "rosbag2_bagfile_information: {relative_file_paths: 1e400, compression_mode: !!python/object:os.system x}",
         "\0\1\2",

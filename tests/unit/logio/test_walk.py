@@ -9,6 +9,7 @@ from types import FunctionType
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.core.compiled import njit
@@ -25,7 +26,7 @@ from icrtool.logio.layout import (
     Layout,
     compile_layout,
 )
-from icrtool.logio.records import RecordTable
+from icrtool.logio.mcap_file import McapFile
 from icrtool.logio.walk import walk_messages
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -37,7 +38,7 @@ WANTED = {
     "std_msgs/Float64MultiArray": ("layout.dim[*].label", "layout.dim[*].size", "layout.data_offset", "data[*]"),
 }
 EXTREMES = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, (1 << 63) - 1, 1 << 63, (1 << 64) - 1]
-MUTATIONS = 150
+MUTATIONS = 100
 
 
 class Guarded:
@@ -270,10 +271,24 @@ def test_scan_refuses_a_length_that_the_chunk_does_not_have(kind, number):
     assert (rows[:count, 4] <= len(chunk)).all()
 
 
-def test_a_table_of_records_grows_to_the_fullest_chunk():
-    record = b"\5" + (22).to_bytes(8, "little") + bytes(22)
-    rows, stop = RecordTable().scan_mcap(np.frombuffer(record * 40_000, np.uint8))
-    assert (len(rows), stop) == (40_000, 40_000 * 31)
+def test_a_chunk_of_more_records_than_the_table_has_rows_is_scanned_in_pieces(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "MOST_ROWS", 7)
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        channel = writer.register_channel(
+            "/a", "cdr", writer.register_schema("std_msgs/msg/Bool", "ros2msg", b"bool data")
+        )
+        for row in range(100):
+            writer.add_message(channel, row, bytes([row]), row)
+        writer.finish()
+    log = McapFile(path)
+    blocks = list(log.blocks(frozenset({1})))
+    log.close()
+    assert max(len(block.start) for block in blocks) == 7
+    assert [int(block.data[at]) for block in blocks for at in block.start] == list(range(100))
+    assert log.problems == []
 
 
 @pytest.mark.stress

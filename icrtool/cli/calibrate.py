@@ -1,0 +1,80 @@
+"""``icrtool calibrate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+
+if TYPE_CHECKING:
+    from icrtool.config import Config
+    from icrtool.tables import RobotLog
+
+
+@click.command("calibrate")
+@click.argument("source", metavar="LOG|RUN", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", metavar="FILE|DIR", type=click.Path(path_type=Path), help="Write calibration.json here."
+)
+@click.option(
+    "--x-icr", metavar="METRES", type=float, help="Where the ICRs are known to lie, forward: gives the antenna's place."
+)
+@options.configuration
+@options.verbosity
+def command(
+    source: Path, output: Path | None, x_icr: float | None,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    r"""Estimate antenna place, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.
+
+    What the drive could not show is said, never guessed. A RUN is calibrated from the log it was made from, with its
+    configuration.
+
+    \b
+    Example:
+      icrtool calibrate field.mcap --robot husky-a200
+      icrtool calibrate icrtool-runs/field -o calibration.json
+    """
+    from icrtool.report.calibration_table import calibration_file, format_calibration, write_calibration
+
+    config = options.load(config_file, robot, sets)
+    if output is not None:
+        calibration_file(output)
+    log, config = _read(source, config, quiet=quiet)
+    from icrtool.analysis.calibrate_verdict import calibrate
+
+    found = calibrate(log, config, x_icr_m=x_icr)
+    options.warn(log.warnings, quiet=quiet)
+    if not quiet:
+        click.echo(format_calibration(found))
+    if output is not None:
+        file = write_calibration(found, output)
+        if not quiet:
+            click.echo(f"\nwritten to {file}")
+    if verbose:
+        for stream in log.streams:
+            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+
+
+def _read(source: Path, config: Config, *, quiet: bool) -> tuple[RobotLog, Config]:
+    """Read a log, or the log of a run with the run's configuration."""
+    from icrtool.logio import read_log
+    from icrtool.report.run_directory import is_run_directory
+
+    path = source
+    if is_run_directory(source):
+        from icrtool.errors import ConfigError
+        from icrtool.report.dropout_source import log_of, read_source, stored_config
+
+        if config.model_fields_set:
+            section = min(config.model_fields_set)
+            raise ConfigError(
+                f"[{section}]", "a finished run keeps the configuration it was made with", "name its log instead"
+            )
+        run = read_source(source)
+        path, config = log_of(run), stored_config(run)
+    with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
+        return read_log(path, config, progress), config

@@ -1,0 +1,83 @@
+"""`icrtool calibrate` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from icrtool.cli import main
+from icrtool.config import load_config
+
+ROOT = Path(__file__).resolve().parents[2]
+LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
+ROBOT = ("--robot", "segway-rmp400")
+
+
+@pytest.fixture
+def icrtool(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as left:
+            return int(left.code or 0), *capfd.readouterr()
+        return 0, *capfd.readouterr()
+
+    return run
+
+
+def test_a_log_is_calibrated_printed_and_written(icrtool, tmp_path: Path) -> None:
+    status, out, err = icrtool("calibrate", LOG, *ROBOT, "-o", tmp_path / "calibration.json")
+    assert (status, err) == (0, "")
+    assert "antenna forward − x ICR" in out
+    assert "not separable" in out
+    document = json.loads((tmp_path / "calibration.json").read_text())
+    assert document["schema"] == "icrtool/calibration/1"
+    for parameter in document["parameters"].values():
+        assert parameter["verdict"] in {"shown", "weak", "not shown", "not separable", "given"}
+    assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
+
+
+def test_a_run_is_calibrated_with_its_configuration(icrtool, tmp_path: Path) -> None:
+    icrtool("fit", LOG, *ROBOT, "-o", "run", "--plots", "none", "-q")
+    status, by_run, _ = icrtool("calibrate", "run")
+    assert status == 0
+    assert by_run == icrtool("calibrate", LOG, *ROBOT)[1]
+    status, _, err = icrtool("calibrate", "run", *ROBOT)
+    assert status == 1
+    assert "keeps the configuration" in err
+
+
+def test_settings_can_be_pasted(icrtool) -> None:
+    wrong = ("--set", "wheels.left_scale=0.97", "--set", "wheels.right_scale=1.0")
+    _, out, _ = icrtool("calibrate", LOG, *ROBOT, *wrong)
+    line = next(line for line in out.splitlines() if "--set" in line)
+    sets = [word for word in line.split() if word != "--set"]
+    assert load_config(sets=sets).wheels.left_scale == pytest.approx(1.0, abs=0.01)
+    toml = out.split("for --config:\n")[1]
+    Path("calibrated.toml").write_text(toml)
+    assert load_config("calibrated.toml").wheels.left_scale == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_known_antenna_is_used(icrtool) -> None:
+    _, out, _ = icrtool("calibrate", LOG, *ROBOT, "--set", "frames.antenna_forward_m=0.0")
+    assert "with the antenna as given" in out
+
+
+@pytest.mark.parametrize("place", ["other.json", "missing/calibration.json"])
+def test_nothing_foreign_is_overwritten(icrtool, tmp_path: Path, place: str) -> None:
+    (tmp_path / "other.json").write_text("{}")
+    status, out, err = icrtool("calibrate", LOG, *ROBOT, "-o", place)
+    assert (status, out) == (1, "")
+    assert err.startswith("Error: ")
+    assert len(err.splitlines()) == 1
+    assert (tmp_path / "other.json").read_text() == "{}"
+
+
+def test_quiet_prints_nothing(icrtool) -> None:
+    assert icrtool("calibrate", LOG, *ROBOT, "-q") == (0, "", "")

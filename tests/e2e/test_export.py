@@ -1,0 +1,70 @@
+"""`icrtool export` as a user runs it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from icrtool.cli import main
+from icrtool.cli.export import TARGETS
+from icrtool.report import export
+
+ROOT = Path(__file__).resolve().parents[2]
+LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from icrtool.analysis.fit import fit
+    from icrtool.logio import read_log
+    from icrtool.report.run_directory import write_run
+
+    config = __import__("icrtool").load_config(robot="segway-rmp400")
+    folder = tmp_path_factory.mktemp("runs")
+    write_run(fit(read_log(LOG, config), config), folder / "icrtool-runs" / "mower", plots=())
+    return folder
+
+
+@pytest.fixture
+def icrtool(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], runs: Path):
+    monkeypatch.chdir(runs)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as left:
+            return int(left.code or 0), *capfd.readouterr()
+        return 0, *capfd.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_what_is_printed_loads_as_yaml(icrtool, target: str) -> None:
+    status, out, err = icrtool("export", "--for", target, "icrtool-runs/mower")
+    assert (status, err) == (0, "")
+    assert YAML(typ="safe").load(out)
+
+
+def test_without_an_argument_the_newest_run_is_taken(icrtool) -> None:
+    assert icrtool("export", "--for", "clearpath") == icrtool("export", "--for", "clearpath", "icrtool-runs/mower")
+
+
+def test_the_choices_are_those_of_the_report() -> None:
+    assert TARGETS == export.TARGETS
+
+
+def test_a_log_is_no_run(icrtool) -> None:
+    status, out, err = icrtool("export", "--for", "json", LOG)
+    assert (status, out) == (1, "")
+    assert err.startswith("Error: ")
+
+
+def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
+    status, _, err = icrtool("export", "--for", "moveit", "icrtool-runs/mower")
+    assert status == 2
+    assert "diff_drive_controller" in err

@@ -1,0 +1,31 @@
+"""The ladder as text and data."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from icrtool.analysis.ladder import Ladder, judge_ladder
+from icrtool.report.calibration_ladder import format_ladder, ladder_document
+from icrtool.report.run_directory import json_bytes
+
+
+@pytest.fixture(scope="module")
+def ladder(make_run) -> Ladder:
+    run = make_run(duration_s=90.0)
+    return judge_ladder(run, run.log.heading, heading_is_reference=True)
+
+
+def test_every_model_has_its_line(ladder: Ladder) -> None:
+    text = format_ladder(ladder)
+    for rung in ladder.rungs:
+        assert any(line.startswith(rung.label) for line in text.splitlines())
+    assert "held out" in text
+    assert "as good as that" in text
+
+
+def test_the_document_is_json(ladder: Ladder) -> None:
+    document = json.loads(json_bytes(ladder_document(ladder)))
+    assert [model["name"] for model in document["models"]] == [rung.name for rung in ladder.rungs]
+    assert set(document["fits"]["window"]["value"]) >= {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}
