@@ -34,7 +34,7 @@ BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
-LARGEST_TABLE_BYTES = 64 << 20
+LARGEST_TABLE_BYTES = 160 << 20
 """Errors held at a time: horizons are taken in groups below it, whatever the length of the log."""
 
 STANDING_MPS = 0.01

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
+from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
@@ -178,7 +179,7 @@ def fit(
             **nis_summary(gnss, heading),
         },
     }
-    return FilterRun(
+    run = FilterRun(
         log=log,
         config=config,
         table=table,
@@ -194,6 +195,11 @@ def fit(
         warnings=warnings,
         summary=summary,
     )
+    excitation = judge_excitation(run)
+    told = tuple(f"{log.name}: {sentence}" for sentence in excitation.sentences)
+    summary["excitation"] = excitation.summary()
+    summary["warnings"] = [*warnings, *told]
+    return replace(run, warnings=(*warnings, *told))
 
 
 def _states(log: RobotLog, output: FilterOutput) -> States:

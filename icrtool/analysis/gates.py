@@ -54,7 +54,13 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a gate found: `value_m` is NaN where the log has no trial of that length; `margin_m` is negative when missed."""
+    """What a gate found.
+
+    Attributes
+    ----------
+    value_m : NaN where the log has no trial of that length
+    margin_m : negative when the bound was missed
+    """
 
     gate: Gate
     value_m: float

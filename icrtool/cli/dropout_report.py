@@ -153,7 +153,9 @@ def report_all(
     """Report on each source in turn; one that cannot be used does not stop the others."""
     from icrtool.errors import IcrToolError
 
-    for source in sources:
+    for number, source in enumerate(sources):
+        if number and not request.quiet:
+            click.echo()
         try:
             yield source, _report_one(source, places.get(source), request, drawer)
         except IcrToolError as err:
@@ -195,6 +197,8 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
 
 def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutContent:
     """Report on one source; `place` is the run directory of a log, None for a run."""
+    from icrtool.analysis.dropout import BOOTSTRAP_RESAMPLES
+    from icrtool.core.open_loop_fast import TOLERANCE_M
     from icrtool.report.dropout_table import format_dropout
 
     if place is None:
@@ -205,7 +209,11 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
     content = _analyse(run, directory, request, drawer)
     if not request.quiet:
         click.echo(format_dropout(content))
-        click.echo(f"\nwritten to {directory / 'dropout'}\n")
+        click.echo(f"\nwritten to {directory / 'dropout'}")
+    if request.verbose:
+        blocks = "moving blocks as long as the horizon"
+        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {request.seed}", err=True)
+        click.echo(f"errors: equal to direct integration, {TOLERANCE_M:g} m left out at most", err=True)
     return content
 
 

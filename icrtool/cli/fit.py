@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import click
 
@@ -13,6 +13,19 @@ if TYPE_CHECKING:
     from icrtool.config import Config
 
 RUNS = Path("icrtool-runs")
+
+
+class FitRequest(NamedTuple):
+    """What the options ask for, the same for every log."""
+
+    config: Config
+    states: Literal["csv", "parquet"]
+    formats: tuple[str, ...]
+    warm_start: Path | None
+    changes_s: tuple[float, ...]
+    smooths: bool
+    quiet: bool
+    verbose: bool
 
 
 @click.command("fit")
@@ -38,11 +51,12 @@ RUNS = Path("icrtool-runs")
     type=float,
     help="Inflate the ICR covariance T seconds after the start; repeatable.",
 )
+@click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[float, ...],
+    warm_start: Path | None, changes: tuple[float, ...], smooths: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     r"""Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -58,12 +72,15 @@ def command(
     from icrtool.errors import IcrToolError
 
     config = options.load(config_file, robot, sets)
-    formats = plot_formats(plots)
+    request = FitRequest(
+        config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start, changes, smooths,
+        quiet, verbose,
+    )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
     for log, directory in zip(logs, directories, strict=True):
         try:
-            _fit_one(log, directory, config, states, formats, warm_start, changes, quiet=quiet, verbose=verbose)
+            _fit_one(log, directory, request)
         except IcrToolError as err:
             if len(logs) == 1:
                 raise
@@ -104,28 +121,30 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     return [(output or RUNS) / name for name in names]
 
 
-def _fit_one(
-    log: Path, directory: Path, config: Config, states: str, formats: tuple[str, ...],
-    warm_start: Path | None, changes: tuple[float, ...], *, quiet: bool, verbose: bool,
-) -> None:  # fmt: skip
+def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     from icrtool.report.run_directory import check_target, read_warm_start, write_run
 
     check_target(directory)
-    start = read_warm_start(warm_start) if warm_start is not None else None
-    with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
+    start = read_warm_start(request.warm_start) if request.warm_start is not None else None
+    with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logio import read_log
 
-        measured = read_log(log, config, progress)
+        measured = read_log(log, request.config, progress)
     from icrtool.analysis.fit import fit
 
-    run = fit(measured, config, warm_start=start, changes_s=changes)
-    write_run(run, directory, states="parquet" if states == "parquet" else "csv", plots=formats)
-    options.warn(run.warnings, quiet=quiet)
-    if not quiet:
+    run = fit(measured, request.config, warm_start=start, changes_s=request.changes_s)
+    smoothed = None
+    if request.smooths:
+        from icrtool.analysis.smooth import smooth
+
+        smoothed = smooth(run, warm_start=start)
+    write_run(run, directory, states=request.states, plots=request.formats, smoothed=smoothed)
+    options.warn(run.warnings, quiet=request.quiet)
+    if not request.quiet:
         from icrtool.report.run_table import format_run
 
         click.echo(format_run(run))
         click.echo(f"\nwritten to {directory}")
     for stream in measured.streams:
-        if verbose or ("chosen over" in stream.why and not quiet):
+        if request.verbose or ("chosen over" in stream.why and not request.quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -66,7 +66,12 @@ def check_target(directory: Path) -> None:
 
 
 def write_run(
-    run: FilterRun, directory: Path, *, states: StatesFormat = "csv", plots: tuple[str, ...] = ("png",)
+    run: FilterRun,
+    directory: Path,
+    *,
+    states: StatesFormat = "csv",
+    plots: tuple[str, ...] = ("png",),
+    smoothed: States | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -76,6 +81,7 @@ def write_run(
     directory : where it shall appear; an old run there is replaced, with all that was made from it
     states : format of the states
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+    smoothed : the smoother's states, written as ``smoothed`` in the same format
 
     Raises
     ------
@@ -90,6 +96,8 @@ def write_run(
     ):
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
+        if smoothed is not None:
+            write_states(smoothed, partial / f"smoothed.{states}", states)
         if plots:
             (partial / "plots").mkdir()
             _draw(run, partial / "plots", plots)

@@ -98,7 +98,9 @@ def test_sensors_without_error_tell_the_truth() -> None:
     seen = sense(truth, QUIET, 20.0, rng())
     np.testing.assert_array_equal(seen.gnss_m, truth.poses(seen.gnss_t)[:, :2])
     np.testing.assert_array_equal(seen.heading_rad, truth.poses(seen.heading_t)[:, 2])
-    np.testing.assert_allclose(seen.travel_left_m, np.interp(seen.wheel_t, truth.t_s, truth.travel_left_m), atol=ROUNDING)
+    np.testing.assert_allclose(
+        seen.travel_left_m, np.interp(seen.wheel_t, truth.t_s, truth.travel_left_m), atol=ROUNDING
+    )
     assert len(seen.wheel_t) == 2000
     assert len(seen.gnss_t) == 400
 

@@ -21,6 +21,8 @@ from icrtool.errors import ConfigError
 def request(name: Any, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
     base = default_request(name, Config())
     plan = base.plan if duration_s is None else replace(base.plan, duration_s=duration_s)
+    if name == "icr-change" and duration_s is not None:
+        plan = replace(plan, changes=((duration_s / 2, (0.7, -0.6, 0.0)),))
     return replace(base, runs=runs, plan=plan, **changes)
 
 
@@ -35,12 +37,12 @@ def median(result: StudyResult, metric: str, **wanted: Any) -> float:
 SMALL: dict[str, dict[str, Any]] = {
     "convergence": {"duration_s": 10.0, "paths": ("circle", "spins")},
     "initial": {"duration_s": 5.0, "values": (1.0, -1.0)},
-    "icr-change": {"duration_s": 180.0},
+    "icr-change": {"duration_s": 20.0},
     "turn-radius": {"duration_s": 25.0, "values": (0.0, 2.0)},
     "input-noise": {"duration_s": 10.0, "values": (0.0, 0.1)},
     "input-bias": {"duration_s": 10.0, "values": (0.0, 0.1)},
     "input-source": {"duration_s": 10.0},
-    "gnss": {"duration_s": 60.0, "values": (0.01, 0.3)},
+    "gnss": {"duration_s": 30.0, "values": (0.01, 0.3)},
     "rate": {"duration_s": 10.0, "values": (20.0, 100.0)},
     "consistency": {"duration_s": 15.0},
 }
@@ -83,7 +85,9 @@ def test_convergence_on_circles_takes_seconds() -> None:
 
 
 def test_inflation_brings_reconvergence_from_minutes_to_seconds() -> None:
-    result = run_study(request("icr-change", 6))
+    asked = request("icr-change", 4)
+    asked = replace(asked, plan=replace(asked.plan, duration_s=350.0))
+    result = run_study(asked)
     slow = median(result, "change1_rise_y_icr_right_s", series="paper", value="not told")
     fast = median(result, "change1_rise_y_icr_right_s", series="field", value="inflated")
     assert 80.0 < slow < 160.0
@@ -100,7 +104,9 @@ def test_wider_turns_take_longer() -> None:
 
 def test_noise_matters_more_than_bias() -> None:
     errors = {
-        name: abs(median(run_study(request(name, 8, values=(0.5,), presets=("paper",))), "error_y_icr_right_m", value=0.5))
+        name: abs(
+            median(run_study(request(name, 8, values=(0.5,), presets=("paper",))), "error_y_icr_right_m", value=0.5)
+        )
         for name in ("input-noise", "input-bias")
     }
     assert errors["input-noise"] > 1.5 * errors["input-bias"]
@@ -116,7 +122,7 @@ def test_on_a_circle_a_bias_moves_both_icrs_by_bias_over_turn_rate() -> None:
 
 
 def test_gnss_noise_costs_accuracy() -> None:
-    result = run_study(request("gnss", 6, 120.0, values=(0.01, 0.3)))
+    result = run_study(request("gnss", 4, 120.0, values=(0.01, 0.3)))
     for preset in ("paper", "field"):
         good, bad = (median(result, "rms_y_icr_right_m", series=preset, value=value) for value in (0.01, 0.3))
         assert good < bad
@@ -124,7 +130,7 @@ def test_gnss_noise_costs_accuracy() -> None:
 
 
 def test_logs_of_any_rate_give_the_same_icrs_within_their_stated_doubt() -> None:
-    result = run_study(request("rate", 10, presets=("field",)))
+    result = run_study(request("rate", 6, presets=("field",)))
     for icr in ("y_icr_right", "y_icr_left", "x_icr"):
         means = [one["metrics"][f"error_{icr}_m"]["mean"] for one in result.levels]
         stated = [one["metrics"][f"std_{icr}_m"]["mean"] for one in result.levels]
@@ -133,7 +139,7 @@ def test_logs_of_any_rate_give_the_same_icrs_within_their_stated_doubt() -> None
 
 
 def test_a_proper_start_converges_and_an_unguarded_inverted_one_never() -> None:
-    result = run_study(request("initial", 4, 60.0, values=(1.0, -1.0)))
+    result = run_study(request("initial", 4, 30.0, values=(1.0, -1.0)))
 
     def share(guard: str, right: float, left: float) -> dict[str, Any]:
         return level(result, series=guard, start_y_icr_right_m=right, start_y_icr_left_m=left)

@@ -93,9 +93,7 @@ def test_the_covariance_at_a_stop_is_that_of_a_run_that_ends_there() -> None:
     out = study.run_batch(batch, PARAMETERS)
     data = single(batch, 1)
     data = data._replace(wheel_t=data.wheel_t[:251], v_left=data.v_left[:251], v_right=data.v_right[:251])
-    np.testing.assert_array_equal(
-        out.P[1, 0], run_filter(data, 0.0, batch.x0[1], full(batch.P0), PARAMETERS).P
-    )
+    np.testing.assert_array_equal(out.P[1, 0], run_filter(data, 0.0, batch.x0[1], full(batch.P0), PARAMETERS).P)
 
 
 @pytest.mark.parametrize("icrs", [(0.6, -0.6, 0.0), (-0.5, 0.4, 0.1)])
@@ -129,9 +127,7 @@ def unguarded_step(x: np.ndarray, v_left: float, v_right: float, dt: float) -> n
 @pytest.mark.parametrize(("guard", "step"), [(study.UNGUARDED, unguarded_step), (study.GUARDED, step_state)])
 def test_a_guards_covariance_is_propagated_with_its_own_derivatives(guard, step, icrs) -> None:
     x = np.array([3.0, -2.0, 0.7, *icrs])
-    F = np.column_stack(
-        [np.imag(step(x + 1j * 1e-30 * np.eye(6)[i], 0.31, 0.52, 0.01)) / 1e-30 for i in range(6)]
-    )
+    F = np.column_stack([np.imag(step(x + 1j * 1e-30 * np.eye(6)[i], 0.31, 0.52, 0.01)) / 1e-30 for i in range(6)])
     A = np.random.default_rng(1).normal(size=(6, 6))
     P = (A @ A.T)[np.triu_indices(6)]
     moved = x.copy()
