@@ -173,7 +173,12 @@ class SqliteBag:
             after, step = after + step, 2 * step
 
     def _rows_cut_off(self) -> frozenset[int]:
-        """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it."""
+        """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it.
+
+        Notes
+        -----
+        A message that is longer than a page and has its tail there is not found; what is needed is shorter.
+        """
         size = self._path.stat().st_size
         with self._path.open("rb") as stream:
             # The field has two bytes, and 1 stands for 65536.

@@ -452,9 +452,9 @@ def test_what_survives_is_used_and_what_was_lost_is_a_warning(run, case):
 
 
 @pytest.mark.parametrize("options", [{}, {"container": "db3", "compression": "zstd-file"}], ids=["mcap", "db3.zstd"])
-def test_an_interrupted_run_leaves_nothing_behind(tmp_path, options):
-    finished = 0
-    for turn, seconds in enumerate((0.7, 1.2, 1.7)):
+def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, options):
+    stopped = 0
+    for turn, seconds in enumerate((0.4, 1.0, 1.6)):
         folder = tmp_path / str(turn)
         folder.mkdir()
         path = log(folder, drive(120), **options)
@@ -463,10 +463,10 @@ def test_an_interrupted_run_leaves_nothing_behind(tmp_path, options):
             time.sleep(seconds)
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=120)
-        finished += process.returncode == 0
         after = set(listing(folder)) - set(before)
-        if process.returncode == 0:
-            assert {Path(name).parts[0] for name in after} == {"icrtool-runs"}
-        else:
-            assert after == set()
-    assert finished < 3
+        files = {"icrtool-runs/drive/run.json", "icrtool-runs/drive/states.csv", "icrtool-runs/drive/SHA256SUMS"}
+        # The signal may come between the last rename and the last line of output.
+        assert after in (set(), {"icrtool-runs", "icrtool-runs/drive", *files})
+        assert after or process.returncode != 0
+        stopped += not after
+    assert stopped > 0

@@ -1,4 +1,4 @@
-"""Logs that nobody here tuned, where they are present: recorded robots, rigid-body simulated ones, foreign containers."""
+"""Logs that nobody here tuned, where they are present: recorded and simulated robots, foreign containers."""
 
 from __future__ import annotations
 
