@@ -16,7 +16,9 @@ class IcrToolError(Exception):
         self.what = what
         self.why = why
         self.advice = advice
-        super().__init__(f"{what}: {why}; {advice}" if advice else f"{what}: {why}")
+        text = f"{what}: {why}; {advice}" if advice else f"{what}: {why}"
+        # Names come from logs: whatever they hold, an error is one line that a terminal can show.
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in text))
 
 
 class ConfigError(IcrToolError):

@@ -187,10 +187,6 @@ def dropout(
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
-    Returns
-    -------
-    DropoutReport
-
     Raises
     ------
     DataError

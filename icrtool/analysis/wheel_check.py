@@ -23,6 +23,9 @@ all along the way: one that comes and goes is slip, or held samples, and no radi
 CLEAR_CORRELATION = 0.5
 SMALLEST_TURN_RAD = math.radians(20.0)
 MOSTLY_BACKWARDS = 0.8
+LONGEST_DRIVE_NS = 30 * 86_400 * 1_000_000_000
+"""A month: stamps further apart are damaged, and seconds between them would fill the memory."""
+
 NEVER_MOVES_SHARE = 0.02
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
@@ -170,6 +173,8 @@ def _turns(log: RobotLog) -> tuple[Floats, Floats]:
     """Return, over seconds, how far the heading turned [rad] and how far left went ahead of right [m]."""
     wheels, heading = log.wheels, log.heading
     begin, end = max(wheels.stamp_ns[0], heading.stamp_ns[0]), min(wheels.stamp_ns[-1], heading.stamp_ns[-1])
+    if end - begin > LONGEST_DRIVE_NS:
+        return np.empty(0), np.empty(0)
     edges = np.arange(begin, end, 1_000_000_000)
     interval = np.diff(wheels.stamp_ns) / 1e9
     ahead = np.concatenate([[0.0], np.cumsum((wheels.v_left_mps - wheels.v_right_mps)[:-1] * interval)])

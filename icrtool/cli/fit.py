@@ -59,7 +59,7 @@ def command(
     warm_start: Path | None, changes: tuple[float, ...], smooths: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    r"""Learn the track ICRs of a robot from its logs, and write a run directory per log.
+    """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
     robot.wheel_radius_m=… tell what the messages do not.
@@ -68,7 +68,7 @@ def command(
     Example:
       icrtool fit field.mcap --robot husky-a200
       icrtool fit log.bag --set topics.gnss=/rtk/fix -o runs/today
-    """
+    """  # noqa: D301 - click reads the escape
     from icrtool.errors import IcrToolError
 
     config = options.load(config_file, robot, sets)

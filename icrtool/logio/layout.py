@@ -33,6 +33,8 @@ _SIZES = {
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
 _STRING_COLUMNS = 3
+LONGEST_UNROLLED = 4096
+"""A fixed array of which elements are taken is no longer than this: a covariance has 36."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +95,8 @@ def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
     if kind == "float64":
         return np.ascontiguousarray(raw).view(np.float64)
     if kind == "float32":
-        return np.ascontiguousarray(raw.astype(np.uint32)).view(np.float32).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
+            return np.ascontiguousarray(raw.astype(np.uint32)).view(np.float32).astype(np.float64)
     if kind.startswith("int"):
         width = _SIZES[kind]
         return np.ascontiguousarray(raw.astype(f"u{width}")).view(f"i{width}").astype(np.int64)
@@ -160,7 +163,12 @@ class _Compiler:
     def _numbers(self, path: str, kind: str, fixed: int | None, loop: tuple[int, int, int]) -> None:
         """Write an array (fixed length) or sequence of numbers."""
         size, starred = _SIZES[kind], f"{path}[*]"
-        if fixed is not None and starred not in self._wanted:
+        elements = any(name.startswith(f"{path}[") for name in self._wanted)
+        if fixed is not None and not elements:
+            self._skip(size, fixed)
+        elif fixed is not None and starred not in self._wanted:
+            if fixed > LONGEST_UNROLLED:
+                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             for i in range(fixed):
                 element = f"{path}[{i}]"
                 if element in self._wanted:
@@ -168,6 +176,8 @@ class _Compiler:
                 else:
                     self._skip(size, 1)
         elif fixed is not None:
+            if fixed > LONGEST_UNROLLED:
+                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             column = self._reserve(fixed)
             self._emit(TAKE, size, fixed, column)
             self.slots[starred] = Slot(kind, column, fixed, 1, -1)

@@ -42,7 +42,7 @@ class StampedRows:
 def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     """Judge the header stamps of a topic: non-zero, near log time, increasing."""
     log_ns = table.log_time_ns
-    if f"{path}.sec" not in table.columns or not len(log_ns):
+    if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
     header = table.columns[f"{path}.sec"] * 1_000_000_000 + table.columns[f"{path}.nanosec"]
     zeros = np.count_nonzero(header == 0)

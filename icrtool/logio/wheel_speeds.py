@@ -18,6 +18,9 @@ LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
 """The reference's way is held against the wheels' over straight windows of this length."""
 
+FASTEST_MPS = 100.0
+"""No robot on wheels or tracks is faster: a number over it is damage, and would make a way of any length."""
+
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
@@ -64,11 +67,20 @@ def wheel_samples(
         raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     if is_position:
         interval = np.diff(stamps) / 1e9
-        left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
+        with np.errstate(over="ignore"):
+            left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
         left[-1], right[-1] = left[-2], right[-2]
     factor, how = _metres_per_unit(motion, unit, stamps, left, right, gnss, config)
-    left = left * factor * _side_scale(config.wheels.left_scale)
-    right = right * factor * _side_scale(config.wheels.right_scale)
+    with np.errstate(over="ignore"):
+        left = left * factor * _side_scale(config.wheels.left_scale)
+        right = right * factor * _side_scale(config.wheels.right_scale)
+    possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
+    if not possible.all():
+        count = np.count_nonzero(~possible)
+        warnings.append(f"{log_name}: {motion.topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out")
+        stamps, left, right = stamps[possible], left[possible], right[possible]
+    if len(stamps) < 2:
+        raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     samples = WheelSamples(stamps, left, right)
     quantity = "position" if is_position else "speed"
     return samples, f"{quantity}{how}", warnings
@@ -83,7 +95,10 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     """Compare the reference's way with the wheels' over straight windows; None where too few are straight."""
     if len(gnss.stamp_ns) < 2:
         return None
-    edges = np.arange(max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9))
+    begin, end, window = max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9)
+    inside = gnss.stamp_ns[(gnss.stamp_ns >= begin) & (gnss.stamp_ns < end)]
+    # Only windows that a fix begins: one stamp that is years off would make billions of them.
+    edges = begin + window * np.unique((inside - begin) // window)
     if len(edges) < 2:
         return None
     places = np.searchsorted(gnss.stamp_ns, edges)
