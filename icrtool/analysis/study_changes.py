@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.analysis.paths import PathPlan
 from icrtool.analysis.simulate import Icrs
-from icrtool.analysis.study import Finding, StudyRequest, StudyResult
+from icrtool.analysis.study import Finding, StudyRequest, StudyResult, statistics
 from icrtool.analysis.study_measures import ICR_NAMES, inverted, measure_times, trace
 from icrtool.analysis.study_runs import Chunk, Progress
 from icrtool.analysis.study_sweeps import Level, base_scenario, run_levels, spread
@@ -67,7 +67,9 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
             Finding(f"{level.series}, {level.value}: 10-90 % rise", spread(rises), "s", paper),
             Finding(f"{level.series}, {level.value}: all three stay within 10 % after", spread(settles), "s"),
             Finding(
-                f"{level.series}, {level.value}: … of the changes", (100 * float(np.isfinite(settles).mean()),), "%"
+                f"{level.series}, {level.value}: … in so many of the changes",
+                (100 * float(np.isfinite(settles).mean()),),
+                "%",
             ),
             Finding(f"{level.series}, {level.value}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
         ]
@@ -114,11 +116,11 @@ def study_turn_radius(request: StudyRequest, progress: Progress | None) -> Study
     for level, one in zip(levels, found, strict=True):
         if level.value in (min(request.values), max(request.values)):
             paper = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}.get(float(level.value), "")
-            rises = np.concatenate([one[f"rise_{icr}_s"] for icr in ICR_NAMES])
+            settles = np.concatenate([one[f"settle_{icr}_s"] for icr in ICR_NAMES])
             label = f"{level.series}: radius {level.value:g} m"
             findings += [
-                Finding(f"{label}: 10-90 % rise, mean", (float(np.nanmean(rises)),), "s", paper),
-                Finding(f"{label}: all three stay within 10 % after", spread(one["settle_s"]), "s"),
+                Finding(f"{label}: an ICR stays within 10 % after, mean", (statistics(settles)["mean"],), "s", paper),
+                Finding(f"{label}: all three do", spread(one["settle_s"]), "s"),
                 Finding(f"{label}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
             ]
     return StudyResult(request, columns, records, tuple(findings))

@@ -172,7 +172,7 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
         name = level["series"]
         for what in ("nees", "nis_gnss", "nis_heading"):
             low, high = level[what]["band"]
-            expected = f"{level[what]['expected']:g} expected, {low:.3f}-{high:.3f} in 95 %"
+            expected = f"{level[what]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
             findings.append(Finding(f"{name}: {WORDS[what]}, mean", (level[what]["mean"],), "", expected))
             findings.append(Finding(f"{name}: {WORDS[what]}, median run", (level["by_run"][what]["p50"],), ""))
         covered = level["coverage_pct"]
@@ -181,7 +181,7 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
                 f"{name}: pose within 2 sigma, least and most",
                 (min(covered[:3]), max(covered[:3])),
                 "%",
-                "95.4 expected",
+                "95.4 %",
             )
         )
         findings.append(
@@ -189,7 +189,7 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
                 f"{name}: ICRs within 2 sigma, least and most",
                 (min(covered[3:]), max(covered[3:])),
                 "%",
-                "95.4 expected",
+                "95.4 %",
             )
         )
     return findings

@@ -50,7 +50,7 @@ def draw_initial(result: StudyResult) -> Figure:
         axes.set_xlabel("Initial y left [m]")
         _draw_curves(panels[1][column], curves[f"trace {name}"], request.plan.icrs_m[0])
     panels[0][0].set_ylabel("Initial y right [m]")
-    panels[1][0].set_ylabel(f"y right [m], from y left {near:g} m")
+    panels[1][0].set_ylabel(f"y right [m] (y left {near:g})")
     keys = [Patch(color=color, label=fate) for fate, color in FATES.items()]
     figure.legend(
         handles=keys, loc="lower center", ncols=3, title="share of the runs; above the dashed line the start is proper"

@@ -41,7 +41,7 @@ def format_study(result: StudyResult) -> str:
         "",
     ]
     lines += [*_level_lines(result), ""] if request.name in SHOWN else []
-    lines += _finding_lines(result.findings)
+    lines += _finding_lines(result.findings, "expected" if request.name == "consistency" else "paper")
     return "\n".join(line.rstrip() for line in lines)
 
 
@@ -75,8 +75,8 @@ def _cell(name: str, told: dict[str, Any], runs: int) -> str:
     return f"{told['p50']:{form}} [{told['p5']:{form}}, {told['p95']:{form}}]{never}"
 
 
-def _finding_lines(findings: tuple[Finding, ...]) -> list[str]:
-    rows = [("", "ours", "paper"), *((one.what, finding_text(one), one.paper) for one in findings)]
+def _finding_lines(findings: tuple[Finding, ...], beside: str) -> list[str]:
+    rows = [("", "ours", beside), *((one.what, finding_text(one), one.paper) for one in findings)]
     first, second = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
     return [f"{what:<{first}}  {ours:<{second}}  {paper}" for what, ours, paper in rows]
 

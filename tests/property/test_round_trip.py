@@ -1,4 +1,4 @@
-"""Round trips: what `icrtool simulate` records, `icrtool fit` reads like any log, and finds the ICRs it was made with."""
+"""Round trips: what `icrtool simulate` records, `icrtool fit` reads like any log, and finds the ICRs it was made of."""
 
 from __future__ import annotations
 
