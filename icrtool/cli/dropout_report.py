@@ -256,6 +256,7 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
     from icrtool.analysis.dropout import dropout
     from icrtool.analysis.gates import budget_distances, judge_gate
     from icrtool.analysis.outages import real_outages
+    from icrtool.analysis.turning import split_by_turning
     from icrtool.report.dropout_content import DropoutContent, title_of
     from icrtool.report.dropout_directory import dropout_directory, write_content
     from icrtool.report.dropout_drawing import draw_histograms, draw_paths, draw_summary
@@ -284,6 +285,7 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
             worst=worst,
             examples=examples,
             outages=outages,
+            by_turning=split_by_turning(run),
         )
         write_content(content, partial)
     return content

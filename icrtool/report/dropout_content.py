@@ -11,6 +11,7 @@ from icrtool.analysis.blind_paths import BlindDrive
 from icrtool.analysis.dropout import DrivenRun, DropoutReport, ModelResult
 from icrtool.analysis.gates import BudgetDistance, Verdict
 from icrtool.analysis.outages import Outage
+from icrtool.analysis.turning import TurningSplit
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
@@ -27,6 +28,7 @@ class DropoutContent:
     worst : largest error first
     examples : a cornering and a straight drive; empty where no trial is that long
     outages : forced ones, then real ones
+    by_turning : straight and turning trials apart
     """
 
     title: str
@@ -37,6 +39,7 @@ class DropoutContent:
     worst: tuple[BlindDrive, ...]
     examples: tuple[BlindDrive, ...]
     outages: tuple[Outage, ...]
+    by_turning: tuple[TurningSplit, ...] = ()
 
     @property
     def passed(self) -> bool:

@@ -88,6 +88,7 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         "models": [_model_document(result, report) for result in report.results],
         "trials": _count_documents(report),
         "budgets": [one._asdict() for one in content.budgets],
+        "by_turning": [one._asdict() for one in content.by_turning],
         "gates": [
             {
                 **asdict(verdict.gate),

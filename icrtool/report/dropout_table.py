@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from icrtool.analysis.dropout import DropoutReport, ModelResult
 from icrtool.analysis.gates import BudgetDistance
 from icrtool.analysis.outages import Outage
+from icrtool.analysis.turning import TurningSplit
 from icrtool.report.dropout_content import DropoutContent, p95_at, shown_horizons
 from icrtool.report.words import duration_text, way_text
 
@@ -27,6 +28,7 @@ def format_dropout(content: DropoutContent) -> str:
     lines = [content.title, f"blind with wheel speeds only, from each of {report.states:,} states; {way}", ""]
     lines += _error_lines(report)
     lines += ["", *_count_lines(report)]
+    lines += [_turning_line(one) for one in content.by_turning]
     lines += ["", *budget_lines(content.budgets)]
     if content.outages:
         lines += ["", *_outage_lines(content.outages, report)]
@@ -96,6 +98,13 @@ def _ratio_lines(icr: ModelResult, no_slip: ModelResult, shown: Sequence[int]) -
         lead = "no slip : ICR" if label == "95 %" else ""
         lines.append(_row(f"{lead:<{MODEL}} {label}", [ratio_text(*pair) for pair in pairs]))
     return lines
+
+
+def _turning_line(split: TurningSplit) -> str:
+    kind = "straight" if split.straight else "turning"
+    labels = {"icr": "ICR", "no_slip": "no slip"}
+    errors = ", ".join(f"{labels[name]} {metres_text(error)}" for name, error in split.expected_m.items())
+    return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
 
 
 def _count_lines(report: DropoutReport) -> list[str]:

@@ -93,7 +93,9 @@ def draw_sweep(result: StudyResult) -> Figure:
             axes.minorticks_off()
     if result.request.name == "gnss":
         for axes in panels.ravel():
-            axes.set_yscale("log")
+            # On a drive without a turn nothing is missed, and zero has no logarithm.
+            if all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
+                axes.set_yscale("log")
     figure.legend(handles=_keys(result), loc="lower center", ncols=5, columnspacing=1.6, handlelength=2.4)
     return figure
 

@@ -50,7 +50,8 @@ def test_the_same_seed_gives_the_same_study(tmp_path: Path) -> None:
 
 def test_options_put_ones_own_robot_and_sensors_in(tmp_path: Path) -> None:
     study(
-        "convergence", "-o", tmp_path / "own", *SMALL, "--robot", "husky-a200", "--path", "spins", "--wheels", "encoder",
+        "convergence", "-o", tmp_path / "own", *SMALL, "--robot", "husky-a200", "--path", "spins",
+        "--wheels", "encoder",
         "--gnss", "waas", "--heading-std", 2, "--rate", 50, "--preset", "field", "--speed", 0.6, "--input-noise", 0.01,
     )  # fmt: skip
     told = settings(tmp_path / "own")

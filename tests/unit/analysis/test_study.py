@@ -113,7 +113,7 @@ def test_noise_matters_more_than_bias() -> None:
 
 
 def test_on_a_circle_a_bias_moves_both_icrs_by_bias_over_turn_rate() -> None:
-    """Closed form: v_x too large by the bias at a constant turn rate is a centre of rotation shifted by it over omega."""
+    """Closed form: v_x too large by the bias at one turn rate is a centre of rotation shifted by it over omega."""
     asked = request("input-bias", 6, 100.0, values=(0.02,), presets=("paper",))
     asked = replace(asked, plan=replace(asked.plan, path=PathPlan("circle", speed_mps=0.4, radius_m=1.0)))
     result = run_study(asked)

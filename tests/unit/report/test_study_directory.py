@@ -26,11 +26,11 @@ PNG = b"\x89PNG"
 
 def small(name, robot: str | None = None) -> StudyResult:
     request = default_request(name, load_config(robot=robot) if robot else Config())
-    values = {"initial": (1.0, -1.0), "convergence": ()}.get(name, request.values[:2])
+    settings = (1.0, -1.0) if name == "initial" else request.values[:2]  # noqa: PD011 - the values of a study, no pandas
     plan = replace(request.plan, duration_s={"turn-radius": 25.0, "gnss": 40.0}.get(name, 12.0))
     if name == "icr-change":
         plan = replace(plan, changes=((4.0, (0.7, -0.6, 0.0)), (8.0, (0.5, -0.7, 0.1))))
-    return run_study(replace(request, runs=2, values=values, paths=request.paths[:2], plan=plan))
+    return run_study(replace(request, runs=2, values=settings, paths=request.paths[:2], plan=plan))
 
 
 @pytest.mark.parametrize("name", STUDY_NAMES)
