@@ -67,7 +67,11 @@ def values_text(text: str) -> tuple[float, ...]:
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed; the same seed, the same numbers."
 )
 @click.option("--values", metavar="V,V,...", type=values_text, help="Settings of what the study varies, in its unit.")
-@click.option("--preset", type=click.Choice(["paper", "field"]), help="Study this filter preset alone.")
+@click.option(
+    "--preset",
+    type=click.Choice(["paper", "field"]),
+    help="Study this preset alone; default both; initial: paper; convergence: paper, field with a robot.",
+)
 @click.option(
     "--icrs",
     metavar="YR,YL,X",
@@ -171,6 +175,8 @@ def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyReq
     preset = given["preset"]
     if preset is None and "preset" in config.filter.model_fields_set:
         preset = config.filter.preset
+    if preset is None and name == "convergence" and config.robot.track_width_m is not None:
+        preset = "field"
     if preset is not None:
         changed["presets"] = (preset,)
     return replace(request, **changed, **_given({"runs": given["runs"], "values": given["values"]}))

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+
+_BLAS = "scipy.linalg.cython_blas"
+if _BLAS not in sys.modules:
+    # numba looks for scipy's BLAS when its array functions are loaded, which takes longer than to load all the rest of
+    # it. No kernel of ours multiplies matrices; numba finds it again when someone else's does.
+    sys.modules[_BLAS] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        del sys.modules[_BLAS]
 
 
 def njit(function: Kernel) -> Kernel:
@@ -19,10 +31,12 @@ def njit(function: Kernel) -> Kernel:
     writable (read-only containers, CI sandboxes). The kernel then compiles in memory, once a process.
     ``error_model="numpy"`` makes a division by zero an inf, as in the NumPy twins, and lets loops vectorise.
     ``nogil=True`` lets the next piece of a log be read and decompressed while a kernel runs.
+    ``no_cfunc_wrapper``: none of our kernels is handed to C, and the wrapper for that takes time to compile.
     The plain Python function stays reachable as ``.py_func``.
     """
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     try:
-        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+        dispatcher = numba.njit(**options)(function)
     return cast(Kernel, dispatcher)

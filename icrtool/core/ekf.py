@@ -13,7 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.core.compiled import njit
-from icrtool.core.ekf_step import DIAGONAL, Floats, correct, icr_column, measured_column, predict, wrap
+from icrtool.core.ekf_step import (
+    DIAGONAL,
+    EAST,
+    HEADING,
+    NORTH,
+    Floats,
+    correct,
+    measured_column,
+    predict,
+    wrap,
+)
 
 Codes = NDArray[np.uint8]
 
@@ -136,7 +146,7 @@ def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
         for place, bound in ((3, least), (4, -least)):
             beyond = bound - x[place]
             if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
-                variance = icr_column(P, place, PH)
+                variance = measured_column(P, place, 0.0, PH)
                 for i in range(6):
                     x[i] += PH[i] / variance * beyond
 
@@ -162,8 +172,8 @@ def take_fix(
     """
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
     nu_n, nu_e = z_n - x[0] - a_n, z_e - x[1] - a_e
-    S_ee = measured_column(P, 1, a_n, PH) + r_e
-    S_nn = measured_column(P, 0, -a_e, PH) + r_n
+    S_ee = measured_column(P, EAST, a_n, PH) + r_e
+    S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
     S_ne = PH[1] + a_n * PH[2]
     nis = (S_ee * nu_n * nu_n - 2.0 * S_ne * nu_n * nu_e + S_nn * nu_e * nu_e) / (S_nn * S_ee - S_ne * S_ne)
     code = USED
@@ -172,14 +182,14 @@ def take_fix(
             code = RECOVERED
             P[0] += nu_n * nu_n
             P[6] += nu_e * nu_e
-            S_nn = measured_column(P, 0, -a_e, PH) + r_n
+            S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
         else:
             code = GATED
     if code != GATED:
         run[0] = 0.0
         E, psi = x[1], x[2]
         correct(x, P, PH, S_nn, nu_n)
-        S_ee = measured_column(P, 1, a_n, PH) + r_e
+        S_ee = measured_column(P, EAST, a_n, PH) + r_e
         correct(x, P, PH, S_ee, nu_e - (x[1] - E) - a_n * (x[2] - psi))
         keep_sides(x, P, PH, parameters.least_icr)
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
@@ -208,7 +218,7 @@ def take_heading(
             code = GATED
     if code != GATED:
         run[0] = 0.0
-        S = measured_column(P, 2, 0.0, PH) + r * parameters.heading_correlation
+        S = measured_column(P, HEADING, 0.0, PH) + r * parameters.heading_correlation
         correct(x, P, PH, S, nu)
         keep_sides(x, P, PH, parameters.least_icr)
     return code, nis, nu

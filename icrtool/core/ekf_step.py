@@ -9,6 +9,7 @@ The sums are written out: loops over a 6 x 6 array take three times as long.
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,15 @@ from icrtool.core.kinematics import body_velocity, icr_separation
 
 Floats = NDArray[np.float64]
 
+NORTH, EAST, HEADING = (cast(int, np.int64(axis)) for axis in range(3))
+"""What is measured. With a type: of a function that is called with a plain number numba compiles a copy for it."""
+
 DIAGONAL = (0, 6, 11, 15, 18, 20)
 """Places of the variances in P."""
+
+PLACES = np.empty((6, 6), np.int64)
+PLACES[np.triu_indices(6)] = PLACES.T[np.triu_indices(6)] = np.arange(21)
+"""Places of the entries of the whole matrix in P."""
 
 
 @njit
@@ -94,34 +102,13 @@ def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float) -> f
 
 @njit
 def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
-    """Fill PH (6,) = P H^T and return H P H^T, for H = e_axis + h_psi e_psi.
-
-    `axis` is 0 (north), 1 (east) or 2 (heading, with h_psi = 0).
-    """
-    if axis == 0:
-        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[0], P[1], P[2], P[3], P[4], P[5]
-    elif axis == 1:
-        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[1], P[6], P[7], P[8], P[9], P[10]
-    else:
-        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[2], P[7], P[11], P[12], P[13], P[14]
+    """Fill PH (6,) = P H^T and return H P H^T, for H = e_axis + h_psi e_psi; h_psi is 0 unless the axis is N or E."""
+    for i in range(6):
+        PH[i] = P[PLACES[axis, i]]
     if h_psi != 0.0:
-        PH[0] += h_psi * P[2]
-        PH[1] += h_psi * P[7]
-        PH[2] += h_psi * P[11]
-        PH[3] += h_psi * P[12]
-        PH[4] += h_psi * P[13]
-        PH[5] += h_psi * P[14]
+        for i in range(6):
+            PH[i] += h_psi * P[PLACES[HEADING, i]]
     return float(PH[axis] + h_psi * PH[2])
-
-
-@njit
-def icr_column(P: Floats, axis: int, PH: Floats) -> float:
-    """Fill PH (6,) with the column of P that belongs to y_icr_right (axis 3) or y_icr_left (4); return the variance."""
-    if axis == 3:
-        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[3], P[8], P[12], P[15], P[16], P[17]
-    else:
-        PH[0], PH[1], PH[2], PH[3], PH[4], PH[5] = P[4], P[9], P[13], P[16], P[18], P[19]
-    return float(PH[axis])
 
 
 @njit

@@ -74,13 +74,15 @@ class Layout:
     def numbers(self, table: NDArray[np.uint64], path: str) -> NDArray[Any]:
         """Return a numeric field: (n,) or, for an array, (n, longest) with what a message lacks as NaN or 0."""
         slot = self.slots[path]
+        if "[*]" not in path:
+            return _typed(table[:, slot.column], slot.kind)
         counts = self.counts(table, path)
-        repeat = min(slot.repeat, int(counts.max(initial=0))) if "[*]" in path else 1
+        repeat = min(slot.repeat, int(counts.max(initial=0)))
         values = _typed(table[:, slot.column : slot.column + repeat * slot.stride : slot.stride], slot.kind)
-        if slot.count_column >= 0:
+        if counts.min(initial=repeat) < repeat:
             lacking = np.arange(repeat) >= counts[:, None]
-            values = np.where(lacking, np.nan if values.dtype.kind == "f" else 0, values).astype(values.dtype)
-        return values if "[*]" in path else values[:, 0]
+            values[lacking] = np.nan if values.dtype.kind == "f" else 0
+        return values
 
     def counts(self, table: NDArray[np.uint64], path: str) -> Ints:
         """Return how many elements of an array each message holds (n,)."""
@@ -91,15 +93,15 @@ class Layout:
 
 
 def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
-    """Give raw 64-bit words their meaning: float64 or int64."""
+    """Give raw 64-bit words their meaning: a new array of float64 or int64."""
     if kind == "float64":
-        return np.ascontiguousarray(raw).view(np.float64)
+        return raw.copy("K").view(np.float64)
     if kind == "float32":
         with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
-            return np.ascontiguousarray(raw.astype(np.uint32)).view(np.float32).astype(np.float64)
+            return raw.astype(np.uint32).view(np.float32).astype(np.float64)
     if kind.startswith("int"):
         width = _SIZES[kind]
-        return np.ascontiguousarray(raw.astype(f"u{width}")).view(f"i{width}").astype(np.int64)
+        return raw.astype(f"u{width}").view(f"i{width}").astype(np.int64)
     return raw.astype(np.int64)
 
 

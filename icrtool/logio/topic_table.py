@@ -12,11 +12,14 @@ from icrtool.errors import DefinitionError
 from icrtool.logio.channel import Block, Channel
 from icrtool.logio.definitions import definitions_of
 from icrtool.logio.layout import Definitions, Layout, compile_layout
-from icrtool.logio.walk import walk_messages
+from icrtool.logio.walk import empty_table, walk_into
 from icrtool.tables import Ints
 
 _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
+
+_ROWS_AT_ONCE = 16_384 + 8
+"""Not a power of two: the columns would be such a distance apart, and fall on the same few lines of the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +93,30 @@ class TopicTable:
 
 
 @dataclass(slots=True)
+class _Rows:
+    """Walked messages of one layout, not columns yet: some thousand at a time are turned into columns.
+
+    Attributes
+    ----------
+    table : (rows, columns) as `walk` fills it; times_ns, readable, walked : (rows,)
+    filled : rows in use
+    """
+
+    table: NDArray[np.uint64] = field(default_factory=lambda: np.empty((0, 0), np.uint64))
+    times_ns: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    readable: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    walked: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    filled: int = 0
+
+    @classmethod
+    def empty(cls, layout: Layout, rows: int) -> _Rows:
+        """Return an empty table of so many rows."""
+        return cls(
+            empty_table(layout, rows), np.empty(rows, np.int64), np.empty(rows, np.bool_), np.empty(rows, np.bool_)
+        )
+
+
+@dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
 
@@ -106,6 +133,7 @@ class TopicCollector:
     _capacity: int = _FIRST_CAPACITY
     _layout: Layout | None = None
     _source: str = ""
+    _rows: _Rows = field(default_factory=_Rows)
     _times: list[Ints] = field(default_factory=list)
     _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
     _texts: dict[str, dict[int, str]] = field(default_factory=dict)
@@ -133,42 +161,78 @@ class TopicCollector:
 
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
-        start, end = block.start[chosen], block.end[chosen]
-        table, readable = walk_messages(self.layout, block.data, start, end)
-        told = table if readable.all() else table[readable]
-        most = max((int(told[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
+        start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
+        new = self._walk(block, start, end, times)
+        most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
         if self._capacity < min(most, self.largest_capacity):
-            self._capacity = min(most, self.largest_capacity)
+            self._settle()
+            self._rows, self._capacity = _Rows(), min(most, self.largest_capacity)
             self._compile()
-            table, readable = walk_messages(self.layout, block.data, start, end)
-            told = table if readable.all() else table[readable]
-        self._unreadable += len(table) - len(told)
-        self._times.append(block.log_time_ns[chosen][readable])
+            new = self._walk(block, start, end, times)
         for path, slot in self.layout.slots.items():
-            values = self._codes(path, told, block) if slot.kind == "string" else self.layout.numbers(told, path)
-            self._parts.setdefault(path, []).append(values)
+            if slot.kind == "string":
+                self._learn_texts(path, new, block)
+        self._rows.filled += len(start)
 
-    def _codes(self, path: str, table: NDArray[np.uint64], block: Block) -> NDArray[np.uint64]:
-        """Return the hashes of a text field (n,) or (n, k); learn the texts that are new."""
-        slot = self.layout.slots[path]
-        texts = self._texts.setdefault(path, {})
-        columns = []
-        counts = self.layout.counts(table, path)
+    def _walk(self, block: Block, start: Ints, end: Ints, times_ns: Ints) -> NDArray[np.uint64]:
+        """Walk messages into the rows behind the filled ones; return those rows that are not like the one before."""
+        if self._rows.filled + len(start) > len(self._rows.table):
+            self._settle()
+        if len(start) > len(self._rows.table):
+            self._rows = _Rows.empty(self.layout, max(len(start), _ROWS_AT_ONCE))
+        rows = slice(self._rows.filled, self._rows.filled + len(start))
+        table, readable, walked = self._rows.table[rows], self._rows.readable[rows], self._rows.walked[rows]
+        walk_into(self.layout, block.data, start, end, table, readable, walked)
+        self._rows.times_ns[rows] = times_ns
+        return table[readable & walked]
+
+    def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
+        """Learn the texts of a text field that are in some rows and were not seen before."""
+        slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
+        counts = self.layout.counts(new, path)
         for i in range(min(slot.repeat, int(counts.max(initial=0)))):
-            at = slot.column + i * slot.stride
-            codes = np.where(counts > i, table[:, at + 2], np.uint64(0))
-            for code in np.unique(codes) if len(codes) and np.any(codes != codes[0]) else codes[:1]:
-                if code and int(code) not in texts:
-                    row = int(np.argmax(codes == code))
-                    first, length = int(table[row, at]), int(table[row, at + 1])
-                    texts[int(code)] = block.data[first : first + length].tobytes().decode("utf-8", "replace")
-            columns.append(codes)
-        if "[*]" not in path:
-            return columns[0] if columns else np.zeros(len(table), np.uint64)
-        return np.stack(columns, axis=1) if columns else np.zeros((len(table), 0), np.uint64)
+            told = new[counts > i, slot.column + i * slot.stride :]
+            codes, first = np.unique(told[:, 2], return_index=True)
+            for code, row in zip(codes.tolist(), first.tolist(), strict=True):
+                if code not in texts:
+                    place, length = int(told[row, 0]), int(told[row, 1])
+                    texts[code] = block.data[place : place + length].tobytes().decode("utf-8", "replace")
+
+    def _settle(self) -> None:
+        """Turn the filled rows into columns, and have them free again."""
+        rows, filled = self._rows, self._rows.filled
+        if not filled:
+            return
+        table, times_ns, readable = rows.table[:filled], rows.times_ns[:filled].copy(), rows.readable[:filled]
+        if not readable.all():
+            table, times_ns = table[readable], times_ns[readable]
+        self._unreadable += filled - len(table)
+        self._times.append(times_ns)
+        for path, slot in self.layout.slots.items():
+            take = self._text_numbers if slot.kind == "string" else self.layout.numbers
+            self._parts.setdefault(path, []).append(take(table, path))
+        rows.filled = 0
+
+    def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
+        """Return the numbers of a text field's texts (n,) or (n, k), in the order they were learned; -1 for none."""
+        slot, counts = self.layout.slots[path], self.layout.counts(table, path)
+        repeat = min(slot.repeat, int(counts.max(initial=0))) if "[*]" in path else 1
+        codes = table[:, slot.column + 2 :][:, : repeat * slot.stride : slot.stride]
+        lacking = np.arange(repeat) >= counts[:, None]
+        alike = bool((codes == codes[:1]).all() and (lacking == lacking[:1]).all())
+        if alike:
+            codes, lacking = codes[:1], lacking[:1]
+        known = np.fromiter(self._texts[path], np.uint64)
+        order = np.append(np.argsort(known), -1)
+        numbers = order[np.searchsorted(known, codes, sorter=order[:-1])]
+        numbers[lacking] = -1
+        if alike:
+            numbers = np.broadcast_to(numbers, (len(table), repeat))
+        return numbers if "[*]" in path else numbers[:, 0]
 
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
+        self._settle()
         times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
         self._times.clear()
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
@@ -177,10 +241,10 @@ class TopicCollector:
         unreadable, self._unreadable = self._unreadable, 0
         gathered, self._parts = self._parts, {}
         for path, parts in gathered.items():
-            values = _joined(parts)
+            values = _joined(parts, -1 if path in self._texts else 0)
             parts.clear()
             if path in self._texts:
-                values, texts[path] = _indexed(values, self._texts[path])
+                texts[path] = list(self._texts[path].values())
             columns[path] = values if order is None else values[order]
         return TopicTable(
             self.channel.topic,
@@ -234,11 +298,3 @@ def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
             for part in parts
         ]
     return np.concatenate(parts)
-
-
-def _indexed(codes: NDArray[np.uint64], texts: dict[int, str]) -> tuple[Ints, list[str]]:
-    """Turn hashes into indices of a list of texts; -1 where a message has no such element."""
-    indices = np.full(codes.shape, -1, np.int64)
-    for i, code in enumerate(texts):
-        indices[codes == np.uint64(code)] = i
-    return indices, list(texts.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -116,7 +116,7 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
     means: list[Floats | None] = []
     for places in (left, right):
         told = [place for place in places if np.isfinite(values[:, place]).any()]
-        means.append(values[:, told].astype(np.float64).mean(axis=1) if told else None)
+        means.append(values.T[told].astype(np.float64).mean(axis=0) if told else None)
     return means[0], means[1]
 
 
@@ -163,9 +163,9 @@ def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
 
     A mean over wheels that changes its members would jump.
     """
-    listed = np.zeros((len(wheels), lefts + rights), np.bool_)
-    rows, places = np.nonzero(wheels >= 0)
-    listed[rows, wheels[rows, places]] = True
+    listed = np.zeros((lefts + rights, len(wheels)), np.bool_).T
+    for rows, wheel, _ in _told_wheels(wheels):
+        listed[rows, wheel] = True
     both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
     sets = listed[both]
     if len(sets) and np.any(sets != sets[0]):
@@ -176,12 +176,22 @@ def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
 
 def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats:
     """Return what each message tells of each wheel (n, count), NaN where nothing."""
-    told = np.full((len(wheels), count), np.nan)
+    told = np.full((count, len(wheels)), np.nan).T
     if values is not None:
-        width = min(values.shape[1], wheels.shape[1])
-        rows, places = np.nonzero(wheels[:, :width] >= 0)
-        told[rows, wheels[rows, places]] = values[rows, places]
+        for rows, wheel, place in _told_wheels(wheels[:, : values.shape[1]]):
+            told[rows, wheel] = values[rows, place]
     return told
+
+
+def _told_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
+    """Yield rows, and the wheel, or that of each row, which they list at a place."""
+    for place, listed in enumerate(wheels.T):
+        if len(listed) and (listed == listed[0]).all():
+            if listed[0] >= 0:
+                yield slice(None), int(listed[0]), place
+        else:
+            rows = np.flatnonzero(listed >= 0)
+            yield rows, listed[rows], place
 
 
 def _by_name(paths: _Paths, score: float, what: str) -> Reader:

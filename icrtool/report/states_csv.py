@@ -146,6 +146,15 @@ def _format_rows(rows: dict[str, Floats | Ints], whole: frozenset[str]) -> memor
 
 
 def _arrow(columns: dict[str, Floats | Ints]) -> pa.Table:
+    """Return columns as an Arrow table that shares their memory; to convert them pyarrow would import pandas."""
     import pyarrow as pa
 
-    return pa.table({name: np.ascontiguousarray(values) for name, values in columns.items()})
+    arrays = {
+        name: pa.Array.from_buffers(
+            pa.int64() if name in INTEGER_COLUMNS else pa.float64(),
+            len(values),
+            [None, pa.py_buffer(np.ascontiguousarray(values))],
+        )
+        for name, values in columns.items()
+    }
+    return pa.table(arrays)

@@ -115,3 +115,10 @@ def test_a_place_that_holds_something_else_is_refused_before_any_work(
 
 def test_every_option_has_help() -> None:
     assert [one.name for one in command.params if one.name != "name" and not getattr(one, "help", None)] == []
+
+
+def test_with_ones_own_robot_convergence_is_that_of_the_tools_own_preset(tmp_path: Path) -> None:
+    study("convergence", "-o", tmp_path / "own", *SMALL, "--robot", "jackal", "--path", "spins")
+    study("convergence", "-o", tmp_path / "paper", *SMALL, "--path", "spins")
+    assert settings(tmp_path / "own")["presets"] == ["field"]
+    assert settings(tmp_path / "paper")["presets"] == ["paper"]

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from icrtool.core import simulate
 from icrtool.core.ekf_plain import step_state
+from icrtool.core.kinematics import body_velocity
 
 EXACT = 1e-9
 """Arcs are exact; what is left is rounding over some ten thousand steps [m, rad]."""
@@ -107,3 +108,12 @@ def test_kernels_equal_their_python_functions() -> None:
     again = (times, *arguments[:5], pose)
     np.testing.assert_allclose(simulate.poses_at(*again), simulate.poses_at.py_func(*again), rtol=1e-12, atol=1e-15)  # type: ignore[attr-defined]
     np.testing.assert_allclose(simulate.follow(v_left, t, 0.1), simulate.follow.py_func(v_left, t, 0.1), rtol=1e-12)  # type: ignore[attr-defined]
+
+
+def test_on_a_steady_circle_inverted_icrs_explain_the_motion_as_well_as_the_true_ones() -> None:
+    """Why the guard alone cannot bring an inverted filter back there (docs/paper.md, Fig. 10)."""
+    v_left, v_right = 0.6, 0.3
+    v_x, _, omega = body_velocity(v_left, v_right, 0.5, -0.75, -0.25)
+    width = 1.25
+    y_right = (v_x + v_right) * width / (v_left - v_right)
+    assert body_velocity(v_left, v_right, y_right, y_right + width, -0.25)[::2] == pytest.approx((v_x, omega))
