@@ -85,6 +85,25 @@ class HeadingSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class GyroSamples:
+    """Turn rates, clockwise positive.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rate_radps : float64 (n,)
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rate_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rate_radps)
+
+
+@dataclass(frozen=True, slots=True)
 class Datum:
     """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
 
@@ -134,6 +153,7 @@ class RobotLog:
     rejected_fixes : fixes dropped at the door by reason (``no fix``, ``not finite`` ...)
     warnings : sentences for the user, in the order they were found
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
+    gyro : turn rates of an inertial unit, None without one; the filter does not use them
     """
 
     name: str
@@ -146,6 +166,7 @@ class RobotLog:
     rejected_fixes: dict[str, int]
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] | None = None
+    gyro: GyroSamples | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.window_fit import CONSTANT, cut_windows, thin_windows, window_spacing_m
+from icrtool.analysis.window_solve import solve_windows
 from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
@@ -22,7 +25,7 @@ from icrtool.core.statistics import (
     summarise,
 )
 from icrtool.errors import ConfigError, DataError
-from icrtool.tables import Bools, Floats, Ints, States
+from icrtool.tables import Floats, Ints
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,40 +52,6 @@ STARTS_A_CALL = 1 << 15
 
 THREADS = 2
 """The kernels run beside each other; more threads would need more memory and find little more to do."""
-
-
-class DrivenRun(Protocol):
-    """A filter run, just made or read back: what the analysis needs of it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the log."""
-        ...
-
-    @property
-    def table(self) -> States:
-        """The recorded states."""
-        ...
-
-    @property
-    def in_gap(self) -> Bools:
-        """Whether the interval after a state is a gap in the wheel data (n,)."""
-        ...
-
-    @property
-    def outages_ns(self) -> Ints:
-        """Half-open spans without usable GNSS (k, 2)."""
-        ...
-
-    @property
-    def track_width_m(self) -> float | None:
-        """Distance b between the track centre lines, None where not given."""
-        ...
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What run.json holds, the effective configuration among it."""
-        ...
 
 
 class Model(NamedTuple):
@@ -183,7 +152,7 @@ def dropout(
     ----------
     run : a `FilterRun`, or a run read back from its directory
     horizons_m : distances driven blind, in any order; default those of the run's configuration
-    models : what to predict with; default `models_of` the run
+    models : what to predict with; default `judged_models` of the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -205,7 +174,7 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else models_of(run)
+    models = models if models is not None else judged_models(run)
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
     with ThreadPoolExecutor(THREADS) as pool:
@@ -263,7 +232,7 @@ def load_kernels() -> None:
 
 
 def models_of(run: DrivenRun) -> tuple[Model, ...]:
-    """Return the models to judge: momentary ICRs, no slip where b is known, the run's final ICRs."""
+    """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
     table = run.table
     models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
     width = run.track_width_m
@@ -274,24 +243,15 @@ def models_of(run: DrivenRun) -> tuple[Model, ...]:
     return tuple(models)
 
 
-def drive_of(run: DrivenRun) -> Drive:
-    """Return the run's states as the kernels want them."""
-    table = run.table
-    in_outage = np.zeros(len(table), np.bool_)
-    for begin, end in run.outages_ns:
-        # The last fix is still good at `begin`, and the first one again at `end`.
-        in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
-    return Drive(
-        dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
-        v_left=table.v_left_mps,
-        v_right=table.v_right_mps,
-        north=table.north_m,
-        east=table.east_m,
-        heading=table.heading_rad,
-        distance=table.distance_m,
-        gap=run.in_gap,
-        in_outage=in_outage,
-    )
+def judged_models(run: DrivenRun) -> tuple[Model, ...]:
+    """Return `models_of` the run and, where it is long enough, the constants fitted to windows of all of its way."""
+    try:
+        windows = thin_windows(cut_windows(run, every_m=window_spacing_m(run)))
+    except DataError:
+        return models_of(run)
+    found = solve_windows(windows, CONSTANT, np.ones(len(windows.start), np.bool_))
+    right, left, x = (float(value) for value in found.parameters[:3])
+    return (*models_of(run), Model("icr_window", "ICR, window fit", FrozenIcrs.constant(right, left, x)))
 
 
 def _groups(horizons: int, states: int) -> list[slice]:

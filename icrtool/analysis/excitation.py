@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
 from icrtool.core.window_fit import NEUTRAL, displace, move
 from icrtool.tables import Floats

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter

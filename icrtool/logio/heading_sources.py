@@ -128,7 +128,8 @@ def _yaw(q: Floats) -> tuple[Floats, Bools, str]:
     return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
 
 
-def _frame_convention(table: TopicTable) -> tuple[Convention, str]:
+def frame_convention(table: TopicTable) -> tuple[Convention, str]:
+    """Return the convention of a message's frame, and how it is known."""
     frame = table.text("header.frame_id")
     if frame.lower().endswith("_ned") or frame.lower() == "ned":
         return "ned", f"frame {frame} (REP-145)"
@@ -149,7 +150,7 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
         yaw, usable, note = _yaw(_quaternion(table, path))
         variance = table.floats(f"{covariance}[{place}]") if covariance else np.full(len(table), np.nan)
         variance = np.where(variance > 0, variance, np.nan)
-        convention, why = _frame_convention(table)
+        convention, why = frame_convention(table)
         if stuffed and not _ATTITUDE_WORDS.search(table.topic):
             convention, why = "ned", "compass angle as yaw"
         lowered, problem = score, ""

@@ -15,6 +15,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.logio.channel import Block, Channel, Container
 from icrtool.logio.dynamic_joints import Collector, collector_for
+from icrtool.logio.gyro import find_gyro
 from icrtool.logio.heading_sources import Convention, HeadingSource
 from icrtool.logio.open_log import open_log
 from icrtool.logio.position_sources import PositionSource
@@ -143,7 +144,10 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    return RobotLog(name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna)
+    gyro = find_gyro(survey.tables, motion.topic, source.topic, clock)
+    return RobotLog(
+        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro
+    )
 
 
 def _place_in_words(antenna: tuple[float, float] | None) -> str:

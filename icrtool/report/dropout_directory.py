@@ -18,6 +18,7 @@ from icrtool.analysis.blind_paths import BlindDrive
 from icrtool.analysis.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, DropoutReport, ModelResult
 from icrtool.core.open_loop_fast import TOLERANCE_M
 from icrtool.report.dropout_content import DropoutContent
+from icrtool.report.ladder_table import LADDER_COLUMNS, ladder_document, ladder_rows
 from icrtool.report.run_directory import json_bytes
 from icrtool.report.whole_directory import whole_directory
 
@@ -53,7 +54,7 @@ def is_dropout_directory(directory: Path) -> bool:
 
 
 def write_content(content: DropoutContent, directory: Path) -> None:
-    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory.
+    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory, and ladder.csv where there is one.
 
     Raises
     ------
@@ -64,6 +65,8 @@ def write_content(content: DropoutContent, directory: Path) -> None:
     (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
     (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(content.report)))
     (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(content.worst)))
+    if content.ladder is not None:
+        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(content.ladder)))
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(content)))
 
 
@@ -74,7 +77,7 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         "schema": DROPOUT_SCHEMA,
         "tool_version": __version__,
         "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
-        "reference": "the filter's estimate at the end of the blind way",
+        "reference": f"the {'smoother' if content.smoothed else 'filter'}'s estimate at the end of the blind way",
         "starts": report.states,
         "starts_standing": report.standing,
         "tolerance_m": TOLERANCE_M,
@@ -89,6 +92,7 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         "trials": _count_documents(report),
         "budgets": [one._asdict() for one in content.budgets],
         "by_turning": [one._asdict() for one in content.by_turning],
+        "ladder": ladder_document(content.ladder) if content.ladder is not None else {"left_out": content.no_ladder},
         "gates": [
             {
                 **asdict(verdict.gate),

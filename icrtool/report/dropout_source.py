@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from icrtool.analysis.driven_run import DrivenRun
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.reference import held_against
 from icrtool.config import Config
 from icrtool.errors import RunError
-from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run
+from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run, read_smoothed
 from icrtool.tables import RobotLog
 
 SAME_STATE_M = 1e-6
@@ -46,6 +48,17 @@ def stored_config(run: StoredRun) -> Config:
         problem = err.errors(include_url=False)[0]
         key = ".".join(str(part) for part in problem["loc"])
         raise RunError(run.directory, f"its configuration is not ours ({key})", "run icrtool fit again") from err
+
+
+def judged_run(run: StoredRun | FilterRun, directory: Path) -> DrivenRun:
+    """Return a run held against the smoother's states in its directory.
+
+    Raises
+    ------
+    RunError
+        It has none.
+    """
+    return held_against(run, read_smoothed(directory, run.table.stamp_ns))
 
 
 def log_of(run: StoredRun) -> Path:

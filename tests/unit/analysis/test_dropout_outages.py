@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from icrtool.analysis.dropout import drive_of
+from icrtool.analysis.driven_run import drive_of
 from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.outages import force_outages, plan_outages, real_outages

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.analysis.dropout import drive_of
+from icrtool.analysis.driven_run import drive_of
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.ladder import _trials as make_trials
 from icrtool.analysis.ladder import clear_of, count_blocks, judge_ladder, predict_block

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from icrtool.analysis.ladder import Ladder, judge_ladder
-from icrtool.report.calibration_ladder import format_ladder, ladder_document
+from icrtool.report.ladder_table import format_ladder, ladder_document
 from icrtool.report.run_directory import json_bytes
 
 
