@@ -23,7 +23,8 @@ def measured_headings(run: FilterRun) -> tuple[MeasuredHeading, ...]:
     if log.gyro is not None and _covers(log.gyro.stamp_ns, stamps):
         found.append(MeasuredHeading("gyro", _integrate(log.gyro.stamp_ns, log.gyro.rate_radps, stamps)))
     topics = {stream.role: stream.topic for stream in log.streams}
-    if topics.get("heading") != topics.get("gnss") and _covers(log.heading.stamp_ns, stamps):
+    of_reference = "heading" in topics and topics["heading"] == topics.get("gnss")
+    if not of_reference and _covers(log.heading.stamp_ns, stamps):
         check = run.heading_check
         told = np.unwrap((-1.0 if check.applied_mirror else 1.0) * log.heading.heading_rad) - check.applied_offset_rad
         found.append(

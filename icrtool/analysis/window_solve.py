@@ -26,8 +26,11 @@ from icrtool.analysis.window_fit import (
 )
 from icrtool.tables import Bools, Floats
 
-SETTLED = 1e-3
-"""In standard deviations of the prior, half a millimetre: a step below this is the last one."""
+SETTLED = 1e-4
+"""In standard deviations of the prior: a step below this is the last one ..."""
+
+SETTLED_COST = 1e-3
+"""... and so is one that gains less than this share of what a stretch of way says: 0.03 of a standard deviation."""
 
 MOST_STEPS = 15
 MOST_HALVINGS = 6
@@ -77,14 +80,14 @@ def solve_windows(windows: Windows, model: WindowModel, kept: Bools, start: Solu
         terms = mean
         misses, slopes = evaluate_windows(windows, base + terms @ basis)
     else:
-        terms = np.linalg.lstsq(basis.T, start.parameters - base, rcond=None)[0]
+        terms = np.asarray(np.linalg.lstsq(basis.T, start.parameters - base, rcond=None)[0], np.float64)
         misses, slopes = start.misses, start.slopes
     for _ in range(MOST_STEPS):
         weight, _ = _weigh(misses, rows)
         pulled = slopes * weight[:, None]
         H = basis @ (pulled.T @ pulled) @ basis.T + np.diag(held**2)
         g = basis @ (pulled.T @ (weight * misses)) + held**2 * (terms - mean)
-        step: Floats = -np.linalg.solve(H, g)
+        step = np.asarray(-np.linalg.solve(H, g), np.float64)
         before = _cost(misses, weight, (terms - mean) * held)
         tried = evaluate_windows(windows, base + (terms + step) @ basis)
         for _ in range(MOST_HALVINGS):
@@ -93,7 +96,9 @@ def solve_windows(windows: Windows, model: WindowModel, kept: Bools, start: Solu
             step = step / 2.0
             tried = evaluate_windows(windows, base + (terms + step) @ basis)
         terms, (misses, slopes) = terms + step, tried
-        if np.all(np.abs(step) < SETTLED * std):
+        # the prior weighs as a stretch does: what its windows, alike as they are, gained together
+        alike = float((held[0] * std[0]) ** 2)
+        if -float(g @ step) < SETTLED_COST * alike or np.all(np.abs(step) < SETTLED * std):
             break
     weight, scale = _weigh(misses, rows)
     return Solution(model, terms, base + terms @ basis, misses, slopes, weight, held, scale)

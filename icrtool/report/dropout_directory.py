@@ -27,6 +27,14 @@ DROPOUT_DIRECTORY = "dropout"
 DROPOUT_SCHEMA = "icrtool/dropout/1"
 SCHEMA_FAMILY = "icrtool/dropout/"
 
+KNOWS = {
+    "icr": "the way up to each start",
+    "no_slip": "the track width",
+    "icr_final": "all of the way (in sample)",
+    "icr_window": "all of the way (in sample)",
+}
+"""What the ICRs of a model were learned from."""
+
 ERROR_COLUMNS = ("icr", "no_slip")
 
 Cell = str | int | float | None
@@ -141,7 +149,7 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
     shared = [name for name in columns if name != "model"]
     rows = [{name: columns[name][row] for name in shared} for row in mine]
-    return {"name": result.name, "label": result.label, "by_horizon": rows}
+    return {"name": result.name, "label": result.label, "knows": KNOWS.get(result.name), "by_horizon": rows}
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from textwrap import wrap
 
 from icrtool.analysis.dropout import DropoutReport, ModelResult
 from icrtool.analysis.gates import BudgetDistance
@@ -17,6 +18,8 @@ LABEL = 26
 MODEL = 15
 """Columns of the left margin; of them, for a model's name."""
 CELL = 18
+
+WIDTH = 100
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -35,7 +38,10 @@ def format_dropout(content: DropoutContent) -> str:
     lines += _error_lines(report)
     lines += ["", *_count_lines(report)]
     lines += [_turning_line(one) for one in content.by_turning]
-    lines += ["", *budget_lines(content.budgets)]
+    lines += [
+        "",
+        *(part for line in budget_lines(content.budgets) for part in wrap(line, WIDTH, subsequent_indent="  ")),
+    ]
     if content.ladder is not None:
         lines += ["", *format_ladder(content.ladder).splitlines()]
     elif content.no_ladder:

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.analysis.ladder import Ladder, Rung
 from icrtool.analysis.ladder_fits import CHOICE_HORIZON_M
 from icrtool.report.figure_style import ICR, inches, new_figure
-from icrtool.report.words import length_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,20 +29,21 @@ def draw_ladder(title: str, ladder: Ladder) -> Figure:
         title,
         f"Open-loop error after {ladder.horizons_m[h]:g} m, {ladder.blocks} blocks of way held out in turn",
         width_in=WIDTH_IN,
-        height_in=1.75 + ROW_IN * (len(rungs) + 0.6 * groups),
+        height_in=1.65 + ROW_IN * (len(rungs) + 0.6 * groups),
     )
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=2.75, right=0.85, top=0.62, bottom=1.0))
+    figure.subplots_adjust(**inches(figure, left=2.75, right=0.85, top=0.62, bottom=0.9))
     _draw_rows(axes, rungs, h)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("Error [m], logarithmic")
     axes.grid(visible=False, axis="y")
     keys = [
-        Line2D([], [], label="95 %", linestyle="none", marker="o", color=ICR.color, markersize=6),
-        Line2D([], [], label="expected", linestyle="none", marker="o", color=ICR.color, mfc="white", markersize=6),
-        Line2D([], [], label="held out", linestyle="none", marker="o", color="0.25", markersize=6),
+        Line2D([], [], label="95 %", linestyle="none", marker="D", color="0.25", markersize=5),
+        Line2D([], [], label="expected", linestyle="none", marker="D", color="0.25", mfc="white", markersize=5),
+        Line2D([], [], label="held out", linestyle="none", marker="o", color=ICR.color, markersize=6),
         Line2D([], [], label="not held out", linestyle="none", marker="s", color="0.6", markersize=6),
     ]  # fmt: skip
     figure.legend(handles=keys, loc="lower center", ncols=4, columnspacing=1.8)
@@ -64,7 +64,7 @@ def _draw_rows(axes: Axes, rungs: list[Rung], h: int) -> None:
             [expected], [y], marker=marker, color=color, markerfacecolor="white", markersize=6.5, linestyle="none"
         )
         axes.annotate(
-            length_text(p95), (p95, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8, color="0.2",
+            f"{p95:.2f} m", (p95, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8, color="0.2",
             annotation_clip=False,
         )  # fmt: skip
         places.append(y)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others"
 TERM_KEYS = (
     "y_icr_right_m", "y_icr_left_m", "x_icr_m", "left_scale", "right_scale", "bend", "speed_spm", "wheels_read_later_s"
 )  # fmt: skip
+
+WIDTH = 100
 
 LADDER_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -34,7 +37,7 @@ def format_ladder(ladder: Ladder) -> str:
             for p95, expected in zip(rung.summary.p95, rung.summary.expected, strict=True)
         )
         lines.append(f"{rung.label:<26}{FITTED[rung.fitted]:<16}{cells}")
-    lines.append(extended_line(ladder))
+    lines += wrap(extended_line(ladder), WIDTH, subsequent_indent="  ")
     lines += ladder.notes
     return "\n".join(line.rstrip() for line in lines)
 
@@ -45,7 +48,7 @@ def extended_line(ladder: Ladder) -> str:
     used = dict.fromkeys(names[name] for name in ladder.chosen)
     if ladder.chosen and set(ladder.chosen) == {"window"}:
         return "extended: none pays on this drive, it is the window fit"
-    return f"extended: {', '.join(used)} (chosen without the block judged); for all of the way: {names[ladder.best]}"
+    return f"extended, chosen without the block judged: {', '.join(used)}; for all of the way: {names[ladder.best]}"
 
 
 def ladder_rows(ladder: Ladder) -> Iterator[Sequence[str | int | float]]:
