@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.window_fit import CONSTANT, cut_windows, thin_windows, window_spacing_m
@@ -38,7 +39,10 @@ BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
 LARGEST_TABLE_BYTES = 160 << 20
-"""Errors held at a time: horizons are taken in groups below it, whatever the length of the log."""
+"""Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
+
+BYTES_A_TRIAL = 12
+"""An error, and where its trial ends."""
 
 STANDING_MPS = 0.01
 """Slower than this the robot stands."""
@@ -179,13 +183,13 @@ def dropout(
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
     with ThreadPoolExecutor(THREADS) as pool:
         for group in _groups(len(horizons), len(run.table)):
+            ends, count = _ends(drive, horizons[group], pool)
+            counts.append(count)
             for model in models:
-                errors, count = _errors(drive, model.icrs, horizons[group], pool)
+                errors = _errors(drive, model.icrs, ends, pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
                 parts[model.name].append(_judge(model, errors, drive, horizons[group], seed, pool))
-                if model is models[0]:
-                    counts.append(count)
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
@@ -256,23 +260,36 @@ def judged_models(run: DrivenRun) -> tuple[Model, ...]:
 
 def _groups(horizons: int, states: int) -> list[slice]:
     """Cut the horizons into groups whose table of errors is not too large."""
-    size = max(1, LARGEST_TABLE_BYTES // (8 * max(states, 1)))
+    size = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * max(states, 1)))
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats, pool: Executor) -> tuple[Floats, TrialCounts]:
-    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and counts."""
+def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
+    """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
     states = len(drive.distance)
-    errors = np.empty((len(horizons), states))
+    ends = np.empty((len(horizons), states), np.int32)
 
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_A_CALL, states)
-        ends = trial_ends(drive, horizons, lo, hi)
-        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends, lo).T
-        return count_trials(ends)
+        found = trial_ends(drive, horizons, lo, hi)
+        ends[:, lo:hi] = found.T
+        return count_trials(found)
 
     counts = pool.map(fill, range(0, states, STARTS_A_CALL))
-    return errors.T, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+    return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+
+
+def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
+    states = ends.shape[1]
+    errors = np.empty(ends.shape)
+
+    def fill(lo: int) -> None:
+        hi = min(lo + STARTS_A_CALL, states)
+        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+
+    list(pool.map(fill, range(0, states, STARTS_A_CALL)))
+    return errors.T
 
 
 def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: int, pool: Executor) -> ModelResult:

@@ -6,7 +6,7 @@ held out, and judged on the trials that lie entirely within it; extended models 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun
 from icrtool.analysis.ladder_fits import CHOICE_HORIZON_M, BlockFits, clear_of, fit_blocks
-from icrtool.analysis.ladder_trials import MeasuredHeading, Trials, calibrate_gyro, cut_trials, predict, predict_along
+from icrtool.analysis.ladder_trials import Along, MeasuredHeading, Trials, calibrate_gyro, cut_trials, predict
 from icrtool.analysis.window_fit import WindowFit, Windows, cut_windows, window_spacing_m
 from icrtool.core.open_loop import FrozenIcrs
 from icrtool.core.open_loop_fast import open_loop_errors
@@ -133,9 +133,8 @@ def judge_ladder(
     with ThreadPoolExecutor(JUDGED_AT_ONCE) as pool:
         jobs = [pool.submit(_judge_plain, run, trials, fits, name) for name in MODELS]
         heading, notes = _usable_heading(headings, trials, windows, clear)
-        if heading is not None:
-            jobs += [pool.submit(_judge_along, run, trials, fits, heading, name) for name in MODELS]
-        rungs = tuple(rung for job in jobs if (rung := job.result()) is not None)
+        more = tuple(_judge_along(run, trials, fits, heading)) if heading is not None else ()
+        rungs = (*(rung for job in jobs if (rung := job.result()) is not None), *more)
     return Ladder(
         horizons_m=tuple(horizons_m),
         blocks=blocks,
@@ -170,19 +169,23 @@ def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> 
     return Rung(name, LABELS[name], FITTED[name], False, summarise(errors))
 
 
-def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading, name: str) -> Rung | None:
-    """Judge a model along a measured heading; the multiplier is left out, it says nothing of the way along one."""
-    if name == "multiplier":
-        return None
-    if name in fits.held_out:
-        p = fits.held_out[name]
-        icrs = FrozenIcrs(*np.ascontiguousarray(p[trials.block, :3].T))
-    elif (frozen := _icrs_of(run, name)) is not None:
-        icrs, p = frozen, np.tile([*NEUTRAL, 0.0], (len(fits.chosen), 1))
-    else:
-        return None
-    errors = predict_along(trials, heading.angle_rad, icrs, p, from_reference=heading.kind == "gyro")
-    return Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED[name], True, summarise(errors))
+def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
+    """Judge the models along a measured heading; a multiplier says nothing of the way along one."""
+    along = Along(trials, heading.angle_rad, from_reference=heading.kind == "gyro")
+    neutral = np.tile([*NEUTRAL, 0.0], (len(fits.chosen), 1))
+    plain = along.place(neutral)
+    for name in MODELS:
+        if name == "multiplier":
+            continue
+        if name in fits.held_out:
+            p = fits.held_out[name]
+            place = plain if np.array_equal(p[:, 3:], neutral[:, 3:]) else along.place(p)
+            icrs: FrozenIcrs | None = FrozenIcrs(*np.ascontiguousarray(p[trials.block, :3].T))
+        else:
+            place, icrs = plain, _icrs_of(run, name)
+        if icrs is not None:
+            summary = summarise(along.errors(place, icrs))
+            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED[name], True, summary)
 
 
 def _usable_heading(

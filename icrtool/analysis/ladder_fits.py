@@ -89,8 +89,9 @@ def _inside(windows: Windows, edges_m: Floats, block: int) -> Bools:
 
 
 def _fit_all(windows: Windows, kept: Bools) -> dict[str, Solution]:
-    """Fit every model to some windows; the extended ones start from the plain one."""
-    fits = {model.name: solve_windows(windows, model, kept) for model in (MULTIPLIER, CONSTANT)}
+    """Fit every model to some windows, each from a simpler one's fit to the same."""
+    fits = {MULTIPLIER.name: solve_windows(windows, MULTIPLIER, kept)}
+    fits[CONSTANT.name] = solve_windows(windows, CONSTANT, kept, fits[MULTIPLIER.name])
     for model in EXTENDED:
         fits[model.name] = solve_windows(windows, model, kept, fits[CONSTANT.name])
     return fits

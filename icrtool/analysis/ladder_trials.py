@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -13,7 +14,7 @@ from icrtool.analysis.window_fit import Windows, coarse_rows
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.window_fit import NEUTRAL
+from icrtool.core.window_fit import NEUTRAL, Complexes
 from icrtool.tables import Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
@@ -93,14 +94,13 @@ def predict(trials: Trials, p: Floats) -> Floats:
     return open_loop_errors(drive._replace(v_left=left, v_right=right), FrozenIcrs(*icrs), trials.ends)
 
 
-def predict_along(trials: Trials, angle_rad: Floats, icrs: FrozenIcrs, p: Floats, *, from_reference: bool) -> Floats:
-    """Return the errors (n, h) [m] where heading is measured, and wheels and ICRs only tell the way along it.
+class Along:
+    """Trials along a measured heading: wheels and ICRs only tell the way along it.
 
     Parameters
     ----------
+    trials : where they start and end
     angle_rad : (n,) measured heading
-    icrs : by start, or one triple
-    p : parameters (blocks, 8): scales and delay are used
     from_reference : the heading is that of the reference at the start, and turns as measured
 
     Notes
@@ -108,28 +108,38 @@ def predict_along(trials: Trials, angle_rad: Floats, icrs: FrozenIcrs, p: Floats
     With omega = d psi / dt the way is the sum of V e^{j psi}, V the mean track speed, and ((y_r + y_l) / 2 - j x)
     (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
-    drive = trials.drive
-    dt = np.where(drive.gap, 0.0, drive.dt_s)
-    mean = np.empty(len(dt))
-    for block, one in enumerate(p):
-        rows = trials.rows(block)
-        # on the neutral ICRs of half a metre the mean of the sides is theirs, whatever the turn
-        left, right = _driven(trials, rows, np.array([0.5, -0.5, 0.0, one[3], one[4], 0.0, 0.0, one[7]]))
-        mean[rows] = (left + right) / 2.0
-    middle = np.exp(0.5j * (angle_rad[:-1] + angle_rad[1:]))
-    place = np.concatenate([[0.0], np.cumsum((dt * mean)[:-1] * middle)])
-    arm = (icrs.y_icr_right + icrs.y_icr_left) / 2.0 - 1j * icrs.x_icr
-    lever = np.exp(1j * angle_rad) / 1j
-    reference = drive.north + 1j * drive.east
-    errors = np.full(trials.ends.shape, np.nan)
-    for h in range(trials.ends.shape[1]):
-        start = np.flatnonzero(trials.ends[:, h] >= 0)
-        end = trials.ends[start, h]
-        moved = place[end] - place[start] + (arm if len(arm) == 1 else arm[start]) * (lever[end] - lever[start])
-        if from_reference:
-            moved = moved * np.exp(1j * (drive.heading[start] - angle_rad[start]))
-        errors[start, h] = np.abs(moved - (reference[end] - reference[start]))
-    return errors
+
+    def __init__(self, trials: Trials, angle_rad: Floats, *, from_reference: bool) -> None:
+        drive = trials.drive
+        self._trials, self._dt = trials, np.where(drive.gap, 0.0, drive.dt_s)
+        self._middle = _direction((angle_rad[:-1] + angle_rad[1:]) / 2.0)
+        self._lever = _direction(angle_rad - math.pi / 2.0)
+        self._turn = _direction(drive.heading - angle_rad) if from_reference else np.ones(1)
+        self._reference = drive.north + 1j * drive.east
+
+    def place(self, p: Floats) -> Complexes:
+        """Return the prefix sum (n,) [m] of the way; of the parameters p (blocks, 8) scales and delay are used."""
+        mean = np.empty(len(self._dt))
+        for block, one in enumerate(p):
+            rows = self._trials.rows(block)
+            # on ICRs of half a metre the mean of the sides is the robot's, whatever the turn
+            left, right = _driven(self._trials, rows, np.array([0.5, -0.5, 0.0, one[3], one[4], 0.0, 0.0, one[7]]))
+            mean[rows] = (left + right) / 2.0
+        return np.concatenate([[0.0], np.cumsum((self._dt * mean)[:-1] * self._middle)])
+
+    def errors(self, place: Complexes, icrs: FrozenIcrs) -> Floats:
+        """Return the errors (n, h) [m]; `icrs` by start, or one triple."""
+        arm = (icrs.y_icr_right + icrs.y_icr_left) / 2.0 - 1j * icrs.x_icr
+        ends = self._trials.ends
+        errors = np.full(ends.shape, np.nan)
+        for h in range(ends.shape[1]):
+            start = np.flatnonzero(ends[:, h] >= 0)
+            end = ends[start, h]
+            lever = self._lever[end] - self._lever[start]
+            moved = place[end] - place[start] + (arm if len(arm) == 1 else arm[start]) * lever
+            moved = moved * (self._turn if len(self._turn) == 1 else self._turn[start])
+            errors[start, h] = np.abs(moved - (self._reference[end] - self._reference[start]))
+        return errors
 
 
 def calibrate_gyro(
@@ -159,6 +169,13 @@ def calibrate_gyro(
         pull = np.array([noise / GYRO_SCALE_PRIOR, 0.0]) * np.sqrt(len(columns) / len(kept))
         found[block] = np.linalg.lstsq(np.vstack([columns, pull]), np.append(target, pull[0]), rcond=None)[0]
     return found if np.all(np.abs(found[:, 0] - 1.0) < TURNS_WITH_ROBOT) else None
+
+
+def _direction(angle_rad: Floats) -> Complexes:
+    """Return e^{j angle} in a third of the time of a complex exponential."""
+    direction = np.empty(len(angle_rad), np.complex128)
+    direction.real, direction.imag = np.cos(angle_rad), np.sin(angle_rad)
+    return direction
 
 
 def _driven(trials: Trials, rows: slice, p: Floats) -> tuple[Floats, Floats]:

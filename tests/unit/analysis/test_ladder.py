@@ -12,7 +12,7 @@ import pytest
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.ladder import count_blocks, judge_ladder
 from icrtool.analysis.ladder_fits import clear_of
-from icrtool.analysis.ladder_trials import MeasuredHeading, cut_trials, predict, predict_along
+from icrtool.analysis.ladder_trials import Along, MeasuredHeading, cut_trials, predict
 from icrtool.analysis.measured_heading import measured_headings
 from icrtool.analysis.window_fit import cut_windows
 from icrtool.config import Config
@@ -89,7 +89,8 @@ def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
     dt = trials.drive.dt_s
     turned = np.concatenate([[0.0], np.cumsum(dt * (trials.drive.v_left - trials.drive.v_right) / 1.1)[:-1]])
     neutral = np.tile([0, 0, 0, 1, 1, 0, 0, 0.0], (blocks, 1))
-    along = predict_along(trials, turned, icrs, neutral, from_reference=True)
+    model = Along(trials, turned, from_reference=True)
+    along = model.errors(model.place(neutral), icrs)
     wheels = open_loop_errors(trials.drive, icrs, trials.ends)
     tried = ~np.isnan(wheels)
     assert np.max(np.abs(along[tried] - wheels[tried])) < 0.05
