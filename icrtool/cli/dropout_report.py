@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -105,8 +104,6 @@ def command(
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    # No kernel of ours uses BLAS, and a process with threads should not be forked.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from icrtool.analysis.dropout import DEFAULT_SEED
     from icrtool.analysis.gates import parse_gate
     from icrtool.report.dropout_drawing import DrawingProcess
