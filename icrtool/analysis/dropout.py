@@ -38,7 +38,7 @@ BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
-LARGEST_TABLE_BYTES = 160 << 20
+LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
 
 BYTES_A_TRIAL = 12
@@ -51,7 +51,7 @@ BULK_IN_P95 = 3.0
 MOST_BULKS = 10.0
 """A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
 
-STARTS_A_CALL = 1 << 15
+STARTS_A_CALL = 1 << 14
 """Starts tried by a thread at a time."""
 
 THREADS = 2

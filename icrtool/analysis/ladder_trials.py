@@ -14,7 +14,7 @@ from icrtool.analysis.window_fit import Windows, coarse_rows
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.window_fit import NEUTRAL, Complexes
+from icrtool.core.window_fit import Complexes
 from icrtool.tables import Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
@@ -84,14 +84,15 @@ def predict(trials: Trials, p: Floats) -> Floats:
     Scales, bend, speed and delay change what the sides are taken to do: with the speeds
     V_l = v_x - omega y_l and V_r = v_x - omega y_r the ICRs of Eqs. 8-12 give just that v_x and omega.
     """
-    drive, n = trials.drive, len(trials.t)
-    left, right, icrs = drive.v_left.copy(), drive.v_right.copy(), np.empty((3, n))
+    drive, errors = trials.drive, np.full(trials.ends.shape, np.nan)
     for block, one in enumerate(p):
         rows = trials.rows(block)
-        icrs[:, rows] = one[:3, None]
-        if np.any(one[3:] != (*NEUTRAL[3:], 0.0)):
-            left[rows], right[rows] = _driven(trials, rows, one)
-    return open_loop_errors(drive._replace(v_left=left, v_right=right), FrozenIcrs(*icrs), trials.ends)
+        left, right = _driven(trials, rows, one)
+        within = Drive(*(column[rows] for column in drive))
+        ends = np.maximum(trials.ends[rows] - rows.start, -1)
+        icrs = FrozenIcrs.constant(*(float(icr) for icr in one[:3]))
+        errors[rows] = open_loop_errors(within._replace(v_left=left, v_right=right), icrs, ends)
+    return errors
 
 
 class Along:
