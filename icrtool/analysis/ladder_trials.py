@@ -88,10 +88,13 @@ def predict(trials: Trials, p: Floats) -> Floats:
     for block, one in enumerate(p):
         rows = trials.rows(block)
         left, right = _driven(trials, rows, one)
-        within = Drive(*(column[rows] for column in drive))
+        within = Drive(
+            drive.dt_s[rows], left, right, drive.north[rows], drive.east[rows], drive.heading[rows],
+            drive.distance[rows], drive.gap[rows], drive.in_outage[rows],
+        )  # fmt: skip
         ends = np.maximum(trials.ends[rows] - rows.start, -1)
         icrs = FrozenIcrs.constant(*(float(icr) for icr in one[:3]))
-        errors[rows] = open_loop_errors(within._replace(v_left=left, v_right=right), icrs, ends)
+        errors[rows] = open_loop_errors(within, icrs, ends)
     return errors
 
 

@@ -31,11 +31,26 @@ def format_run(run: FilterRun) -> str:
         "",
         *_icr_lines(run),
         *_multiplier_lines(run),
+        *excitation_lines(run),
         "",
         *_position_lines(run),
         *_heading_lines(run),
     ]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def excitation_lines(run: FilterRun) -> list[str]:
+    """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
+    found = run.summary["excitation"]
+    verdicts = found["verdict"]
+    if set(verdicts.values()) == {"shown"}:
+        said = "enough to show all three ICRs"
+    else:
+        said = ", ".join(f"{ICR_LABELS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
+    right, left = found["turned_right_deg"], found["turned_left_deg"]
+    spun = found["spun_right_deg"] + found["spun_left_deg"]
+    turned = f"turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot"
+    return [_line("excitation", f"{said}; {turned}")]
 
 
 def _stream_lines(run: FilterRun) -> list[str]:
