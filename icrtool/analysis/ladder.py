@@ -202,4 +202,6 @@ def _usable_heading(
             # turns within a block are all that counts: the angle may jump where blocks meet
             return MeasuredHeading("gyro", scale * heading.angle_rad + bias * trials.t), tuple(notes)
         notes.append("the gyro does not turn with the robot: rows with it are left out")
+    if not headings:
+        notes.append("no heading measured apart from the position: no rows with one")
     return None, tuple(notes)
