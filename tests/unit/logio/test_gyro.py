@@ -29,11 +29,24 @@ def test_rates_are_clockwise_in_either_convention(frame: str, sign: float) -> No
 
 
 def test_the_headings_own_unit_comes_first_then_the_wheels_namespace_then_the_one_with_more_samples() -> None:
-    heading, kin, long, short = imu("/x/ahrs", count=20), imu("/bot/imu", count=30), imu("/a/imu"), imu("/b/imu")
-    short = imu("/b/imu", count=40)
+    heading, kin = imu("/x/ahrs", count=20), imu("/bot/imu", count=30)
+    long, short = imu("/a/imu"), imu("/b/imu", count=40)
 
     def chosen(*tables: TopicTable) -> str:
         found = find_gyro(tables, "/bot/joints", "/x/ahrs", "log")
+        return found.topic if found is not None else ""
+
+    assert chosen(long, kin, heading) == "/x/ahrs"
+    assert chosen(long, kin) == "/bot/imu"
+    assert chosen(short, long) == "/a/imu"
+
+
+def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() -> None:
+    assert find_gyro([imu("/imu", np.zeros(COUNT)), imu("/b", np.full(COUNT, np.nan))], "/w", "/h", "log") is None
+    spoilt = np.where(np.arange(2 * COUNT) == 7, 1e6, np.tile(RATE, 2))
+    times = TIMES[0] + 10_000_000 * np.arange(2 * COUNT)
+    tables = [TopicTable("/imu", "sensor_msgs/Imu", times, {"angular_velocity.z": spoilt}, {}, 0, "the log")]
+    found = find_gyro(tables, "/bot/joints", "/x/ahrs", "log")
         return found.topic if found is not None else ""
 
     assert chosen(long, kin, heading) == "/x/ahrs"
