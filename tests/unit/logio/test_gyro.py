@@ -46,19 +46,6 @@ def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() 
     spoilt = np.where(np.arange(2 * COUNT) == 7, 1e6, np.tile(RATE, 2))
     times = TIMES[0] + 10_000_000 * np.arange(2 * COUNT)
     tables = [TopicTable("/imu", "sensor_msgs/Imu", times, {"angular_velocity.z": spoilt}, {}, 0, "the log")]
-    found = find_gyro(tables, "/bot/joints", "/x/ahrs", "log")
-        return found.topic if found is not None else ""
-
-    assert chosen(long, kin, heading) == "/x/ahrs"
-    assert chosen(long, kin) == "/bot/imu"
-    assert chosen(short, long) == "/a/imu"
-
-
-def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() -> None:
-    assert find_gyro([imu("/imu", np.zeros(COUNT)), imu("/b", np.full(COUNT, np.nan))], "/w", "/h", "log") is None
-    spoilt = np.tile(RATE, 2)
-    tables = [TopicTable("/imu", "sensor_msgs/Imu", TIMES[0] + 10_000_000 * np.arange(2 * COUNT),
-                         {"angular_velocity.z": np.where(np.arange(2 * COUNT) == 7, 1e6, spoilt)}, {}, 0, "x")]  # fmt: skip
     found = find_gyro(tables, "/w", "/h", "log")
     assert found is not None
     assert len(found.rate_radps) == 2 * COUNT - 1
