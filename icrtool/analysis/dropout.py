@@ -25,6 +25,7 @@ from icrtool.core.statistics import (
     round_bin_width,
     summarise,
 )
+from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Floats, Ints
 
@@ -233,6 +234,10 @@ def load_kernels() -> None:
     errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
     bootstrap_intervals(errors, way, horizon, DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
+    motion = move(
+        way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
+    )
+    window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
 
 
 def models_of(run: DrivenRun) -> tuple[Model, ...]:
