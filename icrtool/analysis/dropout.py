@@ -21,9 +21,10 @@ from icrtool.core.statistics import (
     Intervals,
     Summary,
     bootstrap_intervals,
-    histogram,
+    histogram_sorted,
     round_bin_width,
-    summarise,
+    sort_trials,
+    summarise_sorted,
 )
 from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import ConfigError, DataError
@@ -302,11 +303,12 @@ def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: i
 
     def judge(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
-        summary = summarise(column)
+        ordered = sort_trials(column[:, 0])
+        summary = summarise_sorted([ordered])
         intervals = bootstrap_intervals(
             column, drive.distance, horizons[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL
         )
-        bins = histogram(column[:, 0], _bin_width(float(summary.p95[0]), float(summary.largest[0])))
+        bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         return ModelResult(model.name, model.label, summary, intervals, (bins,))
 
     return _joined(list(pool.map(judge, range(len(horizons)))))

@@ -63,11 +63,11 @@ class Trials(NamedTuple):
 def cut_trials(run: DrivenRun, edges_m: Floats, horizons_m: Sequence[float]) -> Trials:
     """Return the trials within blocks of way, `edges_m` their inner borders [m].
 
-    Starts are a tenth of a second or two apart, as the steps of the fits are: nearer ones are copies of one another.
+    Starts are as far apart as the steps of the fits are long: nearer ones are copies of one another.
     """
     table, drive = run.table, drive_of(run)
     block = np.searchsorted(edges_m, table.distance_m, side="right")
-    every = coarse_rows(np.where(drive.gap, 0.0, drive.dt_s))
+    every = coarse_rows(np.where(drive.gap, 0.0, drive.dt_s), drive.v_left, drive.v_right)
     found = trial_ends(drive, np.array(horizons_m, np.float64))
     ends = np.full((len(horizons_m), len(table)), -1, np.int64)
     for h, column in enumerate(found.T):

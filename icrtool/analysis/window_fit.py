@@ -41,8 +41,8 @@ SETTLED = 1e-4
 COARSE_STEP_S = 0.1
 """Wheel samples are joined to steps of this length to get near the solution."""
 
-COARSER_AFTER_S = 1200.0
-"""... or of twice that on a longer drive."""
+MOST_STEPS, LONGEST_STEP_S, COARSE_STEP_M = 10_000, 0.4, 0.25
+"""Steps are longer where there would be more of them, but not longer than this in time and way."""
 
 STRETCH_M = 20.0
 """Way that errs alike, for the covariance: twice the longest window."""
@@ -280,11 +280,19 @@ def robust_scale(misses: Floats) -> float:
     return max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
 
 
-def coarse_rows(dt: Floats) -> int:
-    """Return how many wheel samples make a step of a tenth of a second or two; `dt` (n,) is 0 over gaps [s]."""
-    moving = dt[dt > 0.0]
-    step_s = COARSE_STEP_S if float(moving.sum()) <= COARSER_AFTER_S else 2.0 * COARSE_STEP_S
-    return max(int(step_s / float(np.median(moving))), 1) if len(moving) else 1
+def coarse_rows(dt: Floats, v_left: Floats, v_right: Floats) -> int:
+    """Return how many wheel samples make a step of the fits.
+
+    A tenth of a second; on a long drive longer, up to four, as long as a step is no more than a quarter of a metre of
+    way. `dt` (n,) is 0 over gaps [s], speeds are (n,) [m/s].
+    """
+    lasting = dt > 0.0
+    if not lasting.any():
+        return 1
+    total_s = float(dt.sum())
+    speed_mps = float((dt * (np.abs(v_left) + np.abs(v_right))).sum()) / 2.0 / total_s
+    step_s = min(total_s / MOST_STEPS, COARSE_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S)
+    return max(int(max(step_s, COARSE_STEP_S) / float(np.median(dt[lasting]))), 1)
 
 
 def thin_windows(windows: Windows) -> Windows:
@@ -295,7 +303,7 @@ def thin_windows(windows: Windows) -> Windows:
     Euler steps of m samples at a constant turn rate move along the heading (m - 1) / 2 samples into them: that is the
     `lag` of the joined step, without which it would cut the corner.
     """
-    joined = coarse_rows(windows.dt)
+    joined = coarse_rows(windows.dt, windows.v_left, windows.v_right)
     first = np.arange(0, len(windows.t), joined)
     dt = np.add.reduceat(windows.dt, first)
     left, right = (np.add.reduceat(windows.dt * v, first) for v in (windows.v_left, windows.v_right))
