@@ -203,5 +203,5 @@ def _usable_heading(
             return MeasuredHeading("gyro", scale * heading.angle_rad + bias * trials.t), tuple(notes)
         notes.append("the gyro does not turn with the robot: rows with it are left out")
     if not headings:
-        notes.append("no heading measured apart from the position: no rows with one")
+        notes.append("the run holds no heading measured apart from the position: no rows with one")
     return None, tuple(notes)

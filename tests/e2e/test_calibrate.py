@@ -92,3 +92,15 @@ def test_nothing_foreign_is_overwritten(icrtool, tmp_path: Path, place: str) -> 
 
 def test_quiet_prints_nothing(icrtool) -> None:
     assert icrtool("calibrate", LOG, *ROBOT, "-q") == (0, "", "")
+
+
+def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> None:
+    status, out, err = icrtool("info", LOG, *ROBOT)
+    assert (status, err) == (0, "")
+    assert "excitation  enough to show all three ICRs; turned 972° right, 844° left" in out
+    assert "gyro:\n  -> /imu/data: 20000 turn rates" in out
+    icrtool("simulate", "-o", "straight.mcap", "--path", "straight", "--duration", "60", "-q")
+    status, out, err = icrtool("info", "straight.mcap", *ROBOT)
+    assert status == 0
+    assert "y right not shown, y left not shown" in out
+    assert "add two spins each way" in err

@@ -247,3 +247,15 @@ def test_the_ladder_stands_in_table_report_csv_and_picture(fitted: Path) -> None
     line = next(line for line in out.splitlines() if line.startswith("window fit  "))
     assert f"{window.p95_m:.2f} / {window.expected_error_m:.2f}" in line
     assert (fitted / RUN / "dropout" / "plots" / "ladder.png").stat().st_size > 10_000
+
+
+def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> None:
+    file = folder / RUN / "dropout" / "ladder.csv"
+    of_log = file.read_bytes()
+    status, _, err = report_here(folder, RUN)
+    assert (status, err) == (0, "")
+    assert file.read_bytes() == of_log
+    (folder / RUN / "headings.parquet").write_bytes(b"something else")
+    status, _, err = report_here(folder, RUN)
+    assert status == 1
+    assert "headings.parquet was edited" in err
