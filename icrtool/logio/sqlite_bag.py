@@ -104,7 +104,7 @@ class SqliteBag:
         return database
 
     def _open(self, mode: str) -> sqlite3.Connection:
-        name = quote(os.fsencode(self._path.absolute()))
+        name = quote(os.fsencode(self._path.resolve()))
         database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK_BYTES)
         database.text_factory = lambda text: text.decode("utf-8", "replace")
