@@ -78,6 +78,6 @@ def _part(log: RobotLog) -> RobotLog:
             v_left_mps=wheels.v_left_mps[rows],
             v_right_mps=wheels.v_right_mps[rows],
         ),
-        gnss=PositionFixes(*(getattr(log.gnss, name)[fixes] for name in PositionFixes.__slots__)),
+        gnss=log.gnss.cut(fixes),
         heading=HeadingSamples(*(getattr(log.heading, name)[samples] for name in HeadingSamples.__slots__)),
     )

@@ -237,6 +237,7 @@ def _fixes(
         np.ascontiguousarray(north, np.float64),
         np.ascontiguousarray(east, np.float64),
         *(np.ascontiguousarray(column) for column in variance.T),
+        None if source.told_class is None else source.told_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 
