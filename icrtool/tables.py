@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -75,8 +75,8 @@ class PositionFixes:
 
     def cut(self, rows: slice) -> PositionFixes:
         """Return the fixes of some rows."""
-        columns = (getattr(self, field.name) for field in fields(self))
-        return PositionFixes(*(None if column is None else column[rows] for column in columns))
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,15 @@ from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
-from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary, used_and_rejected
+from icrtool.analysis.summary import (
+    converge,
+    drive_summary,
+    gnss_summary,
+    icr_summary,
+    nis_summary,
+    segment_summary,
+    used_and_rejected,
+)
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
@@ -67,6 +75,7 @@ class FilterRun:
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
     changes_s : terrain changes, seconds since the first recorded state
+    warm_start : what another run had learned, where this one began with it
     convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
     """
 
@@ -82,6 +91,7 @@ class FilterRun:
     covariance: Floats
     process_position_mps: float
     changes_s: tuple[float, ...]
+    warm_start: WarmStart | None
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
@@ -181,6 +191,7 @@ def fit(
             "process_position_mps": position_noise,
             "reference_delay_s": adapted.reference_delay_s,
             "states": len(table),
+            "warm_start": _began_with(warm_start),
             **nis_summary(gnss, heading),
         },
     }
@@ -196,6 +207,7 @@ def fit(
         fix_quality=fixes,
         covariance=_square(output.P),
         changes_s=tuple(sorted(changes_s)),
+        warm_start=warm_start,
         process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
@@ -294,6 +306,12 @@ def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
             "clocks, antenna place or fix quality do not fit the wheels"
         )
     return [f"{name}: {doubt}" for doubt in doubts]
+
+
+def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
+    if warm_start is None:
+        return None
+    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
 
 
 def _square(upper: Floats) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from icrtool.analysis.fix_steps import FEWEST_STEPS, FixSteps
@@ -39,14 +41,14 @@ def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools) -> Bools:
     with np.errstate(invalid="ignore"):
         noisy = level > STRETCH_VARIANCE * usual
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
-    undecided = []
-    for jump in jumps if len(jumps) <= MOST_JUMPS else ():
-        decided, stretches = _noisy_side(level, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
+    undecided, beside, nearby = [], _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
+    for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
+        decided, stretches = _noisy_side(beside, nearby, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
         noisy[stretches] = True
         if not decided:
-            undecided.append(int(jump))
+            undecided.append(jump)
     sold[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
-    for jump, back in zip(undecided[:-1], undecided[1:], strict=True):
+    for jump, back in pairwise(undecided):
         first, last = steps.jump_row[jump], steps.jump_row[back]
         away, home = steps.jump[jump], steps.jump[back]
         short = back == jump + 1 and stamps[last] - stamps[first] < LONGEST_EXCURSION_S * 1e9
@@ -55,19 +57,29 @@ def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools) -> Bools:
     return sold & claimed
 
 
-def _noisy_side(level: Floats, at: int) -> tuple[bool, slice]:
+def _moving_mean(level: Floats, width: int) -> Floats:
+    """Return the mean of `level` (n,) over a window of `width` about each entry, NaN where it holds no number."""
+    kernel, known = np.ones(width), np.isfinite(level)
+    total = np.convolve(np.where(known, level, 0.0), kernel, "same")[: len(level)]
+    count = np.convolve(known.astype(np.float64), kernel, "same")[: len(level)]
+    mean = np.full(len(level), np.nan)
+    np.divide(total, count, out=mean, where=count > 0.5)
+    return mean
+
+
+def _noisy_side(beside: Floats, nearby: Floats, at: int) -> tuple[bool, slice]:
     """Return whether noise tells the sides of a jump in stretch `at` apart, and the stretches that are float then."""
-    before, after = level[max(at - BESIDE_JUMP, 0) : at], level[at + 1 : at + 1 + BESIDE_JUMP]
-    if np.isfinite(before).sum() < 2 or np.isfinite(after).sum() < 2:
+    before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
+    if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
         return False, slice(0, 0)
-    left, right = (max(float(np.nanmean(side)), USUAL_M2) for side in (before, after))
+    left, right = max(float(beside[before]), USUAL_M2), max(float(beside[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return False, slice(0, 0)
-    bound, direction = (left * right) ** 0.5, -1 if left > right else 1
-    end = at
-    for stretch in range(at + direction, len(level) if direction > 0 else -1, direction):
-        nearby = level[max(stretch - 1, 0) : stretch + 2]
-        if not np.isfinite(nearby).any() or float(np.nanmean(nearby)) < bound:
-            break
-        end = stretch
-    return True, slice(min(at, end), max(at, end) + 1)
+    bound = (left * right) ** 0.5
+    with np.errstate(invalid="ignore"):
+        quiet = np.flatnonzero(~(nearby >= bound))
+    if left > right:
+        ends = quiet[quiet < at - 1]
+        return True, slice(int(ends[-1]) + 1 if len(ends) else 0, at + 1)
+    ends = quiet[quiet > at + 1]
+    return True, slice(at, int(ends[0]) if len(ends) else len(nearby))

@@ -20,6 +20,7 @@ PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
 """A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
 
+MOST_TO_FIT = 10_000
 GAP_IN_INTERVALS = 5.0
 
 
@@ -30,8 +31,8 @@ class FixSteps:
     Attributes
     ----------
     step : complex (m - 1,) [m], NaN across a gap
-    product : (m - 2,) minus the product of neighbouring steps, clipped [m^2], NaN across a gap: white noise of
-        variance s^2 a axis makes it 2 s^2 on average, whatever the wheels do slowly makes it less than nothing
+    product : (m - 2,) minus the product of neighbouring steps [m^2], NaN at gaps and wild steps: white noise of
+        variance s^2 an axis makes it 2 s^2 on average; what the wheels get wrong for longer makes it less
     jump_row : (j,) rows of the first fix after a jump; jump : complex (j,) [m]
     """
 
@@ -78,42 +79,46 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     """
     gnss, wheels, heading = log.gnss, log.wheels, log.heading
     if min(len(gnss.stamp_ns), len(wheels.stamp_ns), len(heading.stamp_ns)) < 3:
-        none = np.empty(0, np.complex128)
-        return FixSteps(none, np.empty(0), np.empty(0, np.int64), none)
-    psi = np.unwrap(heading.heading_rad) * (-1.0 if mirrored else 1.0) - offset_rad
+        count, none = len(gnss.stamp_ns), np.empty(0, np.complex128)
+        unknown = np.full(max(count - 2, 0), np.nan)
+        return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, np.empty(0, np.int64), none)
     interval = np.diff(wheels.stamp_ns) / 1e9
-    way = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * np.where(interval < 1.0, interval, 0.0)
-    along = np.interp(wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, heading.stamp_ns, psi)
+    speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
+    travelled = np.concatenate([[0.0], np.cumsum(speed * np.where(interval < 1.0, interval, 0.0))])
+    way = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
 
-    def at_fixes(values: Floats) -> Floats:
-        return np.interp(gnss.stamp_ns, wheels.stamp_ns, np.concatenate([[0.0], np.cumsum(values)]))
+    def nose(stamps: Ints) -> Complexes:
+        # The sample at hand is near enough for steps of centimetres, and needs no unwrapping of all the others.
+        row = np.minimum(np.searchsorted(heading.stamp_ns, stamps), len(heading.stamp_ns) - 1)
+        psi = heading.heading_rad[row]
+        return np.asarray(np.exp(1j * ((-psi if mirrored else psi) - offset_rad)), np.complex128)
 
-    laid = np.diff(at_fixes(way * np.cos(along)) + 1j * at_fixes(way * np.sin(along)))
-    swing = np.diff(np.exp(1j * np.interp(gnss.stamp_ns, heading.stamp_ns, psi)))
+    laid = way * nose(gnss.stamp_ns[:-1] + np.diff(gnss.stamp_ns) // 2)
+    swing = np.diff(nose(gnss.stamp_ns))
     seen = np.diff(gnss.north_m + 1j * gnss.east_m)
     dt = np.diff(gnss.stamp_ns) / 1e9
     usual = float(np.median(dt))
     design = np.column_stack([laid, swing])
-    step = seen - design @ _explain(design, seen)
+    some = slice(None, None, max(1, len(seen) // MOST_TO_FIT))
+    step = seen - design @ _explain(design[some], seen[some])
     step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
     scale = _scale(step)
-    size = np.abs(step)
     with np.errstate(invalid="ignore"):
-        clipped = step * np.minimum(1.0, CLIP_SIGMAS * scale / np.maximum(size, 1e-12))
-    product = -(clipped[1:] * np.conj(clipped[:-1])).real
+        usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
+    product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
     rows, jumps = _jumps(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
     return FixSteps(step, product, rows, jumps)
 
 
 def _explain(design: Complexes, seen: Complexes) -> Complexes:
     """Return the two complex factors of `design` (m, 2) that explain most of `seen` (m,), wild steps left out."""
-    factors = np.array([1.0, 0.0], np.complex128)
+    factors: Complexes = np.array([1.0, 0.0], np.complex128)
     for _ in range(2):
         left = np.abs(seen - design @ factors)
         rows = left <= CLIP_SIGMAS * max(float(np.median(left)), 1e-9)
         part = design[rows]
         normal = part.conj().T @ part + np.diag([1e-9, 1e-9])
-        factors = np.linalg.solve(normal, part.conj().T @ seen[rows])
+        factors = np.asarray(np.linalg.solve(normal, part.conj().T @ seen[rows]), np.complex128)
     return factors
 
 

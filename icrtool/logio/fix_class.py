@@ -69,9 +69,9 @@ def told_by_type(table: TopicTable, path: str) -> Bytes | None:
 def _of_word(text: str) -> int:
     if not text:
         return NOT_TOLD
-    if text.endswith("_FLOAT") or text.endswith("RTKFLOAT"):
+    if text.endswith(("_FLOAT", "RTKFLOAT")):
         return FLOAT_FIX
-    return FIXED_FIX if text.endswith("_INT") or text.endswith(("RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
+    return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
 
 
 def _looked_up(values: Ints, codes: Mapping[int, int], otherwise: int) -> Bytes:

@@ -98,7 +98,7 @@ def no_position(table: TopicTable, problem: str) -> PositionSource:
 
 def _geodetic(
     table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
-    told: Bytes | None = None,
+    told_class: Bytes | None = None,
 ) -> PositionSource:  # fmt: skip
     """Build a source from latitude, longitude, height; drop rows without a fix, not finite, or at 0, 0."""
     rejected: dict[str, int] = {}
@@ -130,7 +130,7 @@ def _geodetic(
     return PositionSource(
         table.topic, table.message_type, stamp_rows(table),
         np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
-        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", told_class=told,
+        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", told_class=told_class,
     )  # fmt: skip
 
 

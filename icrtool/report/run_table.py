@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
@@ -103,11 +104,27 @@ def _position_lines(run: FilterRun) -> list[str]:
             f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
         )
     )
+    lines += _class_lines(gnss["classes"], gnss["jumps"])
     if gnss["recoveries"]:
         lines.append(_line("", f"believed again after rejection: {gnss['recoveries']:,} times"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
-        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}, {away} in all"))
+        lost = len(run.summary["rtk_losses_ns"])
+        cause = f" ({lost} of RTK, fixes went on)" if lost else ""
+        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
+    return lines
+
+
+def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
+    """Say what classes the fixes were of, where they were not all of one, and what was done to them."""
+    lines = []
+    for name, one in classes.items() if len(classes) > 1 else ():
+        done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
+        done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
+        done += [f"{one['sold_as_fixed']:,} sold as fixed"] if one["sold_as_fixed"] else []
+        lines.append(_line("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
+    if jumps:
+        lines.append(_line("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
     return lines
 
 
