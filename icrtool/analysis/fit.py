@@ -14,6 +14,7 @@ from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
+from icrtool.analysis.stream_delays import measure_delays
 from icrtool.analysis.summary import (
     converge,
     drive_summary,
@@ -147,7 +148,8 @@ def fit(
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
-    fixes = judge_fixes(log, config, check)
+    delays = measure_delays(log, config, check)
+    fixes = judge_fixes(delays.log, config, check)
     adapted = run_adaptively(fixes.log, config, check, warm_start, changes_s)
     log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
     table = _states(log, output)
@@ -165,6 +167,7 @@ def fit(
         *log.warnings,
         *wheels.warnings,
         *check.warnings,
+        *delays.warnings,
         *fixes.warnings,
         *_doubts(log.name, table, gnss),
         *_adaptation_notes(log.name, config, adapted),
@@ -180,8 +183,8 @@ def fit(
         "drive": drive_summary(table),
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
         "segments": segment_summary(table, changes_s),
-        "gnss": gnss_summary(log, gnss) | fixes.summary(*used_and_rejected(gnss)),
-        "heading": check.summary(),
+        "gnss": gnss_summary(log, gnss) | delays.gnss_summary() | fixes.summary(*used_and_rejected(gnss)),
+        "heading": check.summary() | delays.heading_summary(),
         "wheels": wheels.summary(),
         "outages_ns": outages.tolist(),
         "rtk_losses_ns": fixes.losses_ns.tolist(),
@@ -189,7 +192,7 @@ def fit(
         "filter": {
             "preset": config.filter.preset,
             "process_position_mps": position_noise,
-            "reference_delay_s": adapted.reference_delay_s,
+            "reference_delay_s": delays.applied_gnss_s + adapted.reference_delay_s,
             "states": len(table),
             "warm_start": _began_with(warm_start),
             **nis_summary(gnss, heading),
