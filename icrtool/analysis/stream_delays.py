@@ -109,7 +109,8 @@ def measure_delays(log: RobotLog, config: Config, check: HeadingCheck) -> Stream
         late = given_heading
     late_gnss = gnss.value_s if free and given_gnss == "auto" and gnss.is_clear else 0.0
     notes = [
-        f"{log.name}: {what} {delay.value_s:.2f} ± {delay.std_s:.2f} s late against the wheels: taken out; {key} sets it"
+        f"{log.name}: {what} {delay.value_s:.2f} ± {delay.std_s:.2f} s late against the wheels: "
+        f"taken out; {key} sets it"
         for what, delay, applied, key in (
             ("the heading is", heading, given_heading == "auto" and late, "frames.heading_delay_s"),
             ("the fixes are", gnss, late_gnss, "frames.reference_delay_s"),
@@ -221,7 +222,7 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
         design, seen, scale_of = explain(delay)
         weight = np.ones(len(seen))
         ridge = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
-        solution = np.zeros(design.shape[1])
+        solution, left, inverse = np.zeros(design.shape[1]), seen, ridge
         for _ in range(REWEIGHTS):
             weighted = design * weight[:, None]
             inverse = np.linalg.pinv(design.T @ weighted + ridge)
