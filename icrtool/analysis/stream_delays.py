@@ -222,12 +222,14 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
         design, seen, scale_of = explain(delay)
         weight = np.ones(len(seen))
         ridge = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
-        solution, left, inverse = np.zeros(design.shape[1]), seen, ridge
+        solution: Floats = np.zeros(design.shape[1])
+        left: Floats = seen
+        inverse: Floats = ridge
         for _ in range(REWEIGHTS):
             weighted = design * weight[:, None]
-            inverse = np.linalg.pinv(design.T @ weighted + ridge)
-            solution = inverse @ (weighted.T @ seen)
-            left = seen - design @ solution
+            inverse = np.asarray(np.linalg.pinv(design.T @ weighted + ridge), np.float64)
+            solution = np.asarray(inverse @ (weighted.T @ seen), np.float64)
+            left = np.asarray(seen - design @ solution, np.float64)
             bound = HUBER_SIGMAS * max(1.4826 * float(np.median(np.abs(left))), 1e-9)
             weight = np.minimum(1.0, bound / np.maximum(np.abs(left), 1e-12))
         gradients = np.add.reduceat(design * (weight * left)[:, None], np.arange(0, len(seen), BLOCK), axis=0)

@@ -141,9 +141,8 @@ def _dead_or_copied(log: RobotLog) -> list[str]:
         return []
     if min(way_left, way_right) < NEVER_MOVES_SHARE * most:
         side = "left" if way_left < way_right else "right"
-        return [
-            f"the {side} wheels hardly ever move: is their encoder dead? These ICRs mean nothing; topics.wheels chooses others"
-        ]
+        meaning = "the ICRs mean nothing then; topics.wheels chooses others"
+        return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         return ["left and right wheels tell the same all the time while the robot turns: one is a copy of the other"]
     return []
