@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.tables import Floats, Ints, RobotLog
@@ -51,6 +52,7 @@ class HeadingCheck:
     agreement, mirrored_agreement : mean resultant length of heading minus course, as given and turned the other way
     applied_mirror : `fit` takes the heading turned the other way
     applied_offset_rad : what `fit` subtracts, after that
+    name : what a significant offset may come from
     applied_std_rad, applied_correlation_s : the least noise, and how long it errs alike, that `fit` gives the heading
     """
 
@@ -64,6 +66,7 @@ class HeadingCheck:
     applied_offset_rad: float
     applied_std_rad: float
     applied_correlation_s: float
+    name: OffsetName
     warnings: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
@@ -80,6 +83,7 @@ class HeadingCheck:
             "windows": self.windows,
             "applied_mirror": self.applied_mirror,
             **numbers,
+            **self.name.summary(),
             "agreement": self.agreement if math.isfinite(self.agreement) else None,
             "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
         }
@@ -138,7 +142,7 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         )
     if len(course.angle) < FEWEST_WINDOWS:
         nan = math.nan
-        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, ())
+        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
     agreement = float(abs(np.exp(1j * course.angle).mean()))
     mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
     if free and max(agreement, mirrored) < EXPLAINED:
@@ -147,16 +151,16 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
-    applied, warnings = _choose_offset(
-        f"{math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}°",
-        offset,
-        sigma,
-        fixed,
-        free=free,
-    )
+    rest = offset + math.pi / 2 if turned_over else offset
+    name = NO_NAME
+    if _is_significant(rest, sigma):
+        name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0]))
+    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
+    cause = f" ({name.text})" if name.text else ""
+    applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
     if turned_over:
         applied = offset if given == "auto" else fixed
-        warnings = [_name_turned_over(offset, len(angle))]
+        warnings = [_name_turned_over(text + cause, len(angle))]
     elif agreement < EXPLAINED and mirrored >= EXPLAINED:
         applied, warnings = (
             fixed,
@@ -186,6 +190,7 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         applied_offset_rad=applied,
         applied_std_rad=raised,
         applied_correlation_s=alike_s,
+        name=name,
         warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
     )
 
@@ -236,21 +241,26 @@ def _near_share(angle: Floats) -> float:
     return float((away < NEAR_RAD).mean(axis=0).max())
 
 
-def _choose_offset(text: str, offset: float, sigma: float, fixed: float, *, free: bool) -> tuple[float, list[str]]:
+def _is_significant(offset: float, sigma: float) -> bool:
+    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma)
+
+
+def _choose_offset(
+    text: str, offset: float, sigma: float, fixed: float, cause: str, *, free: bool
+) -> tuple[float, list[str]]:
     """Return the offset to apply, and what to say about it."""
-    if abs(math.remainder(offset - fixed, 2 * math.pi)) <= max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
+    if not _is_significant(offset - fixed, sigma):
         return fixed, []
     if free:
-        return offset, [f"heading is {text} off the course: applied; frames.heading_offset_deg sets it"]
-    return fixed, [f"heading is {text} off the course, {math.degrees(fixed):+.1f}° is applied"]
+        return offset, [f"heading is {text} off the course{cause}: applied; frames.heading_offset_deg sets it"]
+    return fixed, [f"heading is {text} off the course{cause}, {math.degrees(fixed):+.1f}° is applied"]
 
 
-def _name_turned_over(offset: float, windows: int) -> str:
+def _name_turned_over(rest: str, windows: int) -> str:
     """Say what a heading that turns the other way most likely is: yaw read in the other of ENU and NED."""
-    rest = math.degrees(math.remainder(offset + math.pi / 2, 2 * math.pi))
     return (
         f"the heading turns the other way than the course ({windows} windows): "
-        f"its yaw is of the other convention (ENU/NED), offset {rest:+.1f}°: applied; frames.heading sets it"
+        f"its yaw is of the other convention (ENU/NED), offset {rest}: applied; frames.heading sets it"
     )
 
 

@@ -19,7 +19,7 @@ from icrtool.analysis.heading_check import HeadingCheck
 from icrtool.analysis.reference_delay import busiest_part, delayed
 from icrtool.config import Config
 from icrtool.core.window_fit import Complexes
-from icrtool.tables import Floats, HeadingSamples, RobotLog
+from icrtool.tables import Bools, Floats, HeadingSamples, RobotLog
 
 HEADING_WINDOW_S = 0.5
 WAY_WINDOW_S = 1.0
@@ -31,6 +31,7 @@ BLOCK = 16
 
 FEWEST_WINDOWS = 60
 HUBER_SIGMAS = 2.0
+GAP_S, GAP_IN_INTERVALS, NEAR_GAP_S = 0.25, 5.0, 0.5
 ROUNDS, REWEIGHTS = 4, 5
 SMALLEST_CHANGE_MPS = 0.015
 """Changes of speed beyond what the other columns explain, root mean square: with less, as on a circle, slip decides."""
@@ -136,11 +137,14 @@ def heading_delay(log: RobotLog) -> Delay:
     if len(edges) < FEWEST_WINDOWS:
         return UNKNOWN
     ahead = _sum(wheels.v_left_mps - wheels.v_right_mps, t)
-    turned = np.diff(np.interp(edges, stamped, np.unwrap(heading.heading_rad)))
+    kept = _without_gap(t, edges[:-1], edges[1:]) & _without_gap(stamped, edges[:-1], edges[1:])
+    turned = np.diff(np.interp(edges, stamped, np.unwrap(heading.heading_rad)))[kept]
     ones = np.full(len(turned), HEADING_WINDOW_S)
+    if len(turned) < FEWEST_WINDOWS:
+        return UNKNOWN
 
     def explain(delay: float) -> tuple[Floats, Floats, Callable[[Floats], float]]:
-        now, after, before = (np.diff(np.interp(edges - delay + s, t, ahead)) for s in (0.0, STEP_S, -STEP_S))
+        now, after, before = (np.diff(np.interp(edges - delay + s, t, ahead))[kept] for s in (0.0, STEP_S, -STEP_S))
         return np.column_stack([now, (before - after) / (2 * STEP_S), ones]), turned, lambda p: float(p[0])
 
     return _search(explain)
@@ -166,7 +170,7 @@ def gnss_delay(log: RobotLog, check: HeadingCheck) -> Delay:
     inside = (fixed[first + span] - fixed[first] < 1.5 * max(WAY_WINDOW_S, interval)) & (
         (fixed[first] > t[0] + LARGEST_DELAY_S) & (fixed[first + span] < t[-1] - LARGEST_DELAY_S)
     )
-    first = first[inside]
+    first = first[inside & _without_gap(t, fixed[first], fixed[first + span])]
     last = first + span
     if len(first) < FEWEST_WINDOWS:
         return UNKNOWN
@@ -195,6 +199,16 @@ def gnss_delay(log: RobotLog, check: HeadingCheck) -> Delay:
 def _seconds(log: RobotLog) -> tuple[Floats, Floats]:
     origin = log.wheels.stamp_ns[0]
     return (log.wheels.stamp_ns - origin) / 1e9, (log.heading.stamp_ns - origin) / 1e9
+
+
+def _without_gap(t: Floats, begin: Floats, end: Floats) -> Bools:
+    """Return which windows (w,) keep clear of gaps between samples at t (n,), some delay to either side included."""
+    interval = np.diff(t)
+    gaps = np.flatnonzero(interval > max(GAP_S, GAP_IN_INTERVALS * float(np.median(interval))))
+    # In order, none overlaps another: those that end after the window begins, and begin before it ends.
+    ended = np.searchsorted(t[gaps + 1], begin - NEAR_GAP_S)
+    begun = np.searchsorted(t[gaps], end + NEAR_GAP_S, side="right")
+    return np.asarray(begun <= ended)
 
 
 def _sum(speed: Floats | Complexes, t: Floats) -> Complexes:

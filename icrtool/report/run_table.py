@@ -135,6 +135,8 @@ def _heading_lines(run: FilterRun) -> list[str]:
     # Adding zero takes the sign off a rounded -0.0.
     found = round(math.degrees(check.offset_rad), 1) + 0.0
     offset = f"{found:+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
+    if check.name.text:
+        offset += f" ({check.name.text})"
     applied = math.degrees(check.applied_offset_rad)
     return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
 
