@@ -160,14 +160,23 @@ def _reversed_or_swapped(log: RobotLog) -> tuple[WheelSamples, str] | None:
     away = abs(float(np.angle(np.exp(1j * course.angle).mean())))
     if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
-    mirrored = abs(np.exp(1j * course.mirrored).mean()) > abs(np.exp(1j * course.angle).mean())
+    correlation = _turn_correlation(log, course)
+    if correlation is not None and correlation < -CLEAR_CORRELATION:
+        return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
+    return None
+
+
+def _turn_correlation(log: RobotLog, course: Course) -> float | None:
+    """Return how heading turns and left going ahead of right correlate; None where there are too few turns.
+
+    The heading is taken in the sense in which it follows the course.
+    """
     turned, told = _turns(log)
     tells = len(turned) >= FEWEST_WINDOWS and float(np.ptp(told)) > 0 and float(np.ptp(turned)) > 0
-    if tells and float(np.abs(turned).sum()) > SMALLEST_TURN_RAD:
-        correlation = float(np.corrcoef(-turned if mirrored else turned, told)[0, 1])
-        if correlation < -CLEAR_CORRELATION:
-            return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
-    return None
+    if not tells or float(np.abs(turned).sum()) <= SMALLEST_TURN_RAD:
+        return None
+    mirrored = _agreement(course.mirrored) > _agreement(course.angle)
+    return float(np.corrcoef(-turned if mirrored else turned, told)[0, 1])
 
 
 def _agreement(angle: Floats) -> float:
@@ -183,11 +192,14 @@ def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
         ("left", WheelSamples(wheels.stamp_ns, -left, right)),
         ("right", WheelSamples(wheels.stamp_ns, left, -right)),
     ):
-        course = measure_course(replace(log, wheels=one))
-        if len(course.angle) < FEWEST_WINDOWS:
+        changed = replace(log, wheels=one)
+        course = measure_course(changed)
+        if len(course.angle) < FEWEST_WINDOWS or max(map(_agreement, (course.angle, course.mirrored))) < EXPLAINED:
             continue
-        right_way = abs(float(np.angle(np.exp(1j * course.angle).mean()))) < math.radians(90)
-        if _agreement(course.angle) >= EXPLAINED and right_way:
+        # Either side turned over makes a way; the wrong one is driven backwards, and turns the other way.
+        correlation = _turn_correlation(changed, course)
+        forwards = abs(float(np.angle(np.exp(1j * course.angle).mean()))) < math.radians(90)
+        if forwards if correlation is None else correlation > CLEAR_CORRELATION:
             return one, f"the {name} wheels count backwards"
     return None
 

@@ -11,8 +11,12 @@ import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.outages import real_outages
+from icrtool.analysis.simulate import Drive, Sensors
+from icrtool.analysis.simulate_record import simulate
 from icrtool.config import load_config
 from icrtool.core.ekf import GATED
+from icrtool.logio import read_log
+from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
 from icrtool.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bools, Datum, RobotLog
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -151,3 +155,16 @@ def test_preset_paper_counts_classes_and_changes_no_noise() -> None:
     assert run.summary["gnss"]["classes"]["float"]["fixes"] == int(np.count_nonzero(float_))
     assert np.array_equal(run.log.gnss.var_north_m2, log.gnss.var_north_m2)
     assert not len(run.outages_ns)
+
+
+def test_what_a_log_file_says_of_its_fixes_reaches_the_filter(tmp_path: Path) -> None:
+    recorded, _ = simulate(Drive(duration_s=60.0), Sensors(), seed=1)
+    columns = recorded.columns()
+    plain = (columns["gnss_stamp_ns"] - columns["gnss_stamp_ns"][0]) / 1e9 > 50.0
+    columns["gnss_status"] = np.where(plain, 0, 2)
+    options = WriteOptions(wheel_radius_m=0.08, track_width_m=0.52)
+    path = write_log(tmp_path / "drive.mcap", SensorColumns(**columns), options)
+    config = load_config(robot="pentzer-tracked")
+    run = fit(read_log(path, config), config)
+    assert run.summary["gnss"]["classes"]["other"]["down_weighted"] == int(np.count_nonzero(plain))
+    assert len(run.summary["rtk_losses_ns"]) == 1
