@@ -183,7 +183,9 @@ def fit(
         "drive": drive_summary(table),
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
         "segments": segment_summary(table, changes_s),
-        "gnss": gnss_summary(log, gnss) | delays.gnss_summary() | fixes.summary(*used_and_rejected(gnss)),
+        "gnss": gnss_summary(log, gnss, fixes.down_weighted)
+        | delays.gnss_summary()
+        | fixes.summary(*used_and_rejected(gnss)),
         "heading": check.summary() | delays.heading_summary(),
         "wheels": wheels.summary(),
         "outages_ns": outages.tolist(),

@@ -98,9 +98,9 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     seen = np.diff(gnss.north_m + 1j * gnss.east_m)
     dt = np.diff(gnss.stamp_ns) / 1e9
     usual = float(np.median(dt))
-    design = np.column_stack([laid, swing])
     some = slice(None, None, max(1, len(seen) // MOST_TO_FIT))
-    step = seen - design @ _explain(design[some], seen[some])
+    along, arm = _explain(laid[some], swing[some], seen[some])
+    step = seen - along * laid - arm * swing
     step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
     scale = _scale(step)
     with np.errstate(invalid="ignore"):
@@ -110,16 +110,21 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     return FixSteps(step, product, rows, jumps)
 
 
-def _explain(design: Complexes, seen: Complexes) -> Complexes:
-    """Return the two complex factors of `design` (m, 2) that explain most of `seen` (m,), wild steps left out."""
-    factors: Complexes = np.array([1.0, 0.0], np.complex128)
+def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[complex, complex]:
+    """Return the factors of `laid` and `swing` (m,) that explain most of `seen` (m,), wild steps left out."""
+    along, arm = 1.0 + 0.0j, 0.0 + 0.0j
     for _ in range(2):
-        left = np.abs(seen - design @ factors)
-        rows = left <= CLIP_SIGMAS * max(float(np.median(left)), 1e-9)
-        part = design[rows]
-        normal = part.conj().T @ part + np.diag([1e-9, 1e-9])
-        factors = np.asarray(np.linalg.solve(normal, part.conj().T @ seen[rows]), np.complex128)
-    return factors
+        left = np.abs(seen - along * laid - arm * swing)
+        kept = left <= CLIP_SIGMAS * max(float(np.median(left)), 1e-9)
+        a, b, z = laid[kept], swing[kept], seen[kept]
+        # Normal equations of two unknowns; the sums are written out: BLAS would start its threads for them.
+        aa, bb = float((np.abs(a) ** 2).sum()) + 1e-9, float((np.abs(b) ** 2).sum()) + 1e-9
+        ab, az, bz = (complex((np.conj(one) * other).sum()) for one, other in ((a, b), (a, z), (b, z)))
+        determinant = aa * bb - abs(ab) ** 2
+        if determinant <= 1e-9 * aa * bb:
+            return az / aa, 0.0j
+        along, arm = (bb * az - ab * bz) / determinant, (aa * bz - ab.conjugate() * az) / determinant
+    return along, arm
 
 
 def _scale(step: Complexes) -> float:

@@ -9,10 +9,9 @@ from typing import Any
 
 from icrtool.tables import Datum
 
-LIKE_SIGMAS = 3.0
 LIKE_RAD = math.radians(1.0)
-"""An offset is named after what it equals to within so many of its standard deviations, or this: compasses in robots
-are no better."""
+"""An offset is named after what it equals to within this: compasses in robots are no better. One that is not known
+that well, to three standard deviations, has no name."""
 
 SMALLEST_NAME_RAD = math.radians(0.5)
 UTM_LATITUDES_DEG = (-80.0, 84.0)
@@ -55,9 +54,10 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
     datum : where; None: a metric reference, of which no north is known
     stamp_ns : when, Unix time
     """
+    if not 3.0 * sigma_rad <= LIKE_RAD:
+        return NO_NAME
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
-    bound = max(LIKE_SIGMAS * sigma_rad, LIKE_RAD)
     norths = [("", 0.0)]
     if declination is not None and abs(declination) > math.degrees(SMALLEST_NAME_RAD):
         norths.append((f"magnetic declination here is {declination:+.1f}°", math.radians(declination)))
@@ -68,7 +68,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
             texts = [text for text in (turn_text, north_text) if text]
-            if away <= bound and texts:
+            if away <= LIKE_RAD and texts:
                 # The fewer causes, the likelier; then the nearer.
                 found.append((len(texts), away, " and ".join(texts)))
     return OffsetName(min(found)[2] if found else "", declination, convergence)

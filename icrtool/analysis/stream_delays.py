@@ -32,7 +32,7 @@ BLOCK = 16
 FEWEST_WINDOWS = 60
 HUBER_SIGMAS = 2.0
 GAP_S, GAP_IN_INTERVALS, NEAR_GAP_S = 0.25, 5.0, 0.5
-ROUNDS, REWEIGHTS = 4, 5
+ROUNDS, REWEIGHTS, SETTLED_S = 4, 5, 1e-3
 SMALLEST_CHANGE_MPS = 0.015
 """Changes of speed beyond what the other columns explain, root mean square: with less, as on a circle, slip decides."""
 
@@ -232,7 +232,7 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
     Huber's weights (Huber 1964); the covariance takes `BLOCK` windows for one sample (sandwich, White 1982).
     """
     delay, std = 0.0, math.nan
-    for _ in range(ROUNDS):
+    for first in (True, *(False,) * (ROUNDS - 1)):
         design, seen, scale_of = explain(delay)
         weight = np.ones(len(seen))
         ridge = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
@@ -249,10 +249,13 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
         gradients = np.add.reduceat(design * (weight * left)[:, None], np.arange(0, len(seen), BLOCK), axis=0)
         variance = float((inverse @ (gradients.T @ gradients) @ inverse)[1, 1])
         scale = abs(scale_of(solution))
-        if not scale > 1e-6 or _unexplained(design) < SMALLEST_CHANGE_MPS:
+        if not scale > 1e-6 or (first and _unexplained(design) < SMALLEST_CHANGE_MPS):
             return UNKNOWN
         std = math.sqrt(max(variance, 0.0)) / scale
-        delay += float(np.clip(solution[1] / scale_of(solution), -LARGEST_STEP_S, LARGEST_STEP_S))
+        step = float(np.clip(solution[1] / scale_of(solution), -LARGEST_STEP_S, LARGEST_STEP_S))
+        delay += step
         if abs(delay) > LARGEST_DELAY_S:
             return UNKNOWN
+        if abs(step) < SETTLED_S:
+            break
     return Delay(delay, std)

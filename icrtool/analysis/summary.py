@@ -128,10 +128,10 @@ def used_and_rejected(outcome: MeasurementOutcome) -> tuple[NDArray[np.bool_], N
     return (outcome.code > UNSEEN) & ~rejected, rejected
 
 
-def gnss_summary(log: RobotLog, gnss: MeasurementOutcome) -> dict[str, Any]:
-    """Return how many fixes were used and rejected, and how far the filter stays from those it used."""
-    used = (gnss.code > UNSEEN) & (gnss.code != GATED)
-    difference = gnss.difference[used]
+def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
+    used, _ = used_and_rejected(gnss)
+    difference = gnss.difference[used & ~down_weighted]
     datum = log.datum
     return {
         "used": int(np.count_nonzero(used)),

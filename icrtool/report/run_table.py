@@ -6,12 +6,16 @@ import math
 from typing import Any
 
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
 from icrtool.report.words import duration_text, length_text, position_word, run_title, way_text
 
 WIDTH = 100
 LABEL = 12
 """Columns of the left margin: what a line is about."""
+
+WORTH_TELLING_S = 0.05
+"""A delay below this is not worth a line."""
 
 ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
@@ -35,6 +39,7 @@ def format_run(run: FilterRun) -> str:
         "",
         *_position_lines(run),
         *_heading_lines(run),
+        *_delay_lines(run),
     ]
     return "\n".join(line.rstrip() for line in lines)
 
@@ -139,6 +144,19 @@ def _heading_lines(run: FilterRun) -> list[str]:
         offset += f" ({check.name.text})"
     applied = math.degrees(check.applied_offset_rad)
     return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
+
+
+def _delay_lines(run: FilterRun) -> list[str]:
+    """Say what seems to be late, or early, against the wheels."""
+    told: list[str] = []
+    if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
+        return told
+    for word, facts in (("heading", run.summary["heading"]), ("fixes", run.summary["gnss"])):
+        delay, std = facts["delay_s"], facts["delay_std_s"]
+        if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
+            told.append(f"{word} {abs(delay):.2f} ± {std:.2f} s {'late' if delay > 0 else 'early'}")
+    text = f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"
+    return [_line("delays", text)] if told else []
 
 
 def _line(label: str, text: str) -> str:
