@@ -12,8 +12,18 @@ from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
 from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
+from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
-from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
+from icrtool.analysis.stream_delays import measure_delays
+from icrtool.analysis.summary import (
+    converge,
+    drive_summary,
+    gnss_summary,
+    icr_summary,
+    nis_summary,
+    segment_summary,
+    used_and_rejected,
+)
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
@@ -66,6 +76,7 @@ class FilterRun:
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
     changes_s : terrain changes, seconds since the first recorded state
+    warm_start : what another run had learned, where this one began with it
     convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
     """
 
@@ -77,9 +88,11 @@ class FilterRun:
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
     heading_check: HeadingCheck
+    fix_quality: FixQuality
     covariance: Floats
     process_position_mps: float
     changes_s: tuple[float, ...]
+    warm_start: WarmStart | None
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
@@ -135,7 +148,9 @@ def fit(
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
-    adapted = run_adaptively(log, config, check, warm_start, changes_s)
+    delays = measure_delays(log, config, check)
+    fixes = judge_fixes(delays.log, config, check)
+    adapted = run_adaptively(fixes.log, config, check, warm_start, changes_s)
     log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
     table = _states(log, output)
     gnss = _outcome(
@@ -147,11 +162,13 @@ def fit(
     )  # fmt: skip
     gap = wheel_gap_s(config, setup.data.wheel_t)
     in_gap = np.append(np.diff(table.t_s) > gap, False)
-    convergence, outages = converge(table), _outages(table, gnss)
+    convergence, outages = converge(table), _outages(table, gnss, fixes.losses_ns)
     warnings = (
         *log.warnings,
         *wheels.warnings,
         *check.warnings,
+        *delays.warnings,
+        *fixes.warnings,
         *_doubts(log.name, table, gnss),
         *_adaptation_notes(log.name, config, adapted),
     )
@@ -166,16 +183,20 @@ def fit(
         "drive": drive_summary(table),
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
         "segments": segment_summary(table, changes_s),
-        "gnss": gnss_summary(log, gnss),
-        "heading": check.summary(),
+        "gnss": gnss_summary(log, gnss, fixes.down_weighted)
+        | delays.gnss_summary()
+        | fixes.summary(*used_and_rejected(gnss)),
+        "heading": check.summary() | delays.heading_summary(),
         "wheels": wheels.summary(),
         "outages_ns": outages.tolist(),
+        "rtk_losses_ns": fixes.losses_ns.tolist(),
         "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(in_gap)],
         "filter": {
             "preset": config.filter.preset,
             "process_position_mps": position_noise,
-            "reference_delay_s": adapted.reference_delay_s,
+            "reference_delay_s": delays.applied_gnss_s + adapted.reference_delay_s,
             "states": len(table),
+            "warm_start": _began_with(warm_start),
             **nis_summary(gnss, heading),
         },
     }
@@ -188,8 +209,10 @@ def fit(
         gnss=gnss,
         heading=heading,
         heading_check=check,
+        fix_quality=fixes,
         covariance=_square(output.P),
         changes_s=tuple(sorted(changes_s)),
+        warm_start=warm_start,
         process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
@@ -231,9 +254,15 @@ def _outcome(
     return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
 
 
-def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
-    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns]."""
-    used = gnss.stamp_ns[gnss.code > UNSEEN]
+def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:
+    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns].
+
+    Where RTK was lost, the fixes there do not count: the filter drove on with its wheels.
+    """
+    lost = np.zeros(len(gnss.stamp_ns), np.bool_)
+    for begin, end in rtk_losses_ns:
+        lost |= (gnss.stamp_ns > begin) & (gnss.stamp_ns < end)
+    used = gnss.stamp_ns[(gnss.code > UNSEEN) & ~lost]
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)
@@ -282,6 +311,12 @@ def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
             "clocks, antenna place or fix quality do not fit the wheels"
         )
     return [f"{name}: {doubt}" for doubt in doubts]
+
+
+def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
+    if warm_start is None:
+        return None
+    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
 
 
 def _square(upper: Floats) -> Floats:

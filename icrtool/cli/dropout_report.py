@@ -359,13 +359,14 @@ def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
         log_of,
         stored_config,
         terrain_changes_s,
+        warm_start_of,
     )
 
     config, path = stored_config(run), log_of(run)
     with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
         log = read_log(path, config, progress)
     check_same_log(run, log)
-    again = fit(log, config, changes_s=terrain_changes_s(run))
+    again = fit(log, config, warm_start=warm_start_of(run), changes_s=terrain_changes_s(run))
     check_same_states(run, again)
     return again
 

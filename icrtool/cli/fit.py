@@ -143,7 +143,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     if request.smooths:
         from icrtool.analysis.smooth import smooth
 
-        smoothed = smooth(run, warm_start=start)
+        smoothed = smooth(run)
     write_run(run, directory, states=request.states, plots=request.formats, smoothed=smoothed)
     options.warn(run.warnings, quiet=request.quiet)
     if not request.quiet:

@@ -235,12 +235,15 @@ def _fixes(
         )
     else:
         north, east = np.asarray(source.metric, np.float64)[rows].T
-    variance = source.variance[rows]
+    var_north, var_east, covariance = (np.ascontiguousarray(column) for column in source.variance[rows].T)
     fixes = PositionFixes(
         stamps[rows],
         np.ascontiguousarray(north, np.float64),
         np.ascontiguousarray(east, np.float64),
-        *(np.ascontiguousarray(column) for column in variance.T),
+        var_north,
+        var_east,
+        covariance,
+        told_class=None if source.told_class is None else source.told_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 
