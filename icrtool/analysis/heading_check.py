@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.tables import Floats, Ints, RobotLog
+from icrtool.tables import Floats, Ints, PositionFixes, RobotLog
 
 SHORTEST_WINDOW_M = 1.0
 WINDOW_IN_GNSS_STD = 12.0
@@ -21,6 +21,9 @@ LONGEST_WINDOW_S = 30.0
 """A window that takes longer holds an outage or a stop, and no course."""
 
 FEWEST_WINDOWS = 8
+UNSTATED_STD_M, NOISIER, FEWEST_FIXES = 0.01, 1.5, 30
+"""Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
+
 SIGNIFICANT_SIGMAS = 4.0
 SMALLEST_OFFSET_RAD = math.radians(2.0)
 """An offset is believed when it is this many of its standard deviations, and at least this large."""
@@ -99,7 +102,7 @@ class Course(NamedTuple):
     curvature : (w,) heading change over way [rad/m]
     ratio : (w,) displacement by the fixes over displacement by wheels and heading
     scattered : windows in which fixes and wheels went on, but the way laid along the heading led nowhere
-    noise_rad : what the fixes' noise alone turns a course by
+    noise_rad : what the fixes' noise alone turns a course by; white_rad : what their white noise does
     duration_s : median duration of a window
     """
 
@@ -109,6 +112,7 @@ class Course(NamedTuple):
     ratio: Floats
     scattered: int
     noise_rad: float
+    white_rad: float
     duration_s: float
 
 
@@ -150,6 +154,8 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
+    # A handful of windows may agree by chance, better than their fixes allow.
+    sigma *= max(1.0, course.white_rad / max(scatter, 1e-9))
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
     rest = offset + math.pi / 2 if turned_over else offset
     name = NO_NAME
@@ -290,12 +296,10 @@ def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, flo
 def measure_course(log: RobotLog) -> Course:
     """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
     gnss, wheels = log.gnss, log.wheels
-    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0, 0.0, 0.0)
+    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0, 0.0, 0.0, 0.0)
     if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:
         return none
-    variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
-    known = variance[np.isfinite(variance)]
-    noise = math.sqrt(float(np.median(known))) if len(known) else 0.01
+    noise, white = _fix_noise_m(gnss)
     length = max(SHORTEST_WINDOW_M, WINDOW_IN_GNSS_STD * noise)
     interval = np.diff(wheels.stamp_ns) / 1e9
     step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * np.where(interval < 1.0, interval, 0.0)
@@ -325,8 +329,28 @@ def measure_course(log: RobotLog) -> Course:
         (np.abs(seen) / np.where(moved, np.hypot(real, imaginary), 1.0))[moved],
         int(np.count_nonzero(went & ~led)),
         noise * math.sqrt(2.0) / length,
+        white * math.sqrt(2.0) / length,
         float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,
     )
+
+
+def _fix_noise_m(gnss: PositionFixes) -> tuple[float, float]:
+    """Return the noise of the fixes, an axis [m], and how much of it is seen to be white.
+
+    The noise is what they state, or what their own second differences show where that is clearly more.
+
+    Three white errors make a second difference of six times the variance; what the robot does between two fixes adds
+    little where they are frequent, and lengthens the windows where they are not.
+    """
+    variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
+    known = variance[np.isfinite(variance)]
+    stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
+    if len(gnss.stamp_ns) < FEWEST_FIXES:
+        return stated, 0.0
+    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    # The median of a Rayleigh distribution is 1.1774 of its scale.
+    seen = float(np.median(bend)) / 1.1774 / math.sqrt(6.0)
+    return (seen if seen > NOISIER * stated else stated), min(seen, stated) if seen <= NOISIER * stated else seen
 
 
 def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:

@@ -119,3 +119,13 @@ def test_outliers_among_the_fixes_do_not_condemn_the_heading() -> None:
     far = 5.0 * (rng.random(len(log.gnss.north_m)) < 0.15)
     run = fit(replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + far)), load_config(sets=[WIDTH]))
     assert run.heading_check.applied_offset_rad == pytest.approx(0.0, abs=math.radians(OFFSET_TOLERANCE_DEG))
+
+
+def test_fixes_that_are_noisier_than_they_say_do_not_condemn_the_heading() -> None:
+    log, rng = clean(), np.random.default_rng(7)
+    north, east = (column + rng.normal(0.0, 0.5, len(column)) for column in (log.gnss.north_m, log.gnss.east_m))
+    run = fit(replace(log, gnss=replace(log.gnss, north_m=north, east_m=east)), load_config(sets=[WIDTH]))
+    check = run.heading_check
+    assert check.agreement > 0.9
+    assert (check.applied_offset_rad, check.applied_std_rad) == (0.0, 0.0)
+    assert abs(check.offset_rad) < 4 * check.offset_std_rad
