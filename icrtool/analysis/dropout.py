@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
-from icrtool.analysis.window_fit import CONSTANT, cut_windows, thin_windows, window_spacing_m
-from icrtool.analysis.window_solve import solve_windows
 from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
@@ -158,7 +156,7 @@ def dropout(
     ----------
     run : a `FilterRun`, or a run read back from its directory
     horizons_m : distances driven blind, in any order; default those of the run's configuration
-    models : what to predict with; default `judged_models` of the run
+    models : what to predict with; default `models_of` of the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -180,7 +178,7 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else judged_models(run)
+    models = models if models is not None else models_of(run)
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
     with ThreadPoolExecutor(THREADS) as pool:
@@ -251,17 +249,6 @@ def models_of(run: DrivenRun) -> tuple[Model, ...]:
     final = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*final)))
     return tuple(models)
-
-
-def judged_models(run: DrivenRun) -> tuple[Model, ...]:
-    """Return `models_of` the run and, where it is long enough, the constants fitted to windows of all of its way."""
-    try:
-        windows = thin_windows(cut_windows(run, every_m=window_spacing_m(run)))
-    except DataError:
-        return models_of(run)
-    found = solve_windows(windows, CONSTANT, np.ones(len(windows.start), np.bool_))
-    right, left, x = (float(value) for value in found.parameters[:3])
-    return (*models_of(run), Model("icr_window", "ICR, window fit", FrozenIcrs.constant(right, left, x)))
 
 
 def _groups(horizons: int, states: int) -> list[slice]:

@@ -16,7 +16,7 @@ from icrtool.cli.fit import RUNS, plot_formats, run_directories
 
 if TYPE_CHECKING:
     from icrtool.analysis.driven_run import DrivenRun
-    from icrtool.analysis.dropout import DropoutReport, ErrorSink
+    from icrtool.analysis.dropout import ErrorSink
     from icrtool.analysis.fit import FilterRun
     from icrtool.analysis.gates import Gate
     from icrtool.analysis.outages import Outage
@@ -282,10 +282,8 @@ def _analyse(
         examples, worst = example_drives(run), worst_drives(run)
         draw_paths(draw, title, run.table, (examples, worst), outages)
         horizons = _horizons(run, request)
-        # The three histograms are drawn while all the rest is computed.
-        if request.formats and (preview := _preview(run, horizons)) is not None:
-            draw_histograms(draw, title, preview)
         report = dropout(run, horizons, seed=request.seed, sink=sink)
+        draw_histograms(draw, title, report)
         draw_summary(draw, title, report, outages)
         ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
         if ladder is not None:
@@ -306,16 +304,6 @@ def _analyse(
         )
         write_content(content, partial)
     return content
-
-
-def _preview(run: DrivenRun, horizons: list[float]) -> DropoutReport | None:
-    """Compute what the histograms show ahead of all else; None where none of their horizons is asked for."""
-    from icrtool.analysis.dropout import dropout, models_of
-    from icrtool.report.dropout_drawing import HISTOGRAM_HORIZONS_M, HISTOGRAM_MODELS
-
-    shown = [horizon for horizon in HISTOGRAM_HORIZONS_M if horizon in horizons]
-    models = [model for model in models_of(run) if model.name in HISTOGRAM_MODELS]
-    return dropout(run, shown, models=models) if shown else None
 
 
 def _horizons(run: DrivenRun, request: Request) -> list[float]:

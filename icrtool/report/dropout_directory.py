@@ -31,7 +31,6 @@ KNOWS = {
     "icr": "the way up to each start",
     "no_slip": "the track width",
     "icr_final": "all of the way (in sample)",
-    "icr_window": "all of the way (in sample)",
 }
 """What the ICRs of a model were learned from."""
 

@@ -112,7 +112,7 @@ def test_starts_that_are_no_trial_are_counted_by_kind(run: FilterRun) -> None:
 
 def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., FilterRun]) -> None:
     report = dropout(make_run(track_width_m=None, duration_s=20.0), [1.0])
-    assert [result.name for result in report.results] == ["icr", "icr_final", "icr_window"]
+    assert [result.name for result in report.results] == ["icr", "icr_final"]
     assert report.result("no_slip") is None
 
 
