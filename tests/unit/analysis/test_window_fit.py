@@ -25,7 +25,8 @@ LARGEST_MISS_M = 0.01
 
 @cache
 def made(seed: int, seconds: float = 200.0) -> FilterRun:
-    return fit(make_log(seed, seconds), CONFIG)
+    """A drive by Euler steps, as the windows drive too: their x_icr is what makes the dropout's steps right."""
+    return fit(make_log(seed, seconds, step_heading=0.0), CONFIG)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
