@@ -51,11 +51,12 @@ RECOVERY_S = 1.0
 """Rejected measurements that agree with each other for this long are believed."""
 
 MIDDLE_OF_THE_TURN = 0.5
-"""Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz, 1 m/s);
-a robot that turns while its tracks are held moves along the heading of the middle of its turn."""
+"""Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and
+1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
 
-ICR_INFLATION_M2 = 100.0
-"""Pentzer 2014, Section 5.2: ICR variance after a change of terrain."""
+PAPER_TERRAIN_ICR_STD_M = 10.0
+"""Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's width:
+from 10 m, ICRs that are a metre apart end wrong in one drive of six, from the width in none (a linearised filter)."""
 
 
 class WarmStart(NamedTuple):
@@ -247,6 +248,13 @@ def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
     return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
 
 
+def _terrain_icr_std_m(config: Config) -> float:
+    given = config.filter.terrain_icr_std_m
+    if given is not None:
+        return given
+    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config)
+
+
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
     return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
@@ -310,6 +318,6 @@ def _parameters(
         gap_turn_variance=GAP_TURN_STD_RADPS**2,
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
-        icr_inflation_m2=ICR_INFLATION_M2,
+        icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
         least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config),
     )

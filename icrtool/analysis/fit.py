@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,11 @@ from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
+from icrtool.analysis.terrain import TerrainTest, find_terrain_changes, given_changes
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
+from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
@@ -32,6 +34,10 @@ OUTAGE_S = 2.0
 
 OUTAGE_IN_INTERVALS = 5.0
 """... and at least this many times the usual interval between fixes."""
+
+
+LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
+"""What drives and turns less has shown nothing of the ICRs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +71,9 @@ class FilterRun:
     gnss, heading : what became of the measurements
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
-    changes_s : terrain changes, seconds since the first recorded state
-    convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
+    terrain : changes of the ICRs, given and detected
+    convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None; until the first
+        terrain change
     """
 
     log: RobotLog
@@ -79,7 +86,7 @@ class FilterRun:
     heading_check: HeadingCheck
     covariance: Floats
     process_position_mps: float
-    changes_s: tuple[float, ...]
+    terrain: TerrainTest
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
@@ -88,6 +95,11 @@ class FilterRun:
     def name(self) -> str:
         """Name of the log."""
         return self.log.name
+
+    @property
+    def changes_s(self) -> tuple[float, ...]:
+        """Terrain changes, seconds since the first recorded state."""
+        return self.terrain.times_s
 
     @property
     def track_width_m(self) -> float | None:
@@ -106,6 +118,7 @@ def fit(
     *,
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
+    find_changes: bool = False,
 ) -> FilterRun:
     """Learn a robot's track ICRs from a log.
 
@@ -115,6 +128,7 @@ def fit(
     config : default: all defaults
     warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
     changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
+    find_changes : look for more of them, and run the filter again with those found
 
     Returns
     -------
@@ -135,24 +149,22 @@ def fit(
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
-    adapted = run_adaptively(log, config, check, warm_start, changes_s)
-    log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
-    table = _states(log, output)
-    gnss = _outcome(
-        log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
-    )
-    heading = _outcome(
-        log.heading.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
-        output.heading_innovation,
-    )  # fmt: skip
-    gap = wheel_gap_s(config, setup.data.wheel_t)
-    in_gap = np.append(np.diff(table.t_s) > gap, False)
-    convergence, outages = converge(table), _outages(table, gnss)
+    terrain = given_changes(changes_s)
+    done = _run(log, config, check, warm_start, terrain)
+    if find_changes:
+        terrain = _find_changes(done, terrain)
+        if len(terrain.changes) > len(done.terrain.changes):
+            done = _run(log, config, check, warm_start, terrain)
+    adapted, table, gnss, heading, in_gap, outages, _ = done
+    log, output, position_noise = adapted.log, adapted.output, adapted.process_position_mps
+    terrain, beyond = terrain.within(float(table.t_s[-1]))
+    convergence = converge(table, min(terrain.times_s, default=None))
     warnings = (
         *log.warnings,
         *wheels.warnings,
         *check.warnings,
         *_doubts(log.name, table, gnss),
+        *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
         *_adaptation_notes(log.name, config, adapted),
     )
     summary = {
@@ -165,7 +177,8 @@ def fit(
         "warnings": list(warnings),
         "drive": drive_summary(table),
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
-        "segments": segment_summary(table, changes_s),
+        "terrain": terrain.summary(),
+        "segments": segment_summary(table, terrain.times_s),
         "gnss": gnss_summary(log, gnss),
         "heading": check.summary(),
         "wheels": wheels.summary(),
@@ -189,7 +202,7 @@ def fit(
         heading=heading,
         heading_check=check,
         covariance=_square(output.P),
-        changes_s=tuple(sorted(changes_s)),
+        terrain=terrain,
         process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
@@ -200,6 +213,41 @@ def fit(
     summary["excitation"] = excitation.summary()
     summary["warnings"] = [*warnings, *told]
     return replace(run, warnings=(*warnings, *told))
+
+
+class _Done(NamedTuple):
+    """A pass of the filter over a log, in the words of `FilterRun`."""
+
+    adapted: AdaptedRun
+    table: States
+    gnss: MeasurementOutcome
+    heading: MeasurementOutcome
+    in_gap: Bools
+    outages_ns: Ints
+    terrain: TerrainTest
+
+
+def _run(
+    log: RobotLog, config: Config, check: HeadingCheck, warm_start: WarmStart | None, terrain: TerrainTest
+) -> _Done:
+    adapted = run_adaptively(log, config, check, warm_start, terrain.times_s)
+    log, setup, output = adapted.log, adapted.setup, adapted.output
+    table = _states(log, output)
+    gnss = _outcome(
+        log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
+    )
+    heading = _outcome(
+        log.heading.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
+        output.heading_innovation,
+    )  # fmt: skip
+    in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
+    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss), terrain)
+
+
+def _find_changes(done: _Done, terrain: TerrainTest) -> TerrainTest:
+    seen = done.heading.code > UNSEEN
+    innovations = done.heading.t_s[seen], done.heading.difference[seen]
+    return find_terrain_changes(done.table, done.in_gap, done.outages_ns, innovations, terrain.times_s)
 
 
 def _states(log: RobotLog, output: FilterOutput) -> States:
@@ -265,10 +313,10 @@ def _adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[st
 def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
     """Return what a user should know before trusting the numbers."""
     doubts = []
-    distance = float(table.distance_m[-1])
-    if distance < 1.0:
+    distance, turns = float(table.distance_m[-1]), _turns(table)
+    if distance < LITTLE_WAY_M and not turns:
         doubts.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
-    elif float(np.ptp(table.heading_rad)) < math.radians(20):
+    elif not turns:
         doubts.append("the robot hardly turned: the ICRs are not observable on a straight drive")
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
         doubts.append(
@@ -282,6 +330,19 @@ def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
             "clocks, antenna place or fix quality do not fit the wheels"
         )
     return [f"{name}: {doubt}" for doubt in doubts]
+
+
+def _turns(table: States) -> bool:
+    """Say whether the robot turned enough to show its ICRs: by the heading and, if it went nowhere, by the wheels too.
+
+    A parked robot whose heading drifts has learned nothing, and one that spun on the spot has.
+    """
+    turned = float(np.ptp(table.heading_rad))
+    if float(table.distance_m[-1]) < LITTLE_WAY_M:
+        width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
+        ahead = np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1])
+        turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
+    return turned >= LITTLE_TURN_RAD
 
 
 def _square(upper: Floats) -> Floats:

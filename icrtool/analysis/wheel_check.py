@@ -143,19 +143,20 @@ def _reversed_or_swapped(log: RobotLog) -> tuple[WheelSamples, str] | None:
     if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
     mirrored = abs(np.exp(1j * course.mirrored).mean()) > abs(np.exp(1j * course.angle).mean())
-    turned, told = _turns(log)
-    tells = len(turned) >= FEWEST_WINDOWS and float(np.ptp(told)) > 0 and float(np.ptp(turned)) > 0
-    if tells and float(np.abs(turned).sum()) > SMALLEST_TURN_RAD:
-        correlation = float(np.corrcoef(-turned if mirrored else turned, told)[0, 1])
-        if correlation < -CLEAR_CORRELATION:
-            return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
+    if _turn_correlation(log) * (-1.0 if mirrored else 1.0) < -CLEAR_CORRELATION:
+        return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
     return None
 
 
 def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
-    """Look for a side that counts backwards: then the sides cancel, and their difference makes the way."""
+    """Look for a side that counts backwards: then the sides cancel, and their difference makes the way.
+
+    Spins on the spot have no way either, but there the difference makes the turn.
+    """
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
+    if abs(_turn_correlation(log)) > CLEAR_CORRELATION:
+        return None
     for name, one in (
         ("left", WheelSamples(wheels.stamp_ns, -left, right)),
         ("right", WheelSamples(wheels.stamp_ns, left, -right)),
@@ -167,6 +168,14 @@ def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
         if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and right_way:
             return one, f"the {name} wheels count backwards"
     return None
+
+
+def _turn_correlation(log: RobotLog) -> float:
+    """Return how well left ahead of right tells the turns of the heading, -1 to 1; 0 where there are too few."""
+    turned, told = _turns(log)
+    if len(turned) < FEWEST_WINDOWS or float(np.abs(turned).sum()) <= SMALLEST_TURN_RAD:
+        return 0.0
+    return float(np.corrcoef(turned, told)[0, 1]) if np.ptp(told) > 0 and np.ptp(turned) > 0 else 0.0
 
 
 def _turns(log: RobotLog) -> tuple[Floats, Floats]:

@@ -25,7 +25,7 @@ def make_log(
     faster: float = 1.0,
     step_heading: float = 0.5,
 ) -> RobotLog:
-    """Drive curves for some seconds, along arcs or (``step_heading=0``) by Euler steps; return what the sensors said."""
+    """Drive curves for some seconds, or (``step_heading=0``) by Euler steps; return what the sensors said."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 1.0 / rate)
     v_left, v_right = 0.5 + 0.25 * np.sin(0.5 * t), 0.5 + 0.25 * np.sin(0.31 * t + 1.0)

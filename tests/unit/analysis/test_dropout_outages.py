@@ -9,12 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from icrtool.analysis.dropout import drive_of
 from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import STATE_COLUMNS, FilterRun, fit
 from icrtool.analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.core.ekf_plain import step_state
-from icrtool.core.open_loop import open_loop_path
 from icrtool.errors import ConfigError, DataError
 
 

@@ -21,7 +21,8 @@ LEVER = (0.2, -0.1)
 def parameters(**other: object) -> FilterParameters:
     values: dict[str, object] = {
         "process_variance": (0.04, 0.04, 0.01, 1e-4, 1e-4, 1e-4), "rate_invariant": True, "step_heading": 0.5,
-        "gnss_gate": math.inf, "heading_gate": math.inf, "heading_correlation": 3.0, "antenna_forward": LEVER[0], "antenna_right": LEVER[1],
+        "gnss_gate": math.inf, "heading_gate": math.inf, "heading_correlation": 3.0,
+        "antenna_forward": LEVER[0], "antenna_right": LEVER[1],
         "wheel_gap_s": 0.5, "gap_speed_variance": 4.0, "gap_turn_variance": 1.0, "recovery_count": 5, "recovery_s": 0.2,
         "icr_inflation_m2": 100.0, "least_icr": -math.inf,
     }  # fmt: skip
