@@ -92,7 +92,7 @@ class FilterConfig(_Section):
     `heading_std_deg` those of R (Eq. 31), used where the messages do not say. `process_position_mps` is 0.2 (Eq. 30);
     in preset ``field``, ``auto`` starts at 0.3 and raises it when the fixes contradict wheels this good.
     `process_heading_degps` is 5 (Eq. 30), in preset ``field`` 7.
-    `terrain_icr_std_m` is what the ICRs are uncertain by after a terrain change: 10 (Section 5.2), in preset ``field`` the
+    `terrain_icr_std_m` is how uncertain the ICRs are after a terrain change: 10 (Section 5.2), in preset ``field`` the
     robot's width.
     `heading_correlation_s` is how long an AHRS errs alike: closer samples are not independent (``field`` only).
     """

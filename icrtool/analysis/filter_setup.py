@@ -56,7 +56,7 @@ MIDDLE_OF_THE_TURN = 0.5
 
 PAPER_TERRAIN_ICR_STD_M = 10.0
 """Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's width:
-from 10 m, ICRs that are a metre apart end wrong in one drive of six, from the width in none (a linearised filter)."""
+from 10 m, ICRs a metre apart came out wrong in one of six simulated drives, from the width in none."""
 
 
 class WarmStart(NamedTuple):

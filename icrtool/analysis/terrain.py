@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.analysis.change_test import Step, find_steps
 from icrtool.analysis.summary import ICR_COLUMNS
-from icrtool.core.change_test import Step, find_steps
 from icrtool.tables import Bools, Complexes, Floats, Ints, States
 
 FALSE_ALARMS_PER_HOUR = 0.1

@@ -127,7 +127,7 @@ def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float,
     low, high = value - band, value + band
     shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit)
     for change in run.changes_s:
-        axes.axvline(change / unit, **CHANGE.keywords())
+        axes.axvline(change / unit, zorder=2.6, **CHANGE.keywords())
     shown = extremes(low, high)
     axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
     shown = extremes(value)

@@ -105,7 +105,7 @@ def _terrain_lines(run: FilterRun) -> list[str]:
                 f"false alarms: {FALSE_ALARMS_PER_HOUR:g} an hour"
             )
         else:
-            said = f"too few turns in {driven} of driving to look for changes of the ICRs"
+            said = "too few turns, or too rough a position, to look for changes of the ICRs"
         lines.append(_line("terrain", said))
     if not terrain.changes:
         return lines

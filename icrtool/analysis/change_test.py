@@ -12,15 +12,14 @@ values, and the error, that of most places, bears the steps themselves. With mea
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri, stdtr
 
-Floats = NDArray[np.float64]
+from icrtool.tables import Floats
 
-SPANS = (4, 8, 16, 32)
+SPANS = (5, 10, 20, 40)
 """Values on either side of a step, each twice the one before."""
 
 MEDIAN_VARIANCE = math.pi / 2
@@ -29,10 +28,10 @@ MEDIAN_VARIANCE = math.pi / 2
 NORMAL_MAD = 1.4826
 """Standard deviation of normal values over their median absolute deviation."""
 
-LONG_SERIES = 10
+LONG_SERIES = 6
 """A series this many times longer than a span tells itself how much medians over it differ."""
 
-LARGEST_SCORE = 37.0
+LARGEST_SCORE, SMALLEST_P = 37.0, 1e-298
 """Beyond, a probability is zero in floating point."""
 
 
@@ -84,6 +83,8 @@ def find_steps(
     differ by falls with the square root of the span, or less where a long series says so: values that wander are
     allowed for as far as the spans go. Narrow spans come first: they place a step best and see no other.
     """
+    from scipy.special import ndtr, stdtr
+
     n, c = values.shape
     spans = [span for span in SPANS if 2 * span <= n]
     comparisons = c * sum(n - 2 * span + 1 for span in spans)
@@ -116,4 +117,4 @@ def find_steps(
 
 def _score(p: float) -> float:
     """Return the score of a two-sided probability."""
-    return min(float(-ndtri(p / 2)), LARGEST_SCORE) if p > 0 else LARGEST_SCORE
+    return min(-NormalDist().inv_cdf(p / 2), LARGEST_SCORE) if p > SMALLEST_P else LARGEST_SCORE
