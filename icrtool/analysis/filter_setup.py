@@ -55,8 +55,8 @@ MIDDLE_OF_THE_TURN = 0.5
 1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
 
 PAPER_TERRAIN_ICR_STD_M = 10.0
-"""Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's width:
-from 10 m, ICRs a metre apart came out wrong in one of six simulated drives, from the width in none."""
+"""Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's
+width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
 class WarmStart(NamedTuple):
