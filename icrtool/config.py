@@ -73,13 +73,14 @@ class FramesConfig(_Section):
     """Where sensors sit and what their yaw means.
 
     `antenna_*`: the antenna from the body origin; ``auto`` is what the log's own ``/tf_static`` says, else 0.
-    `reference_delay_s`: how late the position reference is against the wheels; ``auto`` looks for it where the two
-    contradict each other (preset ``field``).
+    `reference_delay_s`, `heading_delay_s`: how late position reference and heading are against the wheels; ``auto``
+    takes out what is clear (preset ``field``).
     """
 
     heading: Literal["auto", "enu", "ned"] = "auto"
     heading_offset_deg: Literal["auto"] | Finite = "auto"
     reference_delay_s: Literal["auto"] | Finite = "auto"
+    heading_delay_s: Literal["auto"] | Finite = "auto"
     antenna_forward_m: Literal["auto"] | Finite = "auto"
     antenna_right_m: Literal["auto"] | Finite = "auto"
     datum: tuple[Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=360)]] | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,10 +15,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
 Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 Role = Literal["wheels", "gnss", "heading"]
 
 
-def _check_lengths(stamp_ns: Ints, *columns: Floats) -> None:
+NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
+"""What a message says of how its position was solved: nothing, without carrier phase (or unknown), RTK float, RTK
+fixed, RTK without saying which."""
+
+
+def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
     lengths = [len(column) for column in columns]
     if any(length != len(stamp_ns) for length in lengths):
         raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
@@ -51,6 +57,7 @@ class PositionFixes:
     stamp_ns : int64 (n,), non-decreasing
     north_m, east_m : float64 (n,)
     var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
+    told_class : uint8 (n,), NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
     """
 
     stamp_ns: Ints
@@ -59,11 +66,18 @@ class PositionFixes:
     var_north_m2: Floats
     var_east_m2: Floats
     cov_north_east_m2: Floats
+    told_class: Bytes | None = None
 
     def __post_init__(self) -> None:
+        told = () if self.told_class is None else (self.told_class,)
         _check_lengths(
-            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2
+            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2, *told
         )
+
+    def cut(self, rows: slice) -> PositionFixes:
+        """Return the fixes of some rows."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +97,25 @@ class HeadingSamples:
 
     def __post_init__(self) -> None:
         _check_lengths(self.stamp_ns, self.heading_rad, self.var_rad2)
+
+
+@dataclass(frozen=True, slots=True)
+class GyroSamples:
+    """Turn rates, clockwise positive.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rate_radps : float64 (n,)
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rate_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rate_radps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +168,7 @@ class RobotLog:
     rejected_fixes : fixes dropped at the door by reason (``no fix``, ``not finite`` ...)
     warnings : sentences for the user, in the order they were found
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
+    gyro : turn rates of an inertial unit, None without one; the filter does not use them
     """
 
     name: str
@@ -147,6 +181,7 @@ class RobotLog:
     rejected_fixes: dict[str, int]
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] | None = None
+    gyro: GyroSamples | None = None
 
 
 @dataclass(frozen=True, slots=True)

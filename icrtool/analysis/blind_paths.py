@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, Model, drive_of, models_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.dropout import Model, models_of
 from icrtool.core.open_loop import SHORT, Drive, OpenLoopPath, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.tables import Floats, Ints

@@ -57,6 +57,20 @@ SAME_CLOCK_S = 1e-3
 """Prior of that delay where both are fields of the same messages."""
 
 
+class WindowMisses(NamedTuple):
+    """What is left of the windows of way, before and after: nothing corrected but W, and all of it.
+
+    Attributes
+    ----------
+    before, after : (3, w) along and across [m], heading change [rad]; prediction minus measurement
+    turn_rad : (w,) heading change measured
+    """
+
+    before: Floats
+    after: Floats
+    turn_rad: Floats
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """All parameters, in the order of `NAMES`, and their covariance.
@@ -65,6 +79,7 @@ class Estimate:
     ----------
     values : (9,); covariance : (9, 9)
     windows, stretches : compared, and stretches of way taken for independent
+    misses : of all windows, before and after
     miss_m, miss_rad : robust standard deviation of short windows' displacements and heading changes
     """
 
@@ -75,6 +90,7 @@ class Estimate:
     miss_m: float
     miss_rad: float
     facts: DriveFacts
+    misses: WindowMisses
 
     @property
     def std(self) -> Floats:
@@ -132,6 +148,7 @@ def estimate(log: RobotLog, config: Config | None = None) -> Estimate:
     residual, slopes = compare(evidence, values)
     covariance, stretches = _covariance(evidence, residual * weights, slopes * weights[:, None], information)
     short = np.flatnonzero(evidence.long == 0)
+    untouched = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, values[8]])
     count = len(evidence.begin)
     return Estimate(
         values=values,
@@ -141,6 +158,9 @@ def estimate(log: RobotLog, config: Config | None = None) -> Estimate:
         miss_m=float(np.hypot(scale[short[0]], scale[count + short[0]])),
         miss_rad=float(scale[2 * count + short[0]]),
         facts=summarise_drive(evidence),
+        misses=WindowMisses(
+            compare(evidence, untouched)[0].reshape(3, -1), residual.reshape(3, -1), _predict(evidence, values).turned
+        ),
     )
 
 

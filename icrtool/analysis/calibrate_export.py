@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun
+from icrtool.analysis.driven_run import DrivenRun
 from icrtool.analysis.excitation import judge_excitation
-from icrtool.analysis.ladder import clear_of, count_blocks
+from icrtool.analysis.ladder import count_blocks
+from icrtool.analysis.ladder_fits import clear_of
 from icrtool.analysis.window_fit import (
     EXTENDED,
     WindowFit,

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.analysis.calibrate import NAMES, PRIOR_STD, Estimate, estimate
+from icrtool.analysis.calibrate import NAMES, PRIOR_STD, Estimate, WindowMisses, estimate
 from icrtool.analysis.calibrate_evidence import DriveFacts
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
@@ -110,6 +110,7 @@ class Calibration:
     miss_m: float
     facts: DriveFacts
     inputs: tuple[dict[str, Any], ...]
+    misses: WindowMisses
 
     def finding(self, key: str) -> Finding:
         """Return a finding by its key."""
@@ -174,6 +175,7 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
         miss_m=found.miss_m,
         facts=found.facts,
         inputs=tuple({"path": one.path, "bytes": one.bytes, "sha256": one.sha256} for one in log.inputs),
+        misses=found.misses,
     )
 
 

@@ -6,10 +6,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.window_fit import CONSTANT, cut_windows, thin_windows, window_spacing_m
+from icrtool.analysis.window_solve import solve_windows
 from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
@@ -17,12 +21,14 @@ from icrtool.core.statistics import (
     Intervals,
     Summary,
     bootstrap_intervals,
-    histogram,
+    histogram_sorted,
     round_bin_width,
-    summarise,
+    sort_trials,
+    summarise_sorted,
 )
+from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import ConfigError, DataError
-from icrtool.tables import Bools, Floats, Ints, States
+from icrtool.tables import Floats, Ints
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,8 +40,11 @@ BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
 """Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
-LARGEST_TABLE_BYTES = 160 << 20
-"""Errors held at a time: horizons are taken in groups below it, whatever the length of the log."""
+LARGEST_TABLE_BYTES = 96 << 20
+"""Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
+
+BYTES_A_TRIAL = 12
+"""An error, and where its trial ends."""
 
 STANDING_MPS = 0.01
 """Slower than this the robot stands."""
@@ -44,45 +53,11 @@ BULK_IN_P95 = 3.0
 MOST_BULKS = 10.0
 """A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
 
-STARTS_A_CALL = 1 << 15
+STARTS_A_CALL = 1 << 14
 """Starts tried by a thread at a time."""
 
 THREADS = 2
 """The kernels run beside each other; more threads would need more memory and find little more to do."""
-
-
-class DrivenRun(Protocol):
-    """A filter run, just made or read back: what the analysis needs of it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the log."""
-        ...
-
-    @property
-    def table(self) -> States:
-        """The recorded states."""
-        ...
-
-    @property
-    def in_gap(self) -> Bools:
-        """Whether the interval after a state is a gap in the wheel data (n,)."""
-        ...
-
-    @property
-    def outages_ns(self) -> Ints:
-        """Half-open spans without usable GNSS (k, 2)."""
-        ...
-
-    @property
-    def track_width_m(self) -> float | None:
-        """Distance b between the track centre lines, None where not given."""
-        ...
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What run.json holds, the effective configuration among it."""
-        ...
 
 
 class Model(NamedTuple):
@@ -183,7 +158,7 @@ def dropout(
     ----------
     run : a `FilterRun`, or a run read back from its directory
     horizons_m : distances driven blind, in any order; default those of the run's configuration
-    models : what to predict with; default `models_of` the run
+    models : what to predict with; default `judged_models` of the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -205,18 +180,18 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else models_of(run)
+    models = models if models is not None else judged_models(run)
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
     with ThreadPoolExecutor(THREADS) as pool:
         for group in _groups(len(horizons), len(run.table)):
+            ends, count = _ends(drive, horizons[group], pool)
+            counts.append(count)
             for model in models:
-                errors, count = _errors(drive, model.icrs, horizons[group], pool)
+                errors = _errors(drive, model.icrs, ends, pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
                 parts[model.name].append(_judge(model, errors, drive, horizons[group], seed, pool))
-                if model is models[0]:
-                    counts.append(count)
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
@@ -260,10 +235,14 @@ def load_kernels() -> None:
     errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
     bootstrap_intervals(errors, way, horizon, DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
+    motion = move(
+        way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
+    )
+    window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
 
 
 def models_of(run: DrivenRun) -> tuple[Model, ...]:
-    """Return the models to judge: momentary ICRs, no slip where b is known, the run's final ICRs."""
+    """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
     table = run.table
     models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
     width = run.track_width_m
@@ -274,45 +253,49 @@ def models_of(run: DrivenRun) -> tuple[Model, ...]:
     return tuple(models)
 
 
-def drive_of(run: DrivenRun) -> Drive:
-    """Return the run's states as the kernels want them."""
-    table = run.table
-    in_outage = np.zeros(len(table), np.bool_)
-    for begin, end in run.outages_ns:
-        # The last fix is still good at `begin`, and the first one again at `end`.
-        in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
-    return Drive(
-        dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
-        v_left=table.v_left_mps,
-        v_right=table.v_right_mps,
-        north=table.north_m,
-        east=table.east_m,
-        heading=table.heading_rad,
-        distance=table.distance_m,
-        gap=run.in_gap,
-        in_outage=in_outage,
-    )
+def judged_models(run: DrivenRun) -> tuple[Model, ...]:
+    """Return `models_of` the run and, where it is long enough, the constants fitted to windows of all of its way."""
+    try:
+        windows = thin_windows(cut_windows(run, every_m=window_spacing_m(run)))
+    except DataError:
+        return models_of(run)
+    found = solve_windows(windows, CONSTANT, np.ones(len(windows.start), np.bool_))
+    right, left, x = (float(value) for value in found.parameters[:3])
+    return (*models_of(run), Model("icr_window", "ICR, window fit", FrozenIcrs.constant(right, left, x)))
 
 
 def _groups(horizons: int, states: int) -> list[slice]:
     """Cut the horizons into groups whose table of errors is not too large."""
-    size = max(1, LARGEST_TABLE_BYTES // (8 * max(states, 1)))
+    size = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * max(states, 1)))
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _errors(drive: Drive, icrs: FrozenIcrs, horizons: Floats, pool: Executor) -> tuple[Floats, TrialCounts]:
-    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial; and counts."""
+def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
+    """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
     states = len(drive.distance)
-    errors = np.empty((len(horizons), states))
+    ends = np.empty((len(horizons), states), np.int32)
 
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_A_CALL, states)
-        ends = trial_ends(drive, horizons, lo, hi)
-        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends, lo).T
-        return count_trials(ends)
+        found = trial_ends(drive, horizons, lo, hi)
+        ends[:, lo:hi] = found.T
+        return count_trials(found)
 
     counts = pool.map(fill, range(0, states, STARTS_A_CALL))
-    return errors.T, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+    return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+
+
+def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
+    states = ends.shape[1]
+    errors = np.empty(ends.shape)
+
+    def fill(lo: int) -> None:
+        hi = min(lo + STARTS_A_CALL, states)
+        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+
+    list(pool.map(fill, range(0, states, STARTS_A_CALL)))
+    return errors.T
 
 
 def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: int, pool: Executor) -> ModelResult:
@@ -320,11 +303,12 @@ def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: i
 
     def judge(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
-        summary = summarise(column)
+        ordered = sort_trials(column[:, 0])
+        summary = summarise_sorted([ordered])
         intervals = bootstrap_intervals(
             column, drive.distance, horizons[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL
         )
-        bins = histogram(column[:, 0], _bin_width(float(summary.p95[0]), float(summary.largest[0])))
+        bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         return ModelResult(model.name, model.label, summary, intervals, (bins,))
 
     return _joined(list(pool.map(judge, range(len(horizons)))))

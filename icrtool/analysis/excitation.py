@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
 from icrtool.core.window_fit import NEUTRAL, displace, move
 from icrtool.tables import Floats
@@ -116,8 +116,8 @@ def judge_excitation(run: DrivenRun) -> Excitation:
     moving = np.abs(drive.v_left) + np.abs(drive.v_right) > 0.02
     turns = np.where(moving, dt * omega, 0.0)
     right, left, spun_right, spun_left = (
-        float(turns[turns > 0].sum()), float(-turns[turns < 0].sum()),
-        float(turns[spins & (turns > 0)].sum()), float(-turns[spins & (turns < 0)].sum()),
+        float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
+        float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),
     )  # fmt: skip
     stds = dict(zip(ICRS, (float(value) for value in std), strict=True))
     verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}

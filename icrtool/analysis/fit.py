@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,15 +9,25 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
+from icrtool.analysis.doubts import adaptation_notes, doubts
 from icrtool.analysis.excitation import judge_excitation
-from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
+from icrtool.analysis.filter_setup import WarmStart, wheel_gap_s
+from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
-from icrtool.analysis.summary import converge, drive_summary, gnss_summary, icr_summary, nis_summary, segment_summary
+from icrtool.analysis.stream_delays import measure_delays
+from icrtool.analysis.summary import (
+    converge,
+    drive_summary,
+    gnss_summary,
+    icr_summary,
+    nis_summary,
+    segment_summary,
+    used_and_rejected,
+)
 from icrtool.analysis.terrain import TerrainTest, find_terrain_changes, given_changes
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
-from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
-from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.core.ekf import UNSEEN, Codes, FilterOutput
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
@@ -34,10 +43,6 @@ OUTAGE_S = 2.0
 
 OUTAGE_IN_INTERVALS = 5.0
 """... and at least this many times the usual interval between fixes."""
-
-
-LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
-"""What drives and turns less has shown nothing of the ICRs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +76,7 @@ class FilterRun:
     gnss, heading : what became of the measurements
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
+    warm_start : what another run had learned, where this one began with it
     terrain : changes of the ICRs, given and detected
     convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None; until the first
         terrain change
@@ -84,8 +90,10 @@ class FilterRun:
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
     heading_check: HeadingCheck
+    fix_quality: FixQuality
     covariance: Floats
     process_position_mps: float
+    warm_start: WarmStart | None
     terrain: TerrainTest
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
@@ -149,12 +157,14 @@ def fit(
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
+    delays = measure_delays(log, config, check)
+    fixes = judge_fixes(delays.log, config, check)
     terrain = given_changes(changes_s)
-    done = _run(log, config, check, warm_start, terrain)
+    done = _run(fixes, config, check, warm_start, terrain)
     if find_changes:
         terrain = _find_changes(done, terrain)
         if len(terrain.changes) > len(done.terrain.changes):
-            done = _run(log, config, check, warm_start, terrain)
+            done = _run(fixes, config, check, warm_start, terrain)
     adapted, table, gnss, heading, in_gap, outages, _ = done
     log, output, position_noise = adapted.log, adapted.output, adapted.process_position_mps
     terrain, beyond = terrain.within(float(table.t_s[-1]))
@@ -163,9 +173,11 @@ def fit(
         *log.warnings,
         *wheels.warnings,
         *check.warnings,
-        *_doubts(log.name, table, gnss),
+        *delays.warnings,
+        *fixes.warnings,
+        *doubts(log.name, table, gnss),
         *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
-        *_adaptation_notes(log.name, config, adapted),
+        *adaptation_notes(log.name, config, adapted),
     )
     summary = {
         "schema": RUN_SCHEMA,
@@ -179,16 +191,20 @@ def fit(
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
         "terrain": terrain.summary(),
         "segments": segment_summary(table, terrain.times_s),
-        "gnss": gnss_summary(log, gnss),
-        "heading": check.summary(),
+        "gnss": gnss_summary(log, gnss, fixes.down_weighted)
+        | delays.gnss_summary()
+        | fixes.summary(*used_and_rejected(gnss)),
+        "heading": check.summary() | delays.heading_summary(),
         "wheels": wheels.summary(),
         "outages_ns": outages.tolist(),
+        "rtk_losses_ns": fixes.losses_ns.tolist(),
         "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(in_gap)],
         "filter": {
             "preset": config.filter.preset,
             "process_position_mps": position_noise,
-            "reference_delay_s": adapted.reference_delay_s,
+            "reference_delay_s": delays.applied_gnss_s + adapted.reference_delay_s,
             "states": len(table),
+            "warm_start": _began_with(warm_start),
             **nis_summary(gnss, heading),
         },
     }
@@ -201,7 +217,9 @@ def fit(
         gnss=gnss,
         heading=heading,
         heading_check=check,
+        fix_quality=fixes,
         covariance=_square(output.P),
+        warm_start=warm_start,
         terrain=terrain,
         process_position_mps=position_noise,
         convergence=convergence,
@@ -228,9 +246,9 @@ class _Done(NamedTuple):
 
 
 def _run(
-    log: RobotLog, config: Config, check: HeadingCheck, warm_start: WarmStart | None, terrain: TerrainTest
+    fixes: FixQuality, config: Config, check: HeadingCheck, warm_start: WarmStart | None, terrain: TerrainTest
 ) -> _Done:
-    adapted = run_adaptively(log, config, check, warm_start, terrain.times_s)
+    adapted = run_adaptively(fixes.log, config, check, warm_start, terrain.times_s)
     log, setup, output = adapted.log, adapted.setup, adapted.output
     table = _states(log, output)
     gnss = _outcome(
@@ -241,7 +259,7 @@ def _run(
         output.heading_innovation,
     )  # fmt: skip
     in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
-    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss), terrain)
+    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
 
 
 def _find_changes(done: _Done, terrain: TerrainTest) -> TerrainTest:
@@ -279,9 +297,15 @@ def _outcome(
     return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
 
 
-def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
-    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns]."""
-    used = gnss.stamp_ns[gnss.code > UNSEEN]
+def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:
+    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns].
+
+    Where RTK was lost, the fixes there do not count: the filter drove on with its wheels.
+    """
+    lost = np.zeros(len(gnss.stamp_ns), np.bool_)
+    for begin, end in rtk_losses_ns:
+        lost |= (gnss.stamp_ns > begin) & (gnss.stamp_ns < end)
+    used = gnss.stamp_ns[(gnss.code > UNSEEN) & ~lost]
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)
@@ -293,56 +317,10 @@ def _outages(table: States, gnss: MeasurementOutcome) -> Ints:
     return np.array(spans, np.int64).reshape(-1, 2)
 
 
-def _adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
-    """Say what was done about clocks and wheels that contradict the position reference."""
-    notes = []
-    if config.frames.reference_delay_s == "auto" and adapted.reference_delay_s:
-        side = "late" if adapted.reference_delay_s > 0 else "early"
-        notes.append(
-            f"{name}: the position reference is {abs(adapted.reference_delay_s):.2f} s {side} against the wheels: "
-            "taken out; frames.reference_delay_s sets it"
-        )
-    if adapted.process_position_mps != configured_process_position_mps(config):
-        notes.append(
-            f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
-            f"position noise raised to {adapted.process_position_mps:.1f} m/s; filter.process_position_mps sets it"
-        )
-    return notes
-
-
-def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
-    """Return what a user should know before trusting the numbers."""
-    doubts = []
-    distance, turns = float(table.distance_m[-1]), _turns(table)
-    if distance < LITTLE_WAY_M and not turns:
-        doubts.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
-    elif not turns:
-        doubts.append("the robot hardly turned: the ICRs are not observable on a straight drive")
-    if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
-        doubts.append(
-            "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
-        )
-    seen = int(np.count_nonzero(gnss.code > UNSEEN))
-    gated = int(np.count_nonzero(gnss.code == GATED))
-    if seen and gated > 0.1 * seen:
-        doubts.append(
-            f"{100 * gated / seen:.0f} % of the fixes were rejected: "
-            "clocks, antenna place or fix quality do not fit the wheels"
-        )
-    return [f"{name}: {doubt}" for doubt in doubts]
-
-
-def _turns(table: States) -> bool:
-    """Say whether the robot turned enough to show its ICRs: by the heading and, if it went nowhere, by the wheels too.
-
-    A parked robot whose heading drifts has learned nothing, and one that spun on the spot has.
-    """
-    turned = float(np.ptp(table.heading_rad))
-    if float(table.distance_m[-1]) < LITTLE_WAY_M:
-        width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
-        ahead = np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1])
-        turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
-    return turned >= LITTLE_TURN_RAD
+def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
+    if warm_start is None:
+        return None
+    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
 
 
 def _square(upper: Floats) -> Floats:

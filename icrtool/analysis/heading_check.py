@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
+from icrtool.errors import DataError
 from icrtool.tables import Floats, Ints, RobotLog
 
 SHORTEST_WINDOW_M = 1.0
@@ -26,6 +28,14 @@ SMALLEST_OFFSET_RAD = math.radians(2.0)
 EXPLAINED = 0.8
 """Mean resultant length of course minus heading above which they are one direction seen twice."""
 
+NEAR_RAD, NEAR_SHARE = math.radians(45.0), 0.6
+"""A heading without agreement is none at all when no offset brings this share of the windows this near to the course:
+outliers among the fixes spoil some windows, not most."""
+
+STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
+"""A heading that stays the very same for so long, while one side goes so far ahead of the other, over so much of the
+way, is stuck."""
+
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course, beyond what the fixes explain, above which the heading's noise is raised to it."""
 
@@ -42,6 +52,7 @@ class HeadingCheck:
     agreement, mirrored_agreement : mean resultant length of heading minus course, as given and turned the other way
     applied_mirror : `fit` takes the heading turned the other way
     applied_offset_rad : what `fit` subtracts, after that
+    name : what a significant offset may come from
     applied_std_rad, applied_correlation_s : the least noise, and how long it errs alike, that `fit` gives the heading
     """
 
@@ -55,6 +66,7 @@ class HeadingCheck:
     applied_offset_rad: float
     applied_std_rad: float
     applied_correlation_s: float
+    name: OffsetName
     warnings: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
@@ -71,6 +83,7 @@ class HeadingCheck:
             "windows": self.windows,
             "applied_mirror": self.applied_mirror,
             **numbers,
+            **self.name.summary(),
             "agreement": self.agreement if math.isfinite(self.agreement) else None,
             "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
         }
@@ -85,6 +98,7 @@ class Course(NamedTuple):
     mirrored : (w,) the same for a heading that turns the other way
     curvature : (w,) heading change over way [rad/m]
     ratio : (w,) displacement by the fixes over displacement by wheels and heading
+    scattered : windows in which fixes and wheels went on, but the way laid along the heading led nowhere
     noise_rad : what the fixes' noise alone turns a course by
     duration_s : median duration of a window
     """
@@ -93,6 +107,7 @@ class Course(NamedTuple):
     mirrored: Floats
     curvature: Floats
     ratio: Floats
+    scattered: int
     noise_rad: float
     duration_s: float
 
@@ -102,6 +117,11 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
 
     The offset is applied where ``frames.heading_offset_deg`` is ``auto``, the preset is not ``paper`` and the offset is
     significant; a number there is applied as it is.
+
+    Raises
+    ------
+    DataError
+        A heading that has nothing to do with the course, whatever its convention and offset (``auto`` only).
 
     Notes
     -----
@@ -113,25 +133,34 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     paper = config.filter.preset == "paper"
     fixed = 0.0 if paper or given == "auto" else math.radians(given)
     course = measure_course(log)
+    free = given == "auto" and not paper
+    if free:
+        _refuse_stuck(log)
+    if free and course.scattered >= FEWEST_WINDOWS and course.scattered > len(course.angle):
+        raise _no_heading(
+            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
+        )
     if len(course.angle) < FEWEST_WINDOWS:
         nan = math.nan
-        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, ())
+        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
     agreement = float(abs(np.exp(1j * course.angle).mean()))
     mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
+    if free and max(agreement, mirrored) < EXPLAINED:
+        _refuse_unexplained(log, course, agreement, mirrored)
     turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
-    applied, warnings = _choose_offset(
-        f"{math.degrees(offset):+.1f}° ± {math.degrees(sigma):.1f}°",
-        offset,
-        sigma,
-        fixed,
-        free=given == "auto" and not paper,
-    )
+    rest = offset + math.pi / 2 if turned_over else offset
+    name = NO_NAME
+    if _is_significant(rest, sigma):
+        name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0]))
+    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
+    cause = f" ({name.text})" if name.text else ""
+    applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
     if turned_over:
         applied = offset if given == "auto" else fixed
-        warnings = [_name_turned_over(offset, len(angle))]
+        warnings = [_name_turned_over(text + cause, len(angle))]
     elif agreement < EXPLAINED and mirrored >= EXPLAINED:
         applied, warnings = (
             fixed,
@@ -161,25 +190,77 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         applied_offset_rad=applied,
         applied_std_rad=raised,
         applied_correlation_s=alike_s,
+        name=name,
         warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
     )
 
 
-def _choose_offset(text: str, offset: float, sigma: float, fixed: float, *, free: bool) -> tuple[float, list[str]]:
+def _refuse_unexplained(log: RobotLog, course: Course, agreement: float, mirrored: float) -> None:
+    """Raise where no convention and no offset makes the heading follow the course."""
+    if max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
+        return
+    spread = math.degrees(math.sqrt(-2.0 * math.log(max(agreement, mirrored, 1e-3))))
+    tried = f"ENU, NED and every offset tried in {len(course.angle)} windows, scatter {spread:.0f}° at best"
+    raise _no_heading(log, "has nothing to do with the course", tried)
+
+
+def _refuse_stuck(log: RobotLog) -> None:
+    """Raise where the heading stays the very same over much of the way while the wheels turn the robot."""
+    stamps, heading, wheels = log.heading.stamp_ns, log.heading.heading_rad, log.wheels
+    if len(stamps) < 2 or len(wheels.stamp_ns) < 2:
+        return
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(heading) != 0) + 1, [len(stamps)]])
+    begin, end = stamps[edges[:-1]], stamps[edges[1:] - 1]
+    long = end - begin > STUCK_S * 1e9
+    if not long.any():
+        return
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
+    ahead, way = (np.concatenate([[0.0], np.cumsum(step)]) for step in (left - right, np.abs(left) + np.abs(right)))
+
+    rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin[long], end[long]]))
+    turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
+    last_row = len(way) - 1
+    gone = way[np.minimum(rows[turning, 1], last_row)] - way[np.minimum(rows[turning, 0], last_row)]
+    share = float(gone.sum()) / max(float(way[-1]), 1e-9)
+    if share > STUCK_SHARE:
+        seconds = float((end - begin)[long][turning].sum()) / 1e9
+        raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")
+
+
+def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
+    topic = next((f" {stream.topic}" for stream in log.streams if stream.role == "heading"), "")
+    advice = "choose another with topics.heading, or go on with --set frames.heading_offset_deg=0"
+    return DataError(log.name, f"the heading{topic} {why}", f"{found}; {advice}")
+
+
+def _near_share(angle: Floats) -> float:
+    """Return the largest share of angles within `NEAR_RAD` of one of 16 directions."""
+    directions = np.arange(16) * math.pi / 8
+    away = np.abs(np.angle(np.exp(1j * (angle[:, None] - directions))))
+    return float((away < NEAR_RAD).mean(axis=0).max())
+
+
+def _is_significant(offset: float, sigma: float) -> bool:
+    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma)
+
+
+def _choose_offset(
+    text: str, offset: float, sigma: float, fixed: float, cause: str, *, free: bool
+) -> tuple[float, list[str]]:
     """Return the offset to apply, and what to say about it."""
-    if abs(math.remainder(offset - fixed, 2 * math.pi)) <= max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * sigma):
+    if not _is_significant(offset - fixed, sigma):
         return fixed, []
     if free:
-        return offset, [f"heading is {text} off the course: applied; frames.heading_offset_deg sets it"]
-    return fixed, [f"heading is {text} off the course, {math.degrees(fixed):+.1f}° is applied"]
+        return offset, [f"heading is {text} off the course{cause}: applied; frames.heading_offset_deg sets it"]
+    return fixed, [f"heading is {text} off the course{cause}, {math.degrees(fixed):+.1f}° is applied"]
 
 
-def _name_turned_over(offset: float, windows: int) -> str:
+def _name_turned_over(rest: str, windows: int) -> str:
     """Say what a heading that turns the other way most likely is: yaw read in the other of ENU and NED."""
-    rest = math.degrees(math.remainder(offset + math.pi / 2, 2 * math.pi))
     return (
         f"the heading turns the other way than the course ({windows} windows): "
-        f"its yaw is of the other convention (ENU/NED), offset {rest:+.1f}°: applied; frames.heading sets it"
+        f"its yaw is of the other convention (ENU/NED), offset {rest}: applied; frames.heading sets it"
     )
 
 
@@ -209,7 +290,7 @@ def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, flo
 def measure_course(log: RobotLog) -> Course:
     """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
     gnss, wheels = log.gnss, log.wheels
-    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0.0, 0.0)
+    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0, 0.0, 0.0)
     if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:
         return none
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
@@ -234,13 +315,15 @@ def measure_course(log: RobotLog) -> Course:
     seen = (gnss.north_m[end] - gnss.north_m[begin]) + 1j * (gnss.east_m[end] - gnss.east_m[begin])
     real, imaginary, way = between(laid.real), between(laid.imag), between(travelled)
     turned = between(np.append(psi_at, psi_at[-1]))
-    moved = (np.abs(seen) > length / 3) & (np.hypot(real, imaginary) > length / 3)
+    went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
+    moved = went & led
     told, mirror = real + 1j * imaginary, real - 1j * imaginary
     return Course(
         np.angle(told * np.conj(seen))[moved],
         np.angle(mirror * np.conj(seen))[moved],
         (turned / way)[moved],
         (np.abs(seen) / np.where(moved, np.hypot(real, imaginary), 1.0))[moved],
+        int(np.count_nonzero(went & ~led)),
         noise * math.sqrt(2.0) / length,
         float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,
     )

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter
@@ -88,7 +88,7 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     Raises
     ------
     DataError
-        The run cannot be made again: it began with what another run had learned.
+        The run cannot be made again.
     """
     setup = set_up_filter(
         run.log,
@@ -99,6 +99,7 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
         heading_correlation_at_least_s=run.heading_check.applied_correlation_s,
         process_position_mps=run.process_position_mps,
         changes_s=run.changes_s,
+        warm_start=run.warm_start,
         outages_ns=tuple(spans_ns),
     )
     output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
@@ -108,7 +109,7 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
     stamps, distance = run.table.stamp_ns[-rows:], run.table.distance_m[-rows:]
     if (away[stamps < min(begin for begin, _ in spans_ns)] > SAME_M).any():
-        raise DataError(run.name, "a warm-started run cannot be made again for forced outages", "fit it without")
+        raise DataError(run.name, "the run cannot be made again for forced outages", "run icrtool fit again")
     origin = int(run.table.stamp_ns[0])
     outages = []
     for begin, end in spans_ns:

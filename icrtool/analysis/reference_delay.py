@@ -46,7 +46,7 @@ def find_delay(log: RobotLog, contradiction: Callable[[RobotLog], float]) -> flo
     On recorded robots the clocks of the streams matter as much as the model. A grid search, then the vertex of the
     parabola through the best three.
     """
-    part = _part(log)
+    part = busiest_part(log)
     steps = round(LONGEST_DELAY_S / DELAY_STEP_S)
     delays = DELAY_STEP_S * np.arange(-steps, steps + 1)
     found = np.array([contradiction(delayed(part, float(delay))) for delay in delays])
@@ -59,7 +59,7 @@ def find_delay(log: RobotLog, contradiction: Callable[[RobotLog], float]) -> flo
     return round(float(delays[best] + DELAY_STEP_S * vertex), 3)
 
 
-def _part(log: RobotLog) -> RobotLog:
+def busiest_part(log: RobotLog) -> RobotLog:
     """Return the stretch of the log, at most `MOST_SAMPLES` long, in which the wheels travel most."""
     wheels = log.wheels
     if len(wheels.stamp_ns) <= MOST_SAMPLES:
@@ -78,6 +78,6 @@ def _part(log: RobotLog) -> RobotLog:
             v_left_mps=wheels.v_left_mps[rows],
             v_right_mps=wheels.v_right_mps[rows],
         ),
-        gnss=PositionFixes(*(getattr(log.gnss, name)[fixes] for name in PositionFixes.__slots__)),
+        gnss=log.gnss.cut(fixes),
         heading=HeadingSamples(*(getattr(log.heading, name)[samples] for name in HeadingSamples.__slots__)),
     )

@@ -6,19 +6,18 @@ from dataclasses import fields
 
 import numpy as np
 
-from icrtool.analysis.filter_setup import WarmStart, set_up_filter
+from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import STATE_COLUMNS, FilterRun
 from icrtool.core.rts import run_smoother
 from icrtool.tables import Floats, States
 
 
-def smooth(run: FilterRun, *, warm_start: WarmStart | None = None) -> States:
+def smooth(run: FilterRun) -> States:
     """Run the RTS smoother over a finished run.
 
     Parameters
     ----------
     run : what `icrtool.fit` returned
-    warm_start : what the run was started with, where it was
 
     Returns
     -------
@@ -40,7 +39,7 @@ def smooth(run: FilterRun, *, warm_start: WarmStart | None = None) -> States:
         heading_correlation_at_least_s=check.applied_correlation_s,
         process_position_mps=run.process_position_mps,
         changes_s=run.changes_s,
-        warm_start=warm_start,
+        warm_start=run.warm_start,
     )
     smoothed = run_smoother(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     std = np.sqrt(np.maximum(smoothed.variance, 0.0))

@@ -124,10 +124,16 @@ def separation_multiplier(table: States, track_width_m: float) -> float:
     return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
 
 
-def gnss_summary(log: RobotLog, gnss: MeasurementOutcome) -> dict[str, Any]:
-    """Return how many fixes were used and rejected, and how far the filter stays from those it used."""
-    used = (gnss.code > UNSEEN) & (gnss.code != GATED)
-    difference = gnss.difference[used]
+def used_and_rejected(outcome: MeasurementOutcome) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which measurements (m,) moved the filter, and which its gate refused."""
+    rejected = outcome.code == GATED
+    return (outcome.code > UNSEEN) & ~rejected, rejected
+
+
+def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
+    used, _ = used_and_rejected(gnss)
+    difference = gnss.difference[used & ~down_weighted]
     datum = log.datum
     return {
         "used": int(np.count_nonzero(used)),

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of, models_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.dropout import models_of
 from icrtool.core.open_loop import trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 

@@ -20,7 +20,10 @@ LARGEST_SCALE_SCATTER = 0.04
 """A scale error is taken out when it is this large, this certain, not larger than tyres and soil explain, and the same
 all along the way: one that comes and goes is slip, or held samples, and no radius."""
 
-CLEAR_CORRELATION = 0.5
+FACTOR_TWO_TOLERANCE = 0.04
+"""A factor two (diameter for radius, counts on both edges) is as certain as a small error when it is this exact."""
+
+CLEAR_CORRELATION, WHOLE_CORRELATION = 0.5, 0.9
 SMALLEST_TURN_RAD = math.radians(20.0)
 MOSTLY_BACKWARDS = 0.8
 LONGEST_DRIVE_NS = 30 * 86_400 * 1_000_000_000
@@ -78,18 +81,20 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     scale, sigma, scatter = _scale(course)
     applied = 1.0
     error = abs(scale - 1.0)
-    significant = error > max(SMALLEST_SCALE_ERROR, SIGNIFICANT_SIGMAS * sigma)
+    # A heading that scatters makes the way along it shorter by half its variance.
+    significant = error > max(SMALLEST_SCALE_ERROR, SIGNIFICANT_SIGMAS * sigma, _angle_scatter(course) ** 2)
     if significant and len(course.ratio) >= FEWEST_SCALE_WINDOWS:
         text = f"the robot goes {100 * scale:.1f} ± {100 * sigma:.1f} % of the way the wheels tell"
         given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-        if corrects and sound and not given and error <= LARGEST_SCALE_CORRECTION and scatter <= LARGEST_SCALE_SCATTER:
+        plausible = error <= LARGEST_SCALE_CORRECTION or _near_factor_two(scale)
+        if corrects and sound and not given and plausible and scatter <= LARGEST_SCALE_SCATTER:
             applied = scale
             wheels = log.wheels
             log = replace(
                 log,
                 wheels=WheelSamples(wheels.stamp_ns, scale * wheels.v_left_mps, scale * wheels.v_right_mps),
             )
-            notes.append(f"{log.name}: {text}: taken out; wheels.left_scale and right_scale set it")
+            notes.append(f"{log.name}: {text}{_likely(scale)}: taken out; wheels.left_scale and right_scale set it")
         else:
             notes.append(f"{log.name}: {text}: check wheel radius, encoder resolution and units{_likely(scale)}")
     held = _held_share(log.wheels)
@@ -108,6 +113,18 @@ def _scale(course: Course) -> tuple[float, float, float]:
     return math.exp(offset), sigma * math.exp(offset), scatter
 
 
+def _angle_scatter(course: Course) -> float:
+    """Return the robust scatter of heading against course [rad], about its middle."""
+    if not len(course.angle):
+        return 0.0
+    away = np.angle(np.exp(1j * course.angle) * np.conj(np.exp(1j * course.angle).mean()))
+    return 1.4826 * float(np.median(np.abs(away)))
+
+
+def _near_factor_two(scale: float) -> bool:
+    return any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))
+
+
 def _likely(scale: float) -> str:
     for value, cause in ((0.5, "twice"), (2.0, "half")):
         if abs(scale / value - 1.0) < LARGEST_SCALE_CORRECTION:
@@ -124,7 +141,8 @@ def _dead_or_copied(log: RobotLog) -> list[str]:
         return []
     if min(way_left, way_right) < NEVER_MOVES_SHARE * most:
         side = "left" if way_left < way_right else "right"
-        return [f"the {side} wheels hardly ever move: is their encoder dead?"]
+        meaning = "the ICRs mean nothing then; topics.wheels chooses others"
+        return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         return ["left and right wheels tell the same all the time while the robot turns: one is a copy of the other"]
     return []
@@ -135,17 +153,36 @@ def _reversed_or_swapped(log: RobotLog) -> tuple[WheelSamples, str] | None:
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
     course = measure_course(log)
-    if len(course.angle) < FEWEST_WINDOWS:
+    if len(course.angle) < FEWEST_WINDOWS or max(_agreement(course.angle), _agreement(course.mirrored)) < EXPLAINED:
         return _one_side_reversed(log)
     sum_way = float((left + right)[left + right > 0].sum()), -float((left + right)[left + right < 0].sum())
     backwards = sum_way[1] / max(sum(sum_way), 1e-12)
     away = abs(float(np.angle(np.exp(1j * course.angle).mean())))
     if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
-    mirrored = abs(np.exp(1j * course.mirrored).mean()) > abs(np.exp(1j * course.angle).mean())
-    if _turn_correlation(log) * (-1.0 if mirrored else 1.0) < -CLEAR_CORRELATION:
+    correlation = _turn_correlation(log, mirrored=_mirrored(course))
+    if correlation is not None and correlation < -CLEAR_CORRELATION:
         return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
     return None
+
+
+def _turn_correlation(log: RobotLog, *, mirrored: bool) -> float | None:
+    """Return how heading turns and left going ahead of right correlate; None where there are too few turns."""
+    turned, told = _turns(log)
+    tells = len(turned) >= FEWEST_WINDOWS and float(np.ptp(told)) > 0 and float(np.ptp(turned)) > 0
+    if not tells or float(np.abs(turned).sum()) <= SMALLEST_TURN_RAD:
+        return None
+    return float(np.corrcoef(-turned if mirrored else turned, told)[0, 1])
+
+
+def _mirrored(course: Course) -> bool:
+    """Say whether the heading follows the course only when it is turned the other way."""
+    return _agreement(course.mirrored) > _agreement(course.angle)
+
+
+def _agreement(angle: Floats) -> float:
+    """Return the mean resultant length of angles."""
+    return float(abs(np.exp(1j * angle).mean()))
 
 
 def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
@@ -155,27 +192,23 @@ def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
     """
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
-    if abs(_turn_correlation(log)) > CLEAR_CORRELATION:
+    correlation = _turn_correlation(log, mirrored=False)
+    if correlation is not None and abs(correlation) > WHOLE_CORRELATION:
         return None
     for name, one in (
         ("left", WheelSamples(wheels.stamp_ns, -left, right)),
         ("right", WheelSamples(wheels.stamp_ns, left, -right)),
     ):
-        course = measure_course(replace(log, wheels=one))
-        if len(course.angle) < FEWEST_WINDOWS:
+        changed = replace(log, wheels=one)
+        course = measure_course(changed)
+        if len(course.angle) < FEWEST_WINDOWS or max(map(_agreement, (course.angle, course.mirrored))) < EXPLAINED:
             continue
-        right_way = abs(float(np.angle(np.exp(1j * course.angle).mean()))) < math.radians(90)
-        if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and right_way:
+        # Either side turned over makes a way; the wrong one is driven backwards, and turns the other way.
+        correlation = _turn_correlation(changed, mirrored=_mirrored(course))
+        forwards = abs(float(np.angle(np.exp(1j * course.angle).mean()))) < math.radians(90)
+        if forwards if correlation is None else correlation > CLEAR_CORRELATION:
             return one, f"the {name} wheels count backwards"
     return None
-
-
-def _turn_correlation(log: RobotLog) -> float:
-    """Return how well left ahead of right tells the turns of the heading, -1 to 1; 0 where there are too few."""
-    turned, told = _turns(log)
-    if len(turned) < FEWEST_WINDOWS or float(np.abs(turned).sum()) <= SMALLEST_TURN_RAD:
-        return 0.0
-    return float(np.corrcoef(turned, told)[0, 1]) if np.ptp(told) > 0 and np.ptp(turned) > 0 else 0.0
 
 
 def _turns(log: RobotLog) -> tuple[Floats, Floats]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.dropout import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
 from icrtool.core.open_loop import trial_ends
-from icrtool.core.window_fit import NEUTRAL, displace, move
+from icrtool.core.window_fit import NEUTRAL, Complexes, move, window_misses
 from icrtool.errors import DataError
 from icrtool.tables import Bools, Floats, Ints
 
@@ -25,6 +25,9 @@ WINDOWS_M = (5.0, 10.0)
 
 EVERY_M = 0.5
 """A window of each length starts every so much way."""
+
+MOST_STARTS = 2000
+"""Where many fits are made, windows of a long way start further apart: about so many of a length."""
 
 HUBER_SIGMAS = 2.0
 """Where the loss turns from square to straight, in robust standard deviations of the residuals."""
@@ -37,6 +40,9 @@ SETTLED = 1e-4
 
 COARSE_STEP_S = 0.1
 """Wheel samples are joined to steps of this length to get near the solution."""
+
+MOST_STEPS, LONGEST_STEP_S, COARSE_STEP_M = 10_000, 0.4, 0.25
+"""Steps are longer where there would be more of them, but not longer than this in time and way."""
 
 STRETCH_M = 20.0
 """Way that errs alike, for the covariance: twice the longest window."""
@@ -99,6 +105,7 @@ class Windows(NamedTuple):
     length_m : (w,)
     reference : complex (w,), displacement in the body frame of the start [m]
     width_m : b, or what stands for it
+    lag : (n,) [s] how long into a step its heading is taken: 0 where it is one wheel sample
     """
 
     t: Floats
@@ -111,8 +118,9 @@ class Windows(NamedTuple):
     start_m: Floats
     end_m: Floats
     length_m: Floats
-    reference: np.ndarray[Any, np.dtype[np.complex128]]
+    reference: Complexes
     width_m: float
+    lag: Floats
 
     def keep(self, kept: Bools) -> Windows:
         """Return the windows marked in `kept` (w,)."""
@@ -157,6 +165,11 @@ class WindowFit:
         return right, left, x
 
 
+def window_spacing_m(run: DrivenRun) -> float:
+    """Return how far apart windows start where a run is fitted many times [m]."""
+    return max(EVERY_M, float(run.table.distance_m[-1]) / MOST_STARTS)
+
+
 def cut_windows(run: DrivenRun, lengths_m: Iterable[float] = WINDOWS_M, every_m: float = EVERY_M) -> Windows:
     """Cut a run into overlapping windows of way; those across a gap or ending in an outage are left out.
 
@@ -195,6 +208,7 @@ def cut_windows(run: DrivenRun, lengths_m: Iterable[float] = WINDOWS_M, every_m:
         length_m=length_m,
         reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
         width_m=run.track_width_m if run.track_width_m is not None else 2.0 * DEFAULT_HALF_WIDTH_M,
+        lag=np.zeros(len(table)),
     )
 
 
@@ -218,12 +232,8 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
     the weights. Windows overlap: a stretch of way counts once in the covariance (sandwich, White 1982), and the prior
     as much as one.
     """
-    chosen = [TERMS.index(term) for term in model.terms]
-    basis, base = _BASIS[chosen], np.array([*NEUTRAL, 0.0])
-    mean, std = _prior(windows.width_m, model)
-    way_m = max(float(np.ptp(windows.start_m)), EVERY_M)
-    alike = max(float(windows.length_m.sum()) / way_m, 1.0)
-    held = np.sqrt(alike) / std
+    basis, base = basis_of(model), base_parameters()
+    mean, held, std = prior_of(windows, model)
     terms = mean
     # far from the solution a tenth of the samples tells the way there
     for problem in (_Problem(thin_windows(windows), basis, base), _Problem(windows, basis, base)):
@@ -232,8 +242,8 @@ def fit_windows(windows: Windows, model: WindowModel = CONSTANT) -> WindowFit:
             if np.all(np.abs(terms - before) < SETTLED * std):
                 break
     misses, slopes = problem(terms)
-    scale = _scale(misses)
-    covariance = _sandwich(misses / scale, slopes / scale, held, np.tile(windows.start_m, 2))
+    scale = robust_scale(misses)
+    covariance = clustered_covariance(misses / scale, slopes / scale, held, np.tile(windows.start_m, 2))
     return WindowFit(
         model=model,
         terms=terms,
@@ -250,7 +260,7 @@ def _step(problem: _Problem, terms: Floats, mean: Floats, held: Floats, std: Flo
     from scipy.optimize import least_squares
 
     misses, _ = problem(terms)
-    scale = _scale(misses)
+    scale = robust_scale(misses)
     # soft L1 by reweighting: rho'(z) = (1 + z)^(-1/2)
     weight = (1.0 + (misses / (HUBER_SIGMAS * scale)) ** 2) ** -0.25 / scale
     found: Floats = least_squares(
@@ -265,15 +275,36 @@ def _step(problem: _Problem, terms: Floats, mean: Floats, held: Floats, std: Flo
     return found
 
 
-def _scale(misses: Floats) -> float:
+def robust_scale(misses: Floats) -> float:
     """Return the robust standard deviation of misses about zero."""
     return max(1.4826 * float(np.median(np.abs(misses))), 1e-6)
 
 
+def coarse_rows(dt: Floats, v_left: Floats, v_right: Floats) -> int:
+    """Return how many wheel samples make a step of the fits.
+
+    A tenth of a second; on a long drive longer, up to four, as long as a step is no more than a quarter of a metre of
+    way. `dt` (n,) is 0 over gaps [s], speeds are (n,) [m/s].
+    """
+    lasting = dt > 0.0
+    if not lasting.any():
+        return 1
+    total_s = float(dt.sum())
+    speed_mps = float((dt * (np.abs(v_left) + np.abs(v_right))).sum()) / 2.0 / total_s
+    step_s = min(total_s / MOST_STEPS, COARSE_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S)
+    return max(int(max(step_s, COARSE_STEP_S) / float(np.median(dt[lasting]))), 1)
+
+
 def thin_windows(windows: Windows) -> Windows:
-    """Return the windows with wheel samples joined to steps of a tenth of a second, mean speeds over their time."""
-    usual = float(np.median(windows.dt[windows.dt > 0.0])) if (windows.dt > 0.0).any() else COARSE_STEP_S
-    first = np.arange(0, len(windows.t), max(int(COARSE_STEP_S / usual), 1))
+    """Return the windows with wheel samples joined to steps as `coarse_rows` has them, mean speeds over their time.
+
+    Notes
+    -----
+    Euler steps of m samples at a constant turn rate move along the heading (m - 1) / 2 samples into them: that is the
+    `lag` of the joined step, without which it would cut the corner.
+    """
+    joined = coarse_rows(windows.dt, windows.v_left, windows.v_right)
+    first = np.arange(0, len(windows.t), joined)
     dt = np.add.reduceat(windows.dt, first)
     left, right = (np.add.reduceat(windows.dt * v, first) for v in (windows.v_left, windows.v_right))
     moving = dt > 0.0
@@ -282,7 +313,15 @@ def thin_windows(windows: Windows) -> Windows:
         dt=dt,
         v_left=np.divide(left, dt, out=np.zeros(len(dt)), where=moving),
         v_right=np.divide(right, dt, out=np.zeros(len(dt)), where=moving),
+        lag=dt * (joined - 1) / (2.0 * joined),
     )
+
+
+def evaluate_windows(windows: Windows, p: Floats) -> tuple[Floats, Floats]:
+    """Return weighted misses of all windows (2 w,) [m per root metre] and their derivatives (2 w, 8) by p (8,)."""
+    w = windows
+    motion = move(w.t, w.dt, w.v_left, w.v_right, p[:7], w.knot_t + p[7], w.lag)
+    return window_misses(motion, w.start, w.end, w.reference, 1.0 / np.sqrt(w.length_m))
 
 
 class _Problem:
@@ -290,22 +329,41 @@ class _Problem:
 
     def __init__(self, windows: Windows, basis: Floats, base: Floats) -> None:
         self._windows, self._basis, self._base = windows, basis, base
-        self._weight = 1.0 / np.sqrt(windows.length_m)
         self._last: tuple[bytes, tuple[Floats, Floats]] | None = None
 
     def __call__(self, terms: Floats) -> tuple[Floats, Floats]:
         key = terms.tobytes()
         if self._last is None or self._last[0] != key:
-            self._last = key, self._evaluate(self._base + terms @ self._basis)
+            misses, slopes = evaluate_windows(self._windows, self._base + terms @ self._basis)
+            self._last = key, (misses, slopes @ self._basis.T)
         return self._last[1]
 
-    def _evaluate(self, p: Floats) -> tuple[Floats, Floats]:
-        w = self._windows
-        motion = move(w.t, w.dt, w.v_left, w.v_right, p[:7], w.knot_t + p[7])
-        d, d_by, d_late = displace(motion, w.start, w.end)
-        weight, miss, by = np.tile(self._weight, 2), d - w.reference, np.column_stack([d_by, d_late])
-        slopes = np.concatenate([by.real, by.imag]) @ self._basis.T
-        return np.concatenate([miss.real, miss.imag]) * weight, slopes * weight[:, None]
+
+def basis_of(model: WindowModel) -> Floats:
+    """Return what one unit of each of a model's terms adds to the parameters (k, 8)."""
+    return _BASIS[[TERMS.index(term) for term in model.terms]]
+
+
+def base_parameters() -> Floats:
+    """Return the parameters (8,) to which the terms add."""
+    return np.array([*NEUTRAL, 0.0])
+
+
+def prior_of(windows: Windows, model: WindowModel, kept: Bools | None = None) -> tuple[Floats, Floats, Floats]:
+    """Return mean (k,) of a model's terms, square roots of their information, and their standard deviations.
+
+    Parameters
+    ----------
+    kept : (w,) the windows that will be fitted; default all. The prior weighs as much as one stretch of way, and
+        windows that overlap say the same several times.
+    """
+    start_m, length_m = (
+        (windows.start_m, windows.length_m) if kept is None else (windows.start_m[kept], windows.length_m[kept])
+    )
+    mean, std = _prior(windows.width_m, model)
+    way_m = max(float(np.ptp(start_m)), EVERY_M) if len(start_m) else EVERY_M
+    alike = max(float(length_m.sum()) / way_m, 1.0)
+    return mean, np.sqrt(alike) / std, std
 
 
 def _prior(width_m: float, model: WindowModel) -> tuple[Floats, Floats]:
@@ -315,7 +373,7 @@ def _prior(width_m: float, model: WindowModel) -> tuple[Floats, Floats]:
     return np.array([means.get(term, 0.0) for term in model.terms]), np.array([stds[term] for term in model.terms])
 
 
-def _sandwich(misses: Floats, slopes: Floats, prior: Floats, way_m: Floats) -> Floats:
+def clustered_covariance(misses: Floats, slopes: Floats, prior: Floats, way_m: Floats) -> Floats:
     """Return the covariance of a robust fit whose misses, over each stretch of way, are one another's kin.
 
     Parameters

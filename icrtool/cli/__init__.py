@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 __all__ = ["main"]
@@ -9,6 +10,8 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
+    # No kernel of ours uses BLAS. Its threads take time to start, and a process with threads should not be forked.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from icrtool.cli.commands import icrtool
     from icrtool.errors import IcrToolError
 

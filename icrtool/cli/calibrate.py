@@ -22,10 +22,13 @@ if TYPE_CHECKING:
 @click.option(
     "--x-icr", metavar="METRES", type=float, help="Where the ICRs are known to lie, forward: gives the antenna's place."
 )
+@click.option(
+    "--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw the misses before and after: png, svg, pdf."
+)
 @options.configuration
 @options.verbosity
 def command(
-    source: Path, output: Path | None, x_icr: float | None,
+    source: Path, output: Path | None, x_icr: float | None, plot: Path | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     r"""Estimate antenna place, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.
@@ -38,11 +41,14 @@ def command(
       icrtool calibrate field.mcap --robot husky-a200
       icrtool calibrate icrtool-runs/field -o calibration.json
     """
+    from icrtool.report.calibration_picture import check_picture, write_picture
     from icrtool.report.calibration_table import calibration_file, format_calibration, write_calibration
 
     config = options.load(config_file, robot, sets)
     if output is not None:
         calibration_file(output)
+    if plot is not None:
+        check_picture(plot)
     log, config = _read(source, config, quiet=quiet)
     from icrtool.analysis.calibrate_verdict import calibrate
 
@@ -54,6 +60,10 @@ def command(
         file = write_calibration(found, output)
         if not quiet:
             click.echo(f"\nwritten to {file}")
+    if plot is not None:
+        write_picture(found, plot)
+        if not quiet:
+            click.echo(f"\ndrawn to {plot}")
     if verbose:
         for stream in log.streams:
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from icrtool.cli import options
 from icrtool.cli.fit import RUNS, plot_formats, run_directories
 
 if TYPE_CHECKING:
+    from icrtool.analysis.driven_run import DrivenRun
     from icrtool.analysis.dropout import DropoutReport, ErrorSink
     from icrtool.analysis.fit import FilterRun
     from icrtool.analysis.gates import Gate
@@ -50,6 +50,8 @@ class Request:
     trials: bool
     seed: int
     formats: tuple[str, ...]
+    ladder: bool
+    smoothed: bool
     quiet: bool
     verbose: bool
 
@@ -69,6 +71,10 @@ class Request:
               help="Force outages of this length on the filter; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
               help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
+@click.option("--ladder/--no-ladder", default=True, show_default=True,
+              help="Judge all models on way they were not fitted to, gyro included.")  # fmt: skip
+@click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
+              help="Judge by the filter's states, or by the smoother's (fit --smooth).")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -80,8 +86,8 @@ class Request:
 @options.verbosity
 def command(
     sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
-    gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...], trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
+    ladder: bool, reference: str, trials: bool, junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Say how far a robot can go blind: open loop from every recorded state, over 1 to 20 m.
@@ -98,8 +104,6 @@ def command(
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    # No kernel of ours uses BLAS, and a process with threads should not be forked.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from icrtool.analysis.dropout import DEFAULT_SEED
     from icrtool.analysis.gates import parse_gate
     from icrtool.report.dropout_drawing import DrawingProcess
@@ -107,7 +111,8 @@ def command(
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         gates=tuple(parse_gate(text) for text in gates), trials=trials,
-        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, quiet=quiet, verbose=verbose,
+        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
+        smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, output, config, (junit, markdown))
     with DrawingProcess(formats) as drawer:
@@ -240,9 +245,10 @@ def _fit(log: Path, directory: Path, request: Request) -> FilterRun:
 
         measured = read_log(log, request.config, progress)
     from icrtool.analysis.fit import fit
+    from icrtool.analysis.smooth import smooth
 
     run = fit(measured, request.config)
-    write_run(run, directory, plots=request.formats)
+    write_run(run, directory, plots=request.formats, smoothed=smooth(run) if request.smoothed else None)
     options.warn(run.warnings, quiet=request.quiet)
     if request.verbose:
         for stream in measured.streams:
@@ -250,7 +256,9 @@ def _fit(log: Path, directory: Path, request: Request) -> FilterRun:
     return run
 
 
-def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, drawer: DrawingProcess) -> DropoutContent:
+def _analyse(
+    filtered: StoredRun | FilterRun, directory: Path, request: Request, drawer: DrawingProcess
+) -> DropoutContent:
     """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
     from icrtool.analysis.blind_paths import example_drives, worst_drives
     from icrtool.analysis.dropout import dropout
@@ -260,9 +268,12 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
     from icrtool.report.dropout_content import DropoutContent, title_of
     from icrtool.report.dropout_directory import dropout_directory, write_content
     from icrtool.report.dropout_drawing import draw_histograms, draw_paths, draw_summary
+    from icrtool.report.dropout_ladder import ladder_of
+    from icrtool.report.dropout_source import judged_run
 
+    run = judged_run(filtered, directory) if request.smoothed else filtered
     title = title_of(run)
-    outages = (*_forced_outages(run, request), *real_outages(run))
+    outages = (*_forced_outages(filtered, request), *real_outages(run))
     with (
         dropout_directory(directory) as partial,
         drawer.into(partial / "plots") as draw,
@@ -276,6 +287,9 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
             draw_histograms(draw, title, preview)
         report = dropout(run, horizons, seed=request.seed, sink=sink)
         draw_summary(draw, title, report, outages)
+        ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
+        if ladder is not None:
+            draw("ladder", title, ladder)
         content = DropoutContent(
             title=title,
             run_summary=run.summary,
@@ -286,12 +300,15 @@ def _analyse(run: StoredRun | FilterRun, directory: Path, request: Request, draw
             examples=examples,
             outages=outages,
             by_turning=split_by_turning(run),
+            ladder=ladder,
+            no_ladder=no_ladder,
+            smoothed=request.smoothed,
         )
         write_content(content, partial)
     return content
 
 
-def _preview(run: StoredRun | FilterRun, horizons: list[float]) -> DropoutReport | None:
+def _preview(run: DrivenRun, horizons: list[float]) -> DropoutReport | None:
     """Compute what the histograms show ahead of all else; None where none of their horizons is asked for."""
     from icrtool.analysis.dropout import dropout, models_of
     from icrtool.report.dropout_drawing import HISTOGRAM_HORIZONS_M, HISTOGRAM_MODELS
@@ -301,7 +318,7 @@ def _preview(run: StoredRun | FilterRun, horizons: list[float]) -> DropoutReport
     return dropout(run, shown, models=models) if shown else None
 
 
-def _horizons(run: StoredRun | FilterRun, request: Request) -> list[float]:
+def _horizons(run: DrivenRun, request: Request) -> list[float]:
     """Return the horizons asked for: by option, else configured; and those that gates name."""
     from icrtool.analysis.dropout import configured_horizons_m
 
@@ -342,13 +359,14 @@ def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
         log_of,
         stored_config,
         terrain_changes_s,
+        warm_start_of,
     )
 
     config, path = stored_config(run), log_of(run)
     with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
         log = read_log(path, config, progress)
     check_same_log(run, log)
-    again = fit(log, config, changes_s=terrain_changes_s(run))
+    again = fit(log, config, warm_start=warm_start_of(run), changes_s=terrain_changes_s(run))
     check_same_states(run, again)
     return again
 

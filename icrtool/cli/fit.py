@@ -134,6 +134,11 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     return [(output or RUNS) / name for name in names]
 
 
+def _reports(request: FitRequest) -> tuple[str, ...]:
+    """Return the modules that write what is asked for."""
+    return "icrtool.report.run_directory", *(("icrtool.report.figures",) if request.formats else ())
+
+
 def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     from icrtool.report.run_directory import check_target, read_warm_start, write_run
 
@@ -142,6 +147,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logio import read_log
 
+        options.load_ahead("pymap3d", "icrtool.analysis.fit", *_reports(request))
         measured = read_log(log, request.config, progress)
     from icrtool.analysis.fit import fit
 
@@ -156,7 +162,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     if request.smooths:
         from icrtool.analysis.smooth import smooth
 
-        smoothed = smooth(run, warm_start=start)
+        smoothed = smooth(run)
     write_run(run, directory, states=request.states, plots=request.formats, smoothed=smoothed)
     options.warn(run.warnings, quiet=request.quiet)
     if not request.quiet:

@@ -10,7 +10,9 @@ import click
 from icrtool.cli import options
 
 if TYPE_CHECKING:
+    from icrtool.analysis.fit import FilterRun
     from icrtool.config import Config
+    from icrtool.tables import RobotLog
 
 
 @click.command("info")
@@ -25,7 +27,9 @@ def command(
     quiet: bool,
     verbose: bool,
 ) -> None:
-    """Say what each log holds, which topic would feed wheels, position and heading, and why.
+    """Say what each log holds, which topic would feed wheels, position and heading, and why; and what is wrong with it.
+
+    The filter is run as well, nothing is written: which ICRs the drive could show is said, and what to drive next.
 
     Exit status 1 when `icrtool fit` could not run on a log.
     """
@@ -52,13 +56,27 @@ def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
 
     with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
         survey = survey_log(log, config, progress)
+    measured, run, problem = None, None, ""
     try:
-        measured, problem = assemble(survey, config), ""
+        measured = assemble(survey, config)
+        run = _try(measured, config)
     except IcrToolError as err:
-        measured, problem = None, str(err)
+        problem = str(err)
     if not quiet:
         click.echo(describe_survey(survey, measured, everything=verbose))
-    options.warn(list(measured.warnings) if measured is not None else list(survey.problems), quiet=quiet)
+        if run is not None:
+            from icrtool.report.run_table import excitation_lines
+
+            click.echo("\n".join(excitation_lines(run)))
+    found = run if run is not None else measured
+    options.warn(list(found.warnings) if found is not None else list(survey.problems), quiet=quiet)
     if problem:
         click.echo(f"Error: {problem}", err=True)
-    return measured is not None
+    return run is not None
+
+
+def _try(measured: RobotLog, config: Config) -> FilterRun:
+    """Fit the log: what the drive could show, and what contradicts what, only the filter tells."""
+    from icrtool.analysis.fit import fit
+
+    return fit(measured, config)

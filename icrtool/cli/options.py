@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -66,3 +68,15 @@ def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None]
             bar.update(int(1000 * min(share, 1.0)) - bar.pos)
 
         yield move
+
+
+def load_ahead(*modules: str) -> None:
+    """Import modules in a thread, for what follows reading; that leaves the interpreter free at times."""
+
+    def load() -> None:
+        for module in modules:
+            # Where it fails, it fails again where it is imported, and is told there.
+            with suppress(ImportError):
+                importlib.import_module(module)
+
+    threading.Thread(target=load).start()

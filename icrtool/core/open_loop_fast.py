@@ -194,6 +194,13 @@ def solve_block(
         sum_moments(drive, plan, tile_lo, min(TILE, last - tile_lo), turns, sums)
         for k in range(tile_lo, min(tile_hi, lo + row_hi)):
             s = k - lo - row_lo
+            tried = False
+            for h in range(ends.shape[0]):
+                if ends[h, k - lo] >= 0:
+                    tried = True
+                    break
+            if not tried:
+                continue
             a, frozen[s, 1], frozen[s, 2], frozen[s, 3], frozen[s, 4] = freeze_start(
                 drive.heading[k],
                 icrs.y_icr_right[k * each],

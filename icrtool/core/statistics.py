@@ -8,6 +8,7 @@ resampling stretches of path, not trials.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,16 +75,22 @@ def summarise(errors_m: Floats) -> Summary:
     Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
     interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
-    horizons = errors_m.shape[1]
-    trials = np.zeros(horizons, dtype=np.int64)
-    table = np.full((4, horizons), np.nan)
-    for h in range(horizons):
-        ordered = np.sort(errors_m[:, h])
-        trials[h] = len(ordered) - np.count_nonzero(np.isnan(ordered))
-        if trials[h]:
-            ordered = ordered[: trials[h]]
-            table[:, h] = ordered.mean(), _quantile(ordered, 0.5), _quantile(ordered, 1.0 - TAIL), ordered[-1]
-    return Summary(trials, *table)
+    return summarise_sorted([sort_trials(column) for column in errors_m.T])
+
+
+def sort_trials(errors_m: Floats) -> Floats:
+    """Return the errors of one horizon's trials in ascending order, without the NaN of those that were none."""
+    ordered = np.sort(errors_m)  # NaN last
+    return ordered[: np.searchsorted(ordered, np.inf, side="right")]
+
+
+def summarise_sorted(ordered: Sequence[Floats]) -> Summary:
+    """Summarise trials as `summarise` does; `ordered` has the result of `sort_trials` for each horizon."""
+    table = np.full((4, len(ordered)), np.nan)
+    for h, errors in enumerate(ordered):
+        if len(errors):
+            table[:, h] = errors.mean(), _quantile(errors, 0.5), _quantile(errors, 1.0 - TAIL), errors[-1]
+    return Summary(np.array([len(errors) for errors in ordered], np.int64), *table)
 
 
 def _quantile(ordered: Floats, share: float) -> float:
@@ -232,7 +239,14 @@ def histogram(errors_m: Floats, bin_width_m: float) -> Histogram:
     errors_m : (n,) [m], NaN where there was no trial
     bin_width_m : [m], see `round_bin_width`
     """
-    tried = errors_m[~np.isnan(errors_m)]
-    counts = np.bincount((tried / bin_width_m).astype(np.int64))
-    edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
-    return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(tried), 1))
+    return histogram_sorted(sort_trials(errors_m), bin_width_m)
+
+
+def histogram_sorted(ordered: Floats, bin_width_m: float) -> Histogram:
+    """Count trials as `histogram` does; `ordered` is the result of `sort_trials`."""
+    if not len(ordered):
+        return Histogram(*np.empty((3, 0)))
+    edges = bin_width_m * np.arange(int(ordered[-1] / bin_width_m) + 3, dtype=np.float64)
+    edges = edges[: np.searchsorted(edges, ordered[-1], side="right") + 1]
+    counts = np.diff(np.searchsorted(ordered, edges))
+    return Histogram(edges[:-1], edges[1:], 100.0 * counts / len(ordered))

@@ -72,13 +72,14 @@ def rates(v_left: float, v_right: float, p: Floats, by: Floats) -> tuple[float, 
     f = 1.0 + p[5] * turning + p[6] * 0.5 * both
     w = max(abs(p[0] - p[1]), MIN_ICR_SEPARATION_M)
     side = 1.0 if p[0] >= p[1] else -1.0
-    omega = (left - right) / (w * f)
-    v_x = (left * p[0] - right * p[1]) / w
-    by[0, 0], by[0, 1], by[0, 2] = (left - side * v_x) / w, (side * v_x - right) / w, 0.0
-    by[0, 3], by[0, 4], by[0, 5], by[0, 6] = v_left * p[0] / w, -v_right * p[1] / w, 0.0, 0.0
-    by[2, 0], by[2, 1], by[2, 2] = -side * omega / w, side * omega / w, 0.0
-    by[2, 3], by[2, 4] = v_left / (w * f), -v_right / (w * f)
-    by[2, 5], by[2, 6] = -omega * turning / f, -omega * 0.5 * both / f
+    a, c = 1.0 / w, 1.0 / f
+    omega = (left - right) * a * c
+    v_x = (left * p[0] - right * p[1]) * a
+    by[0, 0], by[0, 1], by[0, 2] = (left - side * v_x) * a, (side * v_x - right) * a, 0.0
+    by[0, 3], by[0, 4], by[0, 5], by[0, 6] = v_left * p[0] * a, -v_right * p[1] * a, 0.0, 0.0
+    by[2, 0], by[2, 1], by[2, 2] = -side * omega * a, side * omega * a, 0.0
+    by[2, 3], by[2, 4] = v_left * a * c, -v_right * a * c
+    by[2, 5], by[2, 6] = -omega * turning * c, -omega * 0.5 * both * c
     for i in range(7):
         by[1, i] = -p[2] * by[2, i]
     by[1, 2] = -omega
@@ -87,39 +88,49 @@ def rates(v_left: float, v_right: float, p: Floats, by: Floats) -> tuple[float, 
 
 @njit
 def march(
-    t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats,
+    t: Floats, dt: Floats, lag: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats,
     theta: Floats, place: Complexes, theta_by: Floats, place_by: Complexes, theta_rate: Floats, place_rate: Complexes,
 ) -> None:  # fmt: skip
     """Fill the prefix sums at `times` (m,), ascending [s]; see `move` for the rest."""
     by, psi, s = np.zeros((3, 7)), 0.0, 0.0 + 0.0j
-    psi_by, s_by = np.zeros(7), np.zeros(7, np.complex128)
+    psi_by, s_re, s_im = np.zeros(7), np.zeros(7), np.zeros(7)
     row = 0
     for i in range(len(t)):
         last = i == len(t) - 1
         until = np.inf if last else t[i + 1]
         v_x, v_y, omega = rates(v_left[i], v_right[i], p, by)
-        turn = complex(math.cos(psi), math.sin(psi))
-        velocity = complex(v_x, v_y) * turn
+        angle = psi + lag[i] * omega
+        cos_psi, sin_psi = math.cos(angle), math.sin(angle)
+        v_re, v_im = v_x * cos_psi - v_y * sin_psi, v_x * sin_psi + v_y * cos_psi
         held = dt[i] > 0.0 or last
         while row < len(times) and times[row] < until:
             # before the first sample and through a gap nothing moves
             tau = times[row] - t[i] if held and times[row] > t[i] else 0.0
-            theta[row], place[row] = psi + tau * omega, s + tau * velocity
-            theta_rate[row], place_rate[row] = omega, velocity
+            theta[row], place[row] = psi + tau * omega, s + tau * complex(v_re, v_im)
+            theta_rate[row], place_rate[row] = omega, complex(v_re, v_im)
             for k in range(7):
+                bent = psi_by[k] + lag[i] * by[2, k]
                 theta_by[row, k] = psi_by[k] + tau * by[2, k]
-                place_by[row, k] = s_by[k] + tau * (complex(by[0, k], by[1, k]) * turn + 1j * psi_by[k] * velocity)
+                place_by[row, k] = complex(
+                    s_re[k] + tau * (by[0, k] * cos_psi - by[1, k] * sin_psi - bent * v_im),
+                    s_im[k] + tau * (by[0, k] * sin_psi + by[1, k] * cos_psi + bent * v_re),
+                )
             row += 1
         if row == len(times):
             break
         for k in range(7):
-            s_by[k] += dt[i] * (complex(by[0, k], by[1, k]) * turn + 1j * psi_by[k] * velocity)
+            # in reals: complex numbers here take twice the time
+            bent = psi_by[k] + lag[i] * by[2, k]
+            s_re[k] += dt[i] * (by[0, k] * cos_psi - by[1, k] * sin_psi - bent * v_im)
+            s_im[k] += dt[i] * (by[0, k] * sin_psi + by[1, k] * cos_psi + bent * v_re)
             psi_by[k] += dt[i] * by[2, k]
-        s += dt[i] * velocity
+        s += dt[i] * complex(v_re, v_im)
         psi += dt[i] * omega
 
 
-def move(t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats) -> Motion:
+def move(
+    t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats, lag: Floats | None = None
+) -> Motion:
     """Return where wheels alone lead at any times, with derivatives.
 
     Parameters
@@ -129,17 +140,61 @@ def move(t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, time
     v_left, v_right : (n,) [m/s]
     p : (7,), see `PARAMETERS`
     times : (m,) [s], ascending, in the clock of the wheels
+    lag : (n,) [s] how long into a step its heading is taken, for steps that stand for several; 0 by default, as Euler
     """
     m = len(times)
+    lag = np.zeros(len(t)) if lag is None else lag
     out = Motion(
         np.empty(m), np.empty(m, np.complex128), np.empty((m, 7)), np.empty((m, 7), np.complex128),
         np.empty(m), np.empty(m, np.complex128),
     )  # fmt: skip
-    stamps, held, left, right, parameters, wanted = (
-        np.require(column, np.float64, ["C", "A", "W"]) for column in (t, dt, v_left, v_right, p, times)
+    stamps, held, into, left, right, parameters, wanted = (
+        np.require(column, np.float64, ["C", "A", "W"]) for column in (t, dt, lag, v_left, v_right, p, times)
     )
-    march(stamps, held, left, right, parameters, wanted, *out)
+    march(stamps, held, into, left, right, parameters, wanted, *out)
     return out
+
+
+@njit
+def fill_misses(
+    theta: Floats, place: Complexes, theta_by: Floats, place_by: Complexes, theta_rate: Floats, place_rate: Complexes,
+    start: Ints, end: Ints, reference: Complexes, weight: Floats, misses: Floats, slopes: Floats,
+) -> None:  # fmt: skip
+    """Fill misses (2 w,), forward then right, and slopes (2 w, 8), by `PARAMETERS` and a shift of both times."""
+    count = len(start)
+    for i in range(count):
+        s, e, scale = start[i], end[i], weight[i]
+        back = complex(math.cos(theta[s]), -math.sin(theta[s]))
+        way = place[e] - place[s]
+        miss = scale * (back * way - reference[i])
+        misses[i], misses[count + i] = miss.real, miss.imag
+        for k in range(7):
+            by = scale * (back * (place_by[e, k] - place_by[s, k] - 1j * theta_by[s, k] * way))
+            slopes[i, k], slopes[count + i, k] = by.real, by.imag
+        late = scale * (back * (place_rate[e] - place_rate[s] - 1j * theta_rate[s] * way))
+        slopes[i, 7], slopes[count + i, 7] = late.real, late.imag
+
+
+def window_misses(
+    motion: Motion, start: Ints, end: Ints, reference: Complexes, weight: Floats
+) -> tuple[Floats, Floats]:
+    """Return the weighted misses of windows and their derivatives: `displace` less the reference, in one call.
+
+    Parameters
+    ----------
+    start, end : (w,) rows of `motion`
+    reference : complex (w,) [m]; weight : (w,)
+
+    Returns
+    -------
+    misses : (2 w,), forward then right
+    slopes : (2 w, 8), by `PARAMETERS` and by a common shift of both times
+    """
+    misses, slopes = np.empty(2 * len(start)), np.empty((2 * len(start), 8))
+    first, last = (np.require(rows, np.int64, ["C", "A", "W"]) for rows in (start, end))
+    place = np.require(reference, np.complex128, ["C", "A", "W"])
+    fill_misses(*motion, first, last, place, np.require(weight, np.float64, ["C", "A", "W"]), misses, slopes)
+    return misses, slopes
 
 
 def displace(motion: Motion, start: Ints, end: Ints) -> tuple[Complexes, Complexes, Complexes]:

@@ -42,6 +42,9 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
                 f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, "
                 f"jitter {stream.jitter_ms:.3g} ms"
             )
+    if measured is not None and measured.gyro is not None:
+        gyro = measured.gyro
+        lines.append(f"\ngyro:\n  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter")
     if measured is not None:
         spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
         overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from icrtool.logio.orientation import nose_yaw
 from icrtool.logio.position_sources import (
     GOAL_WORDS,
     INS_SOLVED,
@@ -25,7 +26,6 @@ from icrtool.tables import Bools, Floats
 
 Convention = Literal["enu", "ned"]
 
-QUATERNION_NORM_TOLERANCE = 0.1
 _INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
 _RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
 _ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|xsens|mti", re.IGNORECASE)
@@ -43,8 +43,6 @@ _BASELINE_ACCURACY = ("accN", "acc_n", "accE", "acc_e")
 _REFERENCES = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
 LARGEST_DEG = 720.0
 """A heading beyond this stands for "unknown": Septentrio writes -2e10."""
-UPRIGHT_COSINE = math.cos(math.radians(45.0))
-"""A sensor whose z axis is further than 45 deg from vertical is mounted on its side; its yaw is no heading."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,35 +98,8 @@ def _quaternion(table: TopicTable, path: str) -> Floats:
     return np.column_stack([table.column(f"{path}.{axis}") for axis in "xyzw"]).astype(np.float64)
 
 
-def _yaw(q: Floats) -> tuple[Floats, Bools, str]:
-    """Return yaw [rad], which rows are rotations, and a note where the sensor is not mounted upright.
-
-    Yaw is that of the sensor's x axis seen from above. A sensor on its side has another axis level all the time: that
-    axis is used then, and points somewhere at a fixed angle to the robot's nose.
-    """
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(q, axis=1)
-    usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
-    x, y, z, w = (np.where(usable[:, None], q, np.nan) / np.where(usable, norm, 1.0)[:, None]).T
-    axes = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x)],
-        ]
-    )
-    vertical = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    upright = float(np.median(np.abs(vertical[2][usable]))) if usable.any() else 1.0
-    if upright >= UPRIGHT_COSINE:
-        return np.arctan2(axes[0, 1], axes[0, 0]), usable, ""
-    level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
-    note = (
-        f"mounted on its side: its {'xyz'[level]} axis is level and stands for the nose, at an angle still to be found"
-    )
-    return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
-
-
-def _frame_convention(table: TopicTable) -> tuple[Convention, str]:
+def frame_convention(table: TopicTable) -> tuple[Convention, str]:
+    """Return the convention of a message's frame, and how it is known."""
     frame = table.text("header.frame_id")
     if frame.lower().endswith("_ned") or frame.lower() == "ned":
         return "ned", f"frame {frame} (REP-145)"
@@ -146,10 +117,11 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
     """
 
     def read(table: TopicTable) -> HeadingSource:
-        yaw, usable, note = _yaw(_quaternion(table, path))
+        rate = table.floats("angular_velocity.z") if "angular_velocity.z" in table.columns else None
+        yaw, usable, note = nose_yaw(_quaternion(table, path), rate)
         variance = table.floats(f"{covariance}[{place}]") if covariance else np.full(len(table), np.nan)
         variance = np.where(variance > 0, variance, np.nan)
-        convention, why = _frame_convention(table)
+        convention, why = frame_convention(table)
         if stuffed and not _ATTITUDE_WORDS.search(table.topic):
             convention, why = "ned", "compass angle as yaw"
         lowered, problem = score, ""
@@ -163,7 +135,6 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
             problem = "its name says that it is a goal, not a measurement"
         if _RAW_WORDS.search(table.topic):
             lowered -= 10.0
-        rate = table.floats("angular_velocity.z") if "angular_velocity.z" in table.columns else None
         return HeadingSource(
             table.topic, table.message_type, stamp_rows(table), yaw, variance, usable, convention, why,
             rate, lowered, what, problem, note,

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from icrtool.logio.fix_class import GPSFIX_STATUS, told_by_carrier, told_by_mode, told_by_status, told_by_type
 from icrtool.logio.stamps import StampedRows, stamp_rows
 from icrtool.logio.topic_table import TopicTable
-from icrtool.tables import Bools, Floats, Ints
+from icrtool.tables import Bools, Bytes, Floats, Ints
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
@@ -61,6 +62,7 @@ class PositionSource:
     variance : (n, 3) north, east, covariance of both [m^2]; NaN where not told
     usable : (n,) rows to use; `rejected` counts the others by reason
     has_orientation : the same message tells the heading in the same frame
+    told_class : uint8 (n,) how the position was solved, None where no message says
     """
 
     topic: str
@@ -75,6 +77,7 @@ class PositionSource:
     score: float = 0.0
     why: str = ""
     problem: str = ""
+    told_class: Bytes | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -94,8 +97,9 @@ def no_position(table: TopicTable, problem: str) -> PositionSource:
 
 
 def _geodetic(
-    table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str
-) -> PositionSource:
+    table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
+    told_class: Bytes | None = None,
+) -> PositionSource:  # fmt: skip
     """Build a source from latitude, longitude, height; drop rows without a fix, not finite, or at 0, 0."""
     rejected: dict[str, int] = {}
     usable = np.ones(len(table), np.bool_)
@@ -126,7 +130,7 @@ def _geodetic(
     return PositionSource(
         table.topic, table.message_type, stamp_rows(table),
         np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
-        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix",
+        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", told_class=told_class,
     )  # fmt: skip
 
 
@@ -159,7 +163,8 @@ def _without_fix(table: TopicTable) -> Bools:
 
 def _navsatfix(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix")
+    told = told_by_status(table)
+    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", told)
 
 
 def _gpsfix(table: TopicTable) -> PositionSource:
@@ -172,7 +177,8 @@ def _gpsfix(table: TopicTable) -> PositionSource:
         variance[:, column] = np.where(unknown, from_radius, variance[:, column])
     variance[unknown, 2] = np.where(np.isfinite(from_radius[unknown]), 0.0, np.nan)
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix")
+    told = told_by_status(table, GPSFIX_STATUS)
+    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", told)
 
 
 def _accuracy(std: Floats) -> Floats:
@@ -200,7 +206,8 @@ def _navpvt(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     flags = _bits(table, "flags")
     no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
-    return _geodetic(table, geodetic, _accuracy(table.floats(*H_ACC) * 1e-3), no_fix, 85.0, "u-blox position")
+    variance, told = _accuracy(table.floats(*H_ACC) * 1e-3), told_by_carrier(flags)
+    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", told)
 
 
 def _navhpposllh(table: TopicTable) -> PositionSource:
@@ -228,7 +235,7 @@ def _septentrio(mode: str, what: str, score: float) -> Reader:
         variance = _accuracy(np.where(accuracy < SEPTENTRIO_UNKNOWN, accuracy * 0.01, np.nan))
         if "latitude_std_dev" in table.columns:
             variance = _deviations(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
-        return _geodetic(table, geodetic, variance, no_fix, score, what)
+        return _geodetic(table, geodetic, variance, no_fix, score, what, told_by_mode(modes))
 
     return read
 
@@ -244,7 +251,7 @@ def solved(table: TopicTable, path: str, accepted: frozenset[str] | frozenset[in
 
 def _novatel(
     place: tuple[str, str, str], deviations: tuple[str, str], status: str, accepted: frozenset[str] | frozenset[int],
-    what: str, score: float,
+    kind: str, what: str, score: float,
 ) -> Reader:  # fmt: skip
     """Read a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
 
@@ -252,7 +259,8 @@ def _novatel(
         geodetic = _place(table, *place)
         geodetic[:, 2] += np.nan_to_num(table.floats("undulation"))
         variance = _deviations(*(table.floats(name) for name in deviations))
-        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what)
+        told = told_by_type(table, kind)
+        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, told)
 
     return read
 
@@ -300,23 +308,27 @@ _HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 _COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))
 _FIX = (*_HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
 
-_NOVATEL = (*_HEADER, "solution_status", "lat", "lon", "height", "undulation", "lat_sigma", "lon_sigma")
-_OEM7 = (*_HEADER, "sol_status.status", "lat", "lon", "hgt", "undulation", "lat_stdev", "lon_stdev")
+_WORD, _NUMBER = "position_type", "pos_type.type"
+_NOVATEL = (*_HEADER, "solution_status", _WORD, "lat", "lon", "height", "undulation", "lat_sigma", "lon_sigma")
+_OEM7 = (*_HEADER, "sol_status.status", _NUMBER, "lat", "lon", "hgt", "undulation", "lat_stdev", "lon_stdev")
 _INS = (*_HEADER, "latitude", "longitude")
 _NOVATEL_INS_SIGMA = ("latitude_std", "longitude_std")
 _OEM7_INS_SIGMA = ("latitude_stdev", "longitude_stdev")
 
 _bestpos = _novatel(
-    ("lat", "lon", "height"), ("lat_sigma", "lon_sigma"), "solution_status", SOLVED, "NovAtel position", 85.0
-)
+    ("lat", "lon", "height"), ("lat_sigma", "lon_sigma"), "solution_status", SOLVED, _WORD,
+    "NovAtel position", 85.0,
+)  # fmt: skip
 _oem7_bestpos = _novatel(
-    ("lat", "lon", "hgt"), ("lat_stdev", "lon_stdev"), "sol_status.status", SOLVED_CODES, "NovAtel position", 85.0
-)
+    ("lat", "lon", "hgt"), ("lat_stdev", "lon_stdev"), "sol_status.status", SOLVED_CODES, _NUMBER,
+    "NovAtel position", 85.0,
+)  # fmt: skip
 _inspvax = _novatel(
-    ("latitude", "longitude", "altitude"), _NOVATEL_INS_SIGMA, "ins_status", INS_SOLVED, "NovAtel INS position", 84.0
-)
+    ("latitude", "longitude", "altitude"), _NOVATEL_INS_SIGMA, "ins_status", INS_SOLVED, _WORD,
+    "NovAtel INS position", 84.0,
+)  # fmt: skip
 _oem7_inspvax = _novatel(
-    ("latitude", "longitude", "height"), _OEM7_INS_SIGMA, "ins_status.status", INS_SOLVED_CODES,
+    ("latitude", "longitude", "height"), _OEM7_INS_SIGMA, "ins_status.status", INS_SOLVED_CODES, _NUMBER,
     "NovAtel INS position", 84.0,
 )  # fmt: skip
 _odometry = _metric("pose.pose.", "pose.covariance", 60.0, "metric position of an odometry message", odometry=True)
@@ -339,11 +351,14 @@ POSITION_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
         _septentrio("gnss_mode", "Septentrio INS position", 84.0),
     ),
     "novatel_gps_msgs/NovatelPosition": (_NOVATEL, _bestpos),
-    "novatel_gps_msgs/Inspvax": ((*_INS, "altitude", "undulation", "ins_status", *_NOVATEL_INS_SIGMA), _inspvax),
+    "novatel_gps_msgs/Inspvax": (
+        (*_INS, "altitude", "undulation", "ins_status", _WORD, *_NOVATEL_INS_SIGMA),
+        _inspvax,
+    ),
     "novatel_oem7_msgs/BESTPOS": (_OEM7, _oem7_bestpos),
     "novatel_oem7_msgs/BESTGNSSPOS": (_OEM7, _oem7_bestpos),
     "novatel_oem7_msgs/INSPVAX": (
-        (*_INS, "height", "undulation", "ins_status.status", *_OEM7_INS_SIGMA),
+        (*_INS, "height", "undulation", "ins_status.status", _NUMBER, *_OEM7_INS_SIGMA),
         _oem7_inspvax,
     ),
     "geometry_msgs/PoseStamped": (pose_paths("pose."), _metric("pose.", "", 70.0, "metric pose")),

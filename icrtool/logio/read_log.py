@@ -15,6 +15,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.logio.channel import Block, Channel, Container
 from icrtool.logio.dynamic_joints import Collector, collector_for
+from icrtool.logio.gyro import find_gyro
 from icrtool.logio.heading_sources import Convention, HeadingSource
 from icrtool.logio.open_log import open_log
 from icrtool.logio.position_sources import PositionSource
@@ -143,7 +144,10 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    return RobotLog(name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna)
+    gyro = find_gyro(survey.tables, motion.topic, source.topic, clock)
+    return RobotLog(
+        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro
+    )
 
 
 def _place_in_words(antenna: tuple[float, float] | None) -> str:
@@ -231,12 +235,15 @@ def _fixes(
         )
     else:
         north, east = np.asarray(source.metric, np.float64)[rows].T
-    variance = source.variance[rows]
+    var_north, var_east, covariance = (np.ascontiguousarray(column) for column in source.variance[rows].T)
     fixes = PositionFixes(
         stamps[rows],
         np.ascontiguousarray(north, np.float64),
         np.ascontiguousarray(east, np.float64),
-        *(np.ascontiguousarray(column) for column in variance.T),
+        var_north,
+        var_east,
+        covariance,
+        told_class=None if source.told_class is None else source.told_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 

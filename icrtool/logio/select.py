@@ -9,6 +9,7 @@ from typing import Literal, TypeVar
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logio.channel import Channel
+from icrtool.logio.gyro import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logio.heading_sources import HEADING_TYPES, HeadingSource, no_heading
 from icrtool.logio.position_sources import POSITION_TYPES, PositionSource, no_position
 from icrtool.logio.sides import right_twin
@@ -74,6 +75,8 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
             paths += POSITION_TYPES[kind][0]
         if kind in HEADING_TYPES and topics.heading in (None, channel.topic):
             paths += HEADING_TYPES[kind][0]
+        if kind == GYRO_TYPE:
+            paths += GYRO_FIELDS
         if kind in PAIR_TYPES and channel.topic in pairs:
             paths.append("data")
         if paths:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import struct
-from collections.abc import Iterator
-from itertools import islice
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -24,8 +23,11 @@ _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What sqlite3 raises; the latter where a damaged name stands in its message."""
 
-Row = tuple[Any, Any, Any, int]
-"""Topic id, log time [ns], message, row number. SQLite holds a column to no type."""
+Row = tuple[Any, Any, Any, Any, int, int]
+"""Topic ids, log times [ns], sizes, messages; last row number, count of messages that are bytes.
+
+SQLite holds a column to no type.
+"""
 
 
 class SqliteBag:
@@ -102,7 +104,7 @@ class SqliteBag:
         return database
 
     def _open(self, mode: str) -> sqlite3.Connection:
-        name = quote(os.fsencode(self._path.absolute()))
+        name = quote(os.fsencode(self._path.resolve()))
         database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK_BYTES)
         database.text_factory = lambda text: text.decode("utf-8", "replace")
@@ -155,22 +157,30 @@ class SqliteBag:
 
     def _stored(self, wanted: frozenset[int]) -> Iterator[Block]:
         """Yield the messages as they are stored; where pages are damaged, go on behind them."""
-        # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
-        topics, lost = (",".join(str(number) for number in sorted(rows)) for rows in (wanted, self._rows_cut_off()))
-        of_topics = f"topic_id IN ({topics}) AND rowid NOT IN ({lost})"
-        query = f"SELECT topic_id, timestamp, data, rowid FROM messages WHERE {of_topics} AND rowid > ?"  # noqa: S608
-        after, step = 0, 1
+        batch = self._batch_query(wanted)
+        after, count, step = 0, _FIRST_ROWS, 1
         while after < self._rows:
-            damage: Exception | None = None
-            for rows, damage in self._batches(query, after):  # noqa: B007 - the last one is looked at below
-                if rows:
-                    self._last_row = after = max(after, rows[-1][3])
-                    step = 1
-                    yield self._block(rows)
-            if damage is None:
+            try:
+                block, last = batch(after, count)
+            except _DAMAGE as err:
+                if count == 1:
+                    self.problems.say(f"damaged ({err}); what could be read of it was read")
+                    after, step = after + step, 2 * step
+                count = max(count // 2, 1)
+                continue
+            if last is None:
                 return
-            self.problems.say(f"damaged ({damage}); what could be read of it was read")
-            after, step = after + step, 2 * step
+            step = 1
+            if block is None and count > 1:
+                count //= 2
+                continue
+            self._last_row = after = max(after + 1, last)
+            if block is None:
+                self.problems.say("rows without a time or a message left out")
+                continue
+            yield with_possible_times(block, self.problems)
+            by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
+            count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
     def _rows_cut_off(self) -> frozenset[int]:
         """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it.
@@ -191,46 +201,46 @@ class SqliteBag:
         self.problems.say("cut off; what could be read of it was read")
         return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
-    def _batches(self, query: str, after: int) -> Iterator[tuple[list[Row], Exception | None]]:
-        """Yield rows, some megabytes at a time; at a damage those before it, and the damage."""
-        count = _FIRST_ROWS
-        try:
-            cursor = self._database.execute(query, (after,))
-        except _DAMAGE as err:
-            yield [], err
-            return
-        while True:
-            rows: list[Row] = []
-            try:
-                rows.extend(islice(cursor, count))
-            except _DAMAGE as err:
-                yield rows, err
-                return
-            yield rows, None
-            if len(rows) < count:
-                return
-            held = sum(len(row[2]) for row in rows if isinstance(row[2], bytes))
-            count = max(1, min(_MOST_ROWS, _BLOCK_BYTES * len(rows) // max(held, 1)))
+    def _batch_query(self, wanted: frozenset[int]) -> Callable[[int, int], tuple[Block | None, int | None]]:
+        """Return what reads up to so many messages behind a row.
 
-    def _block(self, rows: list[Row]) -> Block:
-        try:
-            block = _packed(rows)
-        except (TypeError, ValueError, OverflowError):
-            sound = [row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes)]
-            self.problems.say("rows without a time or a message left out")
-            block = _packed(sound)
-        return with_possible_times(block, self.problems)
+        It gives them, None where they cannot be joined, and their last row, None where no row is left.
+
+        Notes
+        -----
+        SQLite joins the messages of a batch itself, without one Python object each and with the interpreter free. What
+        it cannot join (a column holds any type) is left to a batch of one.
+        """
+        # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
+        topics, lost = (",".join(str(number) for number in sorted(rows)) for rows in (wanted, self._rows_cut_off()))
+        rows = (
+            "SELECT topic_id AS topic, timestamp AS time, length(data) AS size, data, rowid AS number, "  # noqa: S608
+            "typeof(data) = 'blob' AS sound FROM messages "
+            f"WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) AND rowid > ? ORDER BY rowid LIMIT ?"
+        )
+        joined = (
+            "SELECT group_concat(topic), group_concat(time), group_concat(size), CAST(group_concat(data, '') AS BLOB), "  # noqa: S608
+            f"max(number), sum(sound) FROM ({rows})"
+        )
+
+        def batch(after: int, count: int) -> tuple[Block | None, int | None]:
+            row = self._database.execute(joined if count > 1 else rows, (after, count)).fetchone()
+            return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
+
+        return batch
 
 
-def _packed(rows: list[Row]) -> Block:
-    """Join the messages of rows to one buffer."""
-    messages = [row[2] for row in rows]
-    end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
-    start = np.concatenate([[0], end])[:-1].astype(np.int64)
-    times = np.array([row[1] for row in rows], np.int64)
-    return Block(
-        np.frombuffer(b"".join(messages), np.uint8), np.array([row[0] for row in rows], np.int64), times, start, end
-    )
+def _packed(row: Row) -> Block | None:
+    """Return the messages of a joined row, None where some are no messages or have no time."""
+    *texts, data, _, count = row
+    try:
+        topics, times, sizes = (np.fromstring(str(text), np.int64, sep=",") for text in texts)
+    except ValueError:
+        return None
+    end = np.cumsum(sizes)
+    if not len(topics) == len(times) == len(sizes) == count or not isinstance(data, bytes) or end[-1] != len(data):
+        return None
+    return Block(np.frombuffer(data, np.uint8), topics, times, end - sizes, end)
 
 
 def _table_rows(page: bytes) -> Iterator[tuple[int, int]]:

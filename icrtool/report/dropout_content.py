@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from icrtool.analysis.blind_paths import BlindDrive
-from icrtool.analysis.dropout import DrivenRun, DropoutReport, ModelResult
+from icrtool.analysis.driven_run import DrivenRun
+from icrtool.analysis.dropout import DropoutReport, ModelResult
 from icrtool.analysis.gates import BudgetDistance, Verdict
+from icrtool.analysis.ladder import Ladder
 from icrtool.analysis.outages import Outage
 from icrtool.analysis.turning import TurningSplit
 
@@ -29,6 +31,8 @@ class DropoutContent:
     examples : a cornering and a straight drive; empty where no trial is that long
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
+    ladder : the models judged on way they were not fitted to; None where it was left out, and `no_ladder` says why
+    smoothed : the reference is the smoother's trajectory, not the filter's
     """
 
     title: str
@@ -40,6 +44,9 @@ class DropoutContent:
     examples: tuple[BlindDrive, ...]
     outages: tuple[Outage, ...]
     by_turning: tuple[TurningSplit, ...] = ()
+    ladder: Ladder | None = None
+    no_ladder: str = ""
+    smoothed: bool = False
 
     @property
     def passed(self) -> bool:

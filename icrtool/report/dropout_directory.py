@@ -18,6 +18,7 @@ from icrtool.analysis.blind_paths import BlindDrive
 from icrtool.analysis.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, DropoutReport, ModelResult
 from icrtool.core.open_loop_fast import TOLERANCE_M
 from icrtool.report.dropout_content import DropoutContent
+from icrtool.report.ladder_table import LADDER_COLUMNS, ladder_document, ladder_rows
 from icrtool.report.run_directory import json_bytes
 from icrtool.report.whole_directory import whole_directory
 
@@ -25,6 +26,14 @@ REPORT_FILE = "report.json"
 DROPOUT_DIRECTORY = "dropout"
 DROPOUT_SCHEMA = "icrtool/dropout/1"
 SCHEMA_FAMILY = "icrtool/dropout/"
+
+KNOWS = {
+    "icr": "the way up to each start",
+    "no_slip": "the track width",
+    "icr_final": "all of the way (in sample)",
+    "icr_window": "all of the way (in sample)",
+}
+"""What the ICRs of a model were learned from."""
 
 ERROR_COLUMNS = ("icr", "no_slip")
 
@@ -53,7 +62,7 @@ def is_dropout_directory(directory: Path) -> bool:
 
 
 def write_content(content: DropoutContent, directory: Path) -> None:
-    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory.
+    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory, and ladder.csv where there is one.
 
     Raises
     ------
@@ -64,6 +73,8 @@ def write_content(content: DropoutContent, directory: Path) -> None:
     (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
     (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(content.report)))
     (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(content.worst)))
+    if content.ladder is not None:
+        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(content.ladder)))
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(content)))
 
 
@@ -74,7 +85,7 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         "schema": DROPOUT_SCHEMA,
         "tool_version": __version__,
         "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
-        "reference": "the filter's estimate at the end of the blind way",
+        "reference": f"the {'smoother' if content.smoothed else 'filter'}'s estimate at the end of the blind way",
         "starts": report.states,
         "starts_standing": report.standing,
         "tolerance_m": TOLERANCE_M,
@@ -89,6 +100,7 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         "trials": _count_documents(report),
         "budgets": [one._asdict() for one in content.budgets],
         "by_turning": [one._asdict() for one in content.by_turning],
+        "ladder": ladder_document(content.ladder) if content.ladder is not None else {"left_out": content.no_ladder},
         "gates": [
             {
                 **asdict(verdict.gate),
@@ -137,7 +149,7 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
     shared = [name for name in columns if name != "model"]
     rows = [{name: columns[name][row] for name in shared} for row in mine]
-    return {"name": result.name, "label": result.label, "by_horizon": rows}
+    return {"name": result.name, "label": result.label, "knows": KNOWS.get(result.name), "by_horizon": rows}
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:

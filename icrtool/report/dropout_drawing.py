@@ -143,11 +143,12 @@ def _draw(name: str, directory: Path, formats: tuple[str, ...], content: tuple[A
 
 def _figures() -> dict[str, Callable[..., Figure]]:
     """Return the figures by the first word of their file's name."""
-    from icrtool.report import figure_dropout, figure_dropout_paths
+    from icrtool.report import figure_dropout, figure_dropout_paths, figure_ladder
 
     return {
         "summary": figure_dropout.draw_summary,
         "histogram": figure_dropout.draw_histogram,
+        "ladder": figure_ladder.draw_ladder,
         "examples": figure_dropout_paths.draw_examples,
         "worst": figure_dropout_paths.draw_worst,
         "outages": figure_dropout_paths.draw_outages,

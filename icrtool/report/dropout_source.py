@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from icrtool.analysis.driven_run import DrivenRun
+from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.reference import held_against
 from icrtool.config import Config
 from icrtool.errors import RunError
-from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run
+from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run, read_smoothed
 from icrtool.tables import RobotLog
 
 SAME_STATE_M = 1e-6
@@ -46,6 +49,17 @@ def stored_config(run: StoredRun) -> Config:
         problem = err.errors(include_url=False)[0]
         key = ".".join(str(part) for part in problem["loc"])
         raise RunError(run.directory, f"its configuration is not ours ({key})", "run icrtool fit again") from err
+
+
+def judged_run(run: StoredRun | FilterRun, directory: Path) -> DrivenRun:
+    """Return a run held against the smoother's states in its directory.
+
+    Raises
+    ------
+    RunError
+        It has none.
+    """
+    return held_against(run, read_smoothed(directory, run.table.stamp_ns))
 
 
 def log_of(run: StoredRun) -> Path:
@@ -95,13 +109,31 @@ def check_same_states(run: StoredRun, again: FilterRun) -> None:
         for column in ("north_m", "east_m", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
     )
     if not same:
-        why = f"its log gives other states now (it was warm-started, or icrtool {run.summary['tool_version']} differed)"
+        why = f"its log gives other states now (icrtool {run.summary['tool_version']} made it)"
         raise RunError(run.directory, why, "forced outages need a run that can be made again: fit the log again")
 
 
 def terrain_changes_s(run: StoredRun) -> tuple[float, ...]:
     """Return the terrain changes [s] that a run was made with."""
     return tuple(float(segment["begin_s"]) for segment in run.summary.get("segments", [])[1:])
+
+
+def warm_start_of(run: StoredRun) -> WarmStart | None:
+    """Return what a run began with, where that was another run's end.
+
+    Raises
+    ------
+    RunError
+        It is not readable.
+    """
+    stored = run.summary["filter"].get("warm_start")
+    if stored is None:
+        return None
+    try:
+        icrs, covariance = np.array(stored["icrs_m"], np.float64), np.array(stored["covariance_m2"], np.float64)
+        return WarmStart(icrs.reshape(3), covariance.reshape(3, 3))
+    except (KeyError, TypeError, ValueError) as err:
+        raise RunError(run.directory, "does not say what it was warm-started with", "run icrtool fit again") from err
 
 
 def newest_run(runs: Path) -> Path:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from textwrap import wrap
 
 from icrtool.analysis.dropout import DropoutReport, ModelResult
 from icrtool.analysis.gates import BudgetDistance
 from icrtool.analysis.outages import Outage
 from icrtool.analysis.turning import TurningSplit
 from icrtool.report.dropout_content import DropoutContent, p95_at, shown_horizons
+from icrtool.report.ladder_table import format_ladder
 from icrtool.report.words import duration_text, way_text
 
 LABEL = 26
 MODEL = 15
 """Columns of the left margin; of them, for a model's name."""
 CELL = 18
+
+WIDTH = 100
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -24,12 +28,24 @@ NOTED_STANDING = 0.05
 def format_dropout(content: DropoutContent) -> str:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
     report, drive = content.report, content.run_summary["drive"]
+    reference = "; held against the smoothed trajectory" if content.smoothed else ""
     way = f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-    lines = [content.title, f"blind with wheel speeds only, from each of {report.states:,} states; {way}", ""]
+    lines = [
+        content.title,
+        f"blind with wheel speeds only, from each of {report.states:,} states; {way}{reference}",
+        "",
+    ]
     lines += _error_lines(report)
     lines += ["", *_count_lines(report)]
     lines += [_turning_line(one) for one in content.by_turning]
-    lines += ["", *budget_lines(content.budgets)]
+    lines += [
+        "",
+        *(part for line in budget_lines(content.budgets) for part in wrap(line, WIDTH, subsequent_indent="  ")),
+    ]
+    if content.ladder is not None:
+        lines += ["", *format_ladder(content.ladder).splitlines()]
+    elif content.no_ladder:
+        lines += ["", f"models on way they were not fitted to: left out: {content.no_ladder}"]
     if content.outages:
         lines += ["", *_outage_lines(content.outages, report)]
     if content.verdicts:

@@ -9,9 +9,9 @@ import numpy as np
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.report.decimate import extremes, percentiles
-from icrtool.report.figure_style import BAD_FIX_COLOR, BAR_COLOR, MEAN, inches, new_figure, shade_spans
+from icrtool.report.figure_style import BAD_FIX_COLOR, BAR_COLOR, FLOAT_COLOR, MEAN, inches, new_figure, shade_spans
 from icrtool.report.words import length_text, position_word, run_title
-from icrtool.tables import Floats
+from icrtool.tables import Bools, Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,25 +36,34 @@ def draw_gnss_difference(run: FilterRun) -> Figure:
     subtitle = f"Distance between filter and {position_word(run)}"
     figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=0.9))
+    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
     duration = float(run.table.t_s[-1])
     percent, difference, code = 100 * run.gnss.t_s / duration, run.gnss.difference, run.gnss.code
     used, gated = (code > UNSEEN) & (code != GATED), code == GATED
     top = _top(difference[used])
     if used.any():
-        x, y = _with_breaks(percent[used], difference[used])
+        trusted = used & ~run.fix_quality.down_weighted
+        x, y = _with_breaks(percent[trusted], difference[trusted])
         shown = extremes(y)
         mean, most = (length_text(facts[name]) for name in ("mean_difference_m", "max_difference_m"))
         axes.plot(x[shown], y[shown], color=BAR_COLOR, linewidth=0.7, label=f"used, max {most}")
         axes.axhline(facts["mean_difference_m"], label=f"mean {mean}", **MEAN.keywords())
     if gated.any():
         _draw_rejected(axes, percent[gated], difference[gated], top)
-    shade_spans(axes, 100 * (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / duration, label="no usable GNSS")
+    _mark_down_weighted(axes, percent, difference, run.fix_quality.down_weighted & used, top)
+    lost = len(run.fix_quality.losses_ns) > 0
+    shade_spans(
+        axes,
+        100 * (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / duration,
+        label="no usable GNSS, or RTK lost" if lost else "no usable GNSS",
+    )
     axes.set_xlim(0, 100)
     axes.set_ylim(0, top)
     axes.set_xlabel("Mission time [%]")
     axes.set_ylabel("Difference [m]")
-    figure.legend(loc="lower center", ncols=5, columnspacing=1.6, handlelength=2.0)
+    # Five short entries stand side by side; with more, or longer ones, there are two rows.
+    ncols = 3 if lost or run.fix_quality.down_weighted.any() else 5
+    figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 
@@ -67,6 +76,16 @@ def _draw_rejected(axes: Axes, percent: Floats, difference: Floats, top: float) 
         if len(x):
             shown = extremes(difference[rows], points=MARKS)
             axes.plot(x[shown], y[shown], marker=marker, label=f"{len(x)} rejected{where}", **look)
+
+
+def _mark_down_weighted(axes: Axes, percent: Floats, difference: Floats, rows: Bools, top: float) -> None:
+    """Mark the fixes that were used with the noise of float or other ones."""
+    if not rows.any():
+        return
+    shown = extremes(difference[rows], points=MARKS)
+    x, y = percent[rows][shown], np.minimum(difference[rows][shown], top)
+    look: dict[str, Any] = {"linestyle": "none", "marker": ".", "color": FLOAT_COLOR, "markersize": 4.0}
+    axes.plot(x, y, label=f"{np.count_nonzero(rows):,} down-weighted", **look)
 
 
 def _top(difference: Floats) -> float:

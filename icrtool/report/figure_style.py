@@ -70,6 +70,7 @@ class Pen:
 
 
 FIX_COLOR = "0.70"
+FLOAT_COLOR = "#762a83"
 BAD_FIX_COLOR = "#b2182b"
 OUTAGE_COLOR = "0.90"
 BAR_COLOR = "#5b8db8"

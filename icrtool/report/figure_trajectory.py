@@ -8,12 +8,23 @@ import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.fix_quality import CLASSES, REFERENCE
 from icrtool.analysis.odometry import OdometryPath, icr_odometry, no_slip_odometry
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.report.decimate import places
-from icrtool.report.figure_style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
+from icrtool.report.figure_style import (
+    BAD_FIX_COLOR,
+    FILTER,
+    FIX_COLOR,
+    FLOAT_COLOR,
+    ICR,
+    NO_SLIP,
+    Pen,
+    inches,
+    new_figure,
+)
 from icrtool.report.words import duration_text, position_word, run_title, way_text
-from icrtool.tables import Floats
+from icrtool.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats, PositionFixes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +42,17 @@ SMALLEST_VIEW_M = 2.0
 FAR_M = 20_000.0
 CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
+
+
+_DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
+FIX_LOOKS: dict[int, dict[str, Any]] = {
+    REFERENCE: _DOT,
+    FIXED_FIX: _DOT,
+    FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": FLOAT_COLOR},
+    OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
+}
+REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
+"""Markers by class: shape and luminance tell them apart."""
 
 
 def draw_trajectory(run: FilterRun) -> Figure:
@@ -115,16 +137,25 @@ def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
 
 
 def _draw_fixes(axes: Axes, run: FilterRun, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    fixes, code = run.log.gnss, run.gnss.code
-    word = position_word(run)
-    used: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR, "label": word}
-    rejected: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR, "label": f"{word}, rejected"}
-    for look, chosen in ((used, (code > UNSEEN) & (code != GATED)), (rejected, code == GATED)):
-        north, east = fixes.north_m[chosen], fixes.east_m[chosen]
-        seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
-        shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
-        if chosen.any():
-            axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
+    fixes, code, kind = run.log.gnss, run.gnss.code, run.fix_quality.fix_class
+    word, used = position_word(run), (code > UNSEEN) & (code != GATED)
+    several = len(np.unique(kind)) > 1
+    for value, look in FIX_LOOKS.items():
+        label = f"{word}, {CLASSES[value]}" if several else word
+        _draw_places(axes, fixes, used & (kind == value), (lowest, highest, cell_m), {**look, "label": label})
+    _draw_places(axes, fixes, code == GATED, (lowest, highest, cell_m), {**REJECTED_LOOK, "label": f"{word}, rejected"})
+
+
+def _draw_places(
+    axes: Axes, fixes: PositionFixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
+) -> None:
+    if not chosen.any():
+        return
+    lowest, highest, cell_m = view
+    north, east = fixes.north_m[chosen], fixes.east_m[chosen]
+    seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
+    shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
+    axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
 
 
 def _draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, label: str, order: float) -> None:

@@ -15,7 +15,10 @@ import numpy as np
 
 from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import RUN_SCHEMA, FilterRun
+from icrtool.analysis.ladder_trials import MeasuredHeading
+from icrtool.analysis.measured_heading import measured_headings
 from icrtool.errors import RunError
+from icrtool.report.headings_file import HEADINGS_FILE, read_headings, write_headings
 from icrtool.report.states_csv import StatesFileError, StatesFormat, file_sha256, read_states, write_states
 from icrtool.report.whole_directory import check_place, whole_directory
 from icrtool.tables import Bools, Ints, States
@@ -25,6 +28,8 @@ CHECKSUM_FILE = "SHA256SUMS"
 """Sums of run.json and the states, as ``sha256sum -c`` reads them: an edited run is not taken for a measured one."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
+
+SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parquet": "parquet"}
 
 PLOT_FORMATS = ("png", "svg", "pdf")
 
@@ -96,13 +101,17 @@ def write_run(
     ):
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
+        sums: dict[str, str] = {}
         if smoothed is not None:
-            write_states(smoothed, partial / f"smoothed.{states}", states)
+            sums[f"smoothed.{states}"] = write_states(smoothed, partial / f"smoothed.{states}", states)
+        if headings := measured_headings(run):
+            write_headings(headings, run.table.stamp_ns, partial / HEADINGS_FILE)
+            sums[HEADINGS_FILE] = file_sha256(partial / HEADINGS_FILE)
         if plots:
             (partial / "plots").mkdir()
             _draw(run, partial / "plots", plots)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        sums = {RUN_FILE: file_sha256(partial / RUN_FILE), states_name: states_sum.result()}
+        sums = {RUN_FILE: file_sha256(partial / RUN_FILE), states_name: states_sum.result()} | sums
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
 
 
@@ -119,10 +128,15 @@ def read_run(directory: Path) -> StoredRun:
     name = next((name for name in STATES_FILES if name in sums), None)
     if name is None:
         raise RunError(directory, f"{CHECKSUM_FILE} names no states", "run icrtool fit again")
-    for file in (RUN_FILE, name):
-        _check_sum(directory, file, sums.get(file))
+    _check_sum(directory, RUN_FILE, sums.get(RUN_FILE))
     try:
-        table = read_states(directory / name, STATES_FILES[name])
+        with ThreadPoolExecutor(1) as pool:
+            # Both read the file from end to end; hashing leaves the interpreter to the other.
+            checked = pool.submit(_check_sum, directory, name, sums[name])
+            try:
+                table = read_states(directory / name, STATES_FILES[name])
+            finally:
+                checked.result()
         return StoredRun(
             name=str(document["log"]),
             table=table,
@@ -134,6 +148,46 @@ def read_run(directory: Path) -> StoredRun:
         )
     except (OSError, StatesFileError, KeyError, TypeError, ValueError) as err:
         raise RunError(directory, f"cannot be read ({err})", "run icrtool fit again") from err
+
+
+def read_smoothed(directory: Path, stamp_ns: Ints) -> States:
+    """Read the smoother's states of a run, which must be at the stamps of its states.
+
+    Raises
+    ------
+    RunError
+        The run was made without them, or they were edited since.
+    """
+    sums = _read_sums(directory)
+    name = next((name for name in SMOOTHED_FILES if name in sums), None)
+    if name is None:
+        raise RunError(directory, "it has no smoothed states", "run icrtool fit --smooth")
+    _check_sum(directory, name, sums[name])
+    try:
+        smoothed = read_states(directory / name, SMOOTHED_FILES[name])
+    except (OSError, StatesFileError) as err:
+        raise RunError(directory, f"{name} cannot be read ({err})", "run icrtool fit --smooth again") from err
+    if not np.array_equal(smoothed.stamp_ns, stamp_ns):
+        raise RunError(directory, f"{name} is not of the same states", "run icrtool fit --smooth again")
+    return smoothed
+
+
+def read_measured_headings(run: StoredRun) -> tuple[MeasuredHeading, ...]:
+    """Read the headings that were measured apart from the reference; empty where the run has none.
+
+    Raises
+    ------
+    RunError
+        The file was edited since the run, or cannot be read.
+    """
+    sums = _read_sums(run.directory)
+    if HEADINGS_FILE not in sums:
+        return ()
+    _check_sum(run.directory, HEADINGS_FILE, sums[HEADINGS_FILE])
+    try:
+        return read_headings(run.directory / HEADINGS_FILE, run.table.stamp_ns)
+    except (OSError, KeyError, ValueError) as err:
+        raise RunError(run.directory, f"{HEADINGS_FILE} cannot be read ({err})", "run icrtool fit again") from err
 
 
 def read_warm_start(directory: Path) -> WarmStart:

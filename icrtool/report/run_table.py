@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
 from icrtool.analysis.terrain import FALSE_ALARMS_PER_HOUR, TerrainChange
 from icrtool.report.words import duration_text, length_text, position_word, run_title, way_text
@@ -12,6 +14,9 @@ from icrtool.report.words import duration_text, length_text, position_word, run_
 WIDTH = 100
 LABEL = 12
 """Columns of the left margin: what a line is about."""
+
+WORTH_TELLING_S = 0.05
+"""A delay below this is not worth a line."""
 
 ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
@@ -32,12 +37,28 @@ def format_run(run: FilterRun) -> str:
         "",
         *_icr_lines(run),
         *_multiplier_lines(run),
+        *excitation_lines(run),
         *_terrain_lines(run),
         "",
         *_position_lines(run),
         *_heading_lines(run),
+        *_delay_lines(run),
     ]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def excitation_lines(run: FilterRun) -> list[str]:
+    """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
+    found = run.summary["excitation"]
+    verdicts = found["verdict"]
+    if set(verdicts.values()) == {"shown"}:
+        said = "enough to show all three ICRs"
+    else:
+        said = ", ".join(f"{ICR_LABELS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
+    right, left = found["turned_right_deg"], found["turned_left_deg"]
+    spun = found["spun_right_deg"] + found["spun_left_deg"]
+    turned = f"turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot"
+    return [_line("excitation", f"{said}; {turned}")]
 
 
 def _stream_lines(run: FilterRun) -> list[str]:
@@ -139,11 +160,27 @@ def _position_lines(run: FilterRun) -> list[str]:
             f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
         )
     )
+    lines += _class_lines(gnss["classes"], gnss["jumps"])
     if gnss["recoveries"]:
         lines.append(_line("", f"believed again after rejection: {gnss['recoveries']:,} times"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
-        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}, {away} in all"))
+        lost = len(run.summary["rtk_losses_ns"])
+        cause = f" ({lost} of RTK, fixes went on)" if lost else ""
+        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
+    return lines
+
+
+def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
+    """Say what classes the fixes were of, where they were not all of one, and what was done to them."""
+    lines = []
+    for name, one in classes.items() if len(classes) > 1 else ():
+        done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
+        done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
+        done += [f"{one['sold_as_fixed']:,} sold as fixed"] if one["sold_as_fixed"] else []
+        lines.append(_line("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
+    if jumps:
+        lines.append(_line("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
     return lines
 
 
@@ -154,8 +191,23 @@ def _heading_lines(run: FilterRun) -> list[str]:
     # Adding zero takes the sign off a rounded -0.0.
     found = round(math.degrees(check.offset_rad), 1) + 0.0
     offset = f"{found:+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
+    if check.name.text:
+        offset += f" ({check.name.text})"
     applied = math.degrees(check.applied_offset_rad)
     return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
+
+
+def _delay_lines(run: FilterRun) -> list[str]:
+    """Say what seems to be late, or early, against the wheels."""
+    told: list[str] = []
+    if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
+        return told
+    for word, facts in (("heading", run.summary["heading"]), ("fixes", run.summary["gnss"])):
+        delay, std = facts["delay_s"], facts["delay_std_s"]
+        if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
+            told.append(f"{word} {abs(delay):.2f} ± {std:.2f} s {'late' if delay > 0 else 'early'}")
+    text = f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"
+    return [_line("delays", text)] if told else []
 
 
 def _line(label: str, text: str) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import orjson
 
 from icrtool.tables import Floats, Ints, States
 
@@ -22,11 +24,11 @@ StatesFormat = Literal["csv", "parquet"]
 COLUMNS = tuple(field.name for field in fields(States))
 INTEGER_COLUMNS = frozenset({"stamp_ns"})
 
-CHUNK_ROWS = 16_384
-"""Rows formatted at a time: 4 MB of text, so that memory does not grow with the log."""
+CHUNK_ROWS = 1024
+"""Rows formatted at a time: they stay in the processor's cache, and memory does not grow with the log."""
 
-LARGEST_PLAIN_WHOLE = 1e15
-"""Whole numbers below this are printed without an exponent."""
+CHUNKS_AHEAD = 8
+"""Chunks of text that wait to be written at most."""
 
 
 class StatesFileError(ValueError):
@@ -54,8 +56,8 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
 
     Notes
     -----
-    CSV numbers have the shortest form that reads back to the same double. A column of whole numbers keeps a
-    ``.0``, so that pandas does not take it for integers.
+    CSV numbers have the shortest form that reads back to the same double; whole numbers keep a ``.0``, so that pandas
+    does not take them for integers.
     """
     if states == "parquet":
         import pyarrow.parquet as pq
@@ -63,11 +65,18 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
         with path.open("xb") as file:
             pq.write_table(_arrow(table.columns()), file, compression="zstd")
         return file_sha256(path)
-    digest = hashlib.sha256()
-    with path.open("xb") as file:
-        for chunk in _csv_chunks(table):
-            digest.update(chunk)
-            file.write(chunk)
+    digest, chunks = hashlib.sha256(), _csv_chunks(table)
+
+    def store(chunk: bytes) -> None:
+        digest.update(chunk)
+        file.write(chunk)
+
+    with path.open("xb") as file, ThreadPoolExecutor(1) as pool:
+        # Hashing and writing free the interpreter for the formatting of what comes next.
+        waiting = deque(pool.submit(store, chunk) for chunk in islice(chunks, CHUNKS_AHEAD))
+        while waiting:
+            waiting.popleft().result()
+            waiting.extend(pool.submit(store, chunk) for chunk in islice(chunks, 1))
     return digest.hexdigest()
 
 
@@ -107,42 +116,29 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _csv_chunks(table: States) -> Iterator[memoryview]:
-    """Yield the file piece by piece, formatted ahead by as many threads as there are cores (pyarrow frees the GIL)."""
-    import pyarrow as pa
-
-    yield memoryview((",".join(COLUMNS) + "\n").encode())
-    workers = pa.cpu_count()
+def _csv_chunks(table: States) -> Iterator[bytes]:
+    """Yield the file piece by piece."""
+    yield (",".join(COLUMNS) + "\n").encode()
     columns = table.columns()
-    whole = frozenset(name for name, values in columns.items() if name not in INTEGER_COLUMNS and _is_whole(values))
-    waiting: deque[Future[memoryview]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        for begin in range(0, len(table), CHUNK_ROWS):
-            rows = {name: values[begin : begin + CHUNK_ROWS] for name, values in columns.items()}
-            waiting.append(pool.submit(_format_rows, rows, whole))
-            if len(waiting) > 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+    for begin in range(0, len(table), CHUNK_ROWS):
+        rows = slice(begin, begin + CHUNK_ROWS)
+        stamps = table.stamp_ns[rows]
+        numbers = np.stack(
+            [columns[name][rows] for name in COLUMNS if name not in INTEGER_COLUMNS], 1, dtype=np.float64
+        )
+        yield b"\n".join([*map(b",".join, zip(_texts(stamps), _number_rows(numbers), strict=True)), b""])
 
 
-def _is_whole(values: Floats | Ints) -> bool:
-    """Say whether all of a column would be printed without a decimal point."""
-    return bool(np.all((values == np.trunc(values)) & (np.abs(values) < LARGEST_PLAIN_WHOLE)))
+def _texts(stamps: Ints) -> list[bytes]:
+    return orjson.dumps(np.ascontiguousarray(stamps), option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b",")
 
 
-def _format_rows(rows: dict[str, Floats | Ints], whole: frozenset[str]) -> memoryview:
-    import pyarrow as pa
-    import pyarrow.compute as pac
-    import pyarrow.csv as pc
-
-    block = _arrow(rows)
-    for name in whole:
-        texts = pac.binary_join_element_wise(pac.cast(block.column(name), pa.string()), ".0", "")
-        block = block.set_column(block.schema.get_field_index(name), name, texts)
-    sink = pa.BufferOutputStream()
-    pc.write_csv(block, sink, pc.WriteOptions(include_header=False, quoting_style="none"))
-    return memoryview(sink.getvalue())
+def _number_rows(numbers: Floats) -> list[bytes]:
+    """Return rows of numbers as text, separated by commas."""
+    if not np.isfinite(numbers).all():
+        # JSON has no word for these.
+        return [",".join(map(repr, row)).encode() for row in numbers.tolist()]
+    return orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY)[2:-2].split(b"],[")
 
 
 def _arrow(columns: dict[str, Floats | Ints]) -> pa.Table:

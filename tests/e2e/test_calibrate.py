@@ -43,6 +43,17 @@ def test_a_log_is_calibrated_printed_and_written(icrtool, tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
 
 
+def test_the_misses_are_drawn_before_and_after(icrtool, tmp_path: Path) -> None:
+    status, out, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.png")
+    assert (status, err) == (0, "")
+    assert "drawn to misses.png" in out
+    assert (tmp_path / "misses.png").read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["misses.png"]
+    status, _, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.txt")
+    assert status == 1
+    assert "no format of a picture" in err
+
+
 def test_a_run_is_calibrated_with_its_configuration(icrtool, tmp_path: Path) -> None:
     icrtool("fit", LOG, *ROBOT, "-o", "run", "--plots", "none", "-q")
     status, by_run, _ = icrtool("calibrate", "run")
@@ -81,3 +92,15 @@ def test_nothing_foreign_is_overwritten(icrtool, tmp_path: Path, place: str) -> 
 
 def test_quiet_prints_nothing(icrtool) -> None:
     assert icrtool("calibrate", LOG, *ROBOT, "-q") == (0, "", "")
+
+
+def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> None:
+    status, out, err = icrtool("info", LOG, *ROBOT)
+    assert (status, err) == (0, "")
+    assert "excitation  enough to show all three ICRs; turned 972° right, 844° left" in out
+    assert "gyro:\n  -> /imu/data: 20000 turn rates" in out
+    icrtool("simulate", "-o", "straight.mcap", "--path", "straight", "--duration", "60", "-q")
+    status, out, err = icrtool("info", "straight.mcap", *ROBOT)
+    assert status == 0
+    assert "y right not shown, y left not shown" in out
+    assert "add two spins each way" in err

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_figure_eight"
 RUN = Path("icrtool-runs") / LOG.name
 ROBOT = ("--robot", "segway-rmp400")
-PICTURES = {"summary", "histogram_05m", "histogram_10m", "histogram_20m", "examples_15m", "worst"}
+PICTURES = {"summary", "ladder", "histogram_05m", "histogram_10m", "histogram_20m", "examples_15m", "worst"}
 NO_PLOTS = ("--plots", "none")
 EASY, HARD = "icr.p95@10m <= 100", "icr.p95@10m <= 0.001"
 
@@ -77,7 +77,7 @@ def test_a_log_is_fitted_and_reported_on_in_one_go(fitted: Path) -> None:
     assert "Traceback" not in err
     assert (fitted / RUN / "states.csv").is_file()
     assert (fitted / RUN / "plots" / "trajectory.png").is_file()
-    files = {"summary.csv", "histogram.csv", "worst.csv", "report.json", "trials.parquet"}
+    files = {"summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
     pictures = {f"plots/{name}.png" for name in PICTURES | {"outages"}}
     assert files_in(fitted / RUN / "dropout") == files | pictures
     assert "stays within 0.5 m (95 %) for" in out
@@ -111,7 +111,13 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
     done = report(folder, "--horizons", "2,10", "--plots", "none", "--gate", EASY)
     assert done.returncode == 0, done.stderr
     assert {name: (folder / RUN / name).read_bytes() for name in before} == before
-    assert files_in(folder / RUN / "dropout") == {"summary.csv", "histogram.csv", "worst.csv", "report.json"}
+    assert files_in(folder / RUN / "dropout") == {
+        "summary.csv",
+        "histogram.csv",
+        "ladder.csv",
+        "worst.csv",
+        "report.json",
+    }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])
     assert done.stderr == ""
@@ -209,3 +215,47 @@ def test_requests_that_cannot_be_met_leave_the_old_report(
     assert (found, out) == (status, ""), err
     assert why in err
     assert {name: (fitted / RUN / name).stat().st_mtime_ns for name in files_in(fitted / RUN)} == before
+
+
+def test_the_smoother_may_be_the_reference(folder: Path, report_here) -> None:
+    status, _, err = report_here(folder, RUN, "--reference", "smoothed")
+    assert status == 1
+    assert "it has no smoothed states; run icrtool fit --smooth" in err
+    status, out, _ = report_here(folder, LOG.name, *ROBOT, "--reference", "smoothed", "--no-ladder")
+    assert status == 0
+    assert "held against the smoothed trajectory" in out
+    assert "models on way they were not fitted to" not in out
+    document = json.loads((folder / RUN / "dropout" / "report.json").read_text(encoding="utf-8"))
+    assert document["reference"].startswith("the smoother's estimate")
+    with (folder / RUN / "smoothed.csv").open("a", encoding="utf-8") as file:
+        file.write("\n")
+    status, _, err = report_here(folder, RUN, "--reference", "smoothed")
+    assert status == 1
+    assert "smoothed.csv was edited" in err
+
+
+def test_the_ladder_stands_in_table_report_csv_and_picture(fitted: Path) -> None:
+    _, out, _ = json.loads((fitted / "done.json").read_text(encoding="utf-8"))
+    document = json.loads((fitted / RUN / "dropout" / "report.json").read_text(encoding="utf-8"))["ladder"]
+    rows = pd.read_csv(fitted / RUN / "dropout" / "ladder.csv")
+    names = [model["name"] for model in document["models"]]
+    assert names[:6] == ["no_slip", "multiplier", "icr", "icr_final", "window", "extended"]
+    assert {"no_slip_gyro", "icr_gyro", "window_gyro", "extended_gyro"} <= set(names)
+    assert list(rows.model.unique()) == names
+    window = rows[(rows.model == "window") & (rows.horizon_m == 10.0)].iloc[0]
+    assert window.fitted == "held out"
+    line = next(line for line in out.splitlines() if line.startswith("window fit  "))
+    assert f"{window.p95_m:.2f} / {window.expected_error_m:.2f}" in line
+    assert (fitted / RUN / "dropout" / "plots" / "ladder.png").stat().st_size > 10_000
+
+
+def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> None:
+    file = folder / RUN / "dropout" / "ladder.csv"
+    of_log = file.read_bytes()
+    status, _, err = report_here(folder, RUN)
+    assert (status, err) == (0, "")
+    assert file.read_bytes() == of_log
+    (folder / RUN / "headings.parquet").write_bytes(b"something else")
+    status, _, err = report_here(folder, RUN)
+    assert status == 1
+    assert "headings.parquet was edited" in err

@@ -12,7 +12,8 @@ import pytest
 
 import icrtool
 from icrtool.analysis import dropout as module
-from icrtool.analysis.dropout import Model, configured_horizons_m, drive_of, dropout, load_kernels, models_of
+from icrtool.analysis.driven_run import drive_of
+from icrtool.analysis.dropout import Model, configured_horizons_m, dropout, load_kernels, models_of
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.open_loop import FrozenIcrs, open_loop_errors_direct, trial_ends
 from icrtool.errors import ConfigError, DataError
@@ -111,7 +112,7 @@ def test_starts_that_are_no_trial_are_counted_by_kind(run: FilterRun) -> None:
 
 def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., FilterRun]) -> None:
     report = dropout(make_run(track_width_m=None, duration_s=20.0), [1.0])
-    assert [result.name for result in report.results] == ["icr", "icr_final"]
+    assert [result.name for result in report.results] == ["icr", "icr_final", "icr_window"]
     assert report.result("no_slip") is None
 
 

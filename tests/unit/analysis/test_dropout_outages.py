@@ -99,10 +99,12 @@ def test_an_outage_from_the_very_first_state_delays_the_start_and_is_told(clean:
     assert len(force_outages(clean, plan_outages(clean, 5.0, (0.0,)))) <= 1
 
 
-def test_a_warm_started_run_is_not_passed_off_as_one_made_again(clean: FilterRun) -> None:
+def test_a_warm_started_run_is_made_again_from_its_own_start(clean: FilterRun) -> None:
     warm = fit(clean.log, clean.config, warm_start=WarmStart(np.array([0.9, -0.4, 0.2]), 1e-4 * np.eye(3)))
-    with pytest.raises(DataError, match="warm"):
-        force_outages(warm, plan_outages(warm, 5.0, (20.0,)))
+    (cold_outage,), (outage,) = (force_outages(run, plan_outages(run, 5.0, (2.0,))) for run in (clean, warm))
+    assert outage.end_error_m != pytest.approx(cold_outage.end_error_m, rel=0.01)
+    with pytest.raises(DataError, match="cannot be made again"):
+        force_outages(replace(warm, warm_start=None), plan_outages(warm, 5.0, (20.0,)))
 
 
 def test_a_run_with_terrain_changes_is_made_again_with_them(clean: FilterRun) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.blind_paths import example_drives, worst_drives
-from icrtool.analysis.dropout import drive_of, models_of
+from icrtool.analysis.driven_run import drive_of
+from icrtool.analysis.dropout import models_of
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.open_loop import open_loop_errors_direct, trial_ends
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.analysis.dropout import drive_of, dropout, models_of
+from icrtool.analysis.driven_run import drive_of
+from icrtool.analysis.dropout import dropout, models_of
 from icrtool.core.open_loop import SHORT, open_loop_errors_direct, trial_ends
 
 LOGS = {

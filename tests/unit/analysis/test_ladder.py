@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.analysis.dropout import drive_of
 from icrtool.analysis.fit import FilterRun, fit
-from icrtool.analysis.ladder import _trials as make_trials
-from icrtool.analysis.ladder import clear_of, count_blocks, judge_ladder, predict_block
+from icrtool.analysis.ladder import count_blocks, judge_ladder
+from icrtool.analysis.ladder_fits import clear_of
+from icrtool.analysis.ladder_trials import Along, MeasuredHeading, cut_trials, predict
+from icrtool.analysis.measured_heading import measured_headings
 from icrtool.analysis.window_fit import cut_windows
 from icrtool.config import Config
 from icrtool.core.open_loop import FrozenIcrs
@@ -36,13 +37,77 @@ def edges_of(run: FilterRun) -> np.ndarray:
     return np.linspace(0.0, total, count_blocks(total) + 1)[1:-1]
 
 
-def test_prediction_of_a_block_equals_the_open_loop_kernel(run: FilterRun) -> None:
-    trials = make_trials(run, edges_of(run), (5.0, 10.0), None, 0.0)
-    p = np.array([0.5, -0.6, 0.1, 1.0, 1.0, 0.0, 0.0, 0.0])
-    mine = np.concatenate([predict_block(trials, p, block) for block in range(count_blocks(run.table.distance_m[-1]))])
-    theirs = open_loop_errors(drive_of(run), FrozenIcrs.constant(0.5, -0.6, 0.1), trials.ends)
-    assert np.array_equal(np.isnan(mine), np.isnan(theirs))
-    assert np.nanmax(np.abs(mine - theirs)) < ROUNDING_M
+def test_predictions_equal_the_direct_integration_of_their_model(run: FilterRun) -> None:
+    """Scales, bend, speed and delay against Euler steps with what they mean, spelt out."""
+    trials = cut_trials(run, edges_of(run), (5.0, 10.0))
+    blocks = count_blocks(run.table.distance_m[-1])
+    p = np.array([0.5, -0.6, 0.1, 1.03, 0.96, -0.2, 0.1, 0.0])
+    mine = predict(trials, np.tile(p, (blocks, 1)))
+    drive, starts = trials.drive, np.flatnonzero(trials.ends[:, 1] >= 0)[::50]
+    assert len(starts) > 5
+    for start in starts:
+        north = east = 0.0
+        psi = drive.heading[start]
+        for i in range(start, trials.ends[start, 1]):
+            left, right = p[3] * drive.v_left[i], p[4] * drive.v_right[i]
+            told = abs(drive.v_left[i]) + abs(drive.v_right[i])
+            turning = abs(drive.v_left[i] - drive.v_right[i]) / told if told else 0.0
+            omega = (left - right) / (1.1 * (1 + p[5] * turning + p[6] * told / 2))
+            ahead, aside = (left * p[0] - right * p[1]) / 1.1, -p[2] * omega
+            north += drive.dt_s[i] * (ahead * np.cos(psi) - aside * np.sin(psi))
+            east += drive.dt_s[i] * (ahead * np.sin(psi) + aside * np.cos(psi))
+            psi += drive.dt_s[i] * omega
+        end = trials.ends[start, 1]
+        miss = np.hypot(north - drive.north[end] + drive.north[start], east - drive.east[end] + drive.east[start])
+        assert mine[start, 1] == pytest.approx(miss, abs=ROUNDING_M)
+
+
+def test_a_delay_of_whole_samples_moves_the_wheels_by_them(run: FilterRun) -> None:
+    trials = cut_trials(run, edges_of(run), (5.0,))
+    blocks = count_blocks(run.table.distance_m[-1])
+    interval = float(np.median(np.diff(trials.t)))
+    late = predict(trials, np.tile([0.5, -0.6, 0.1, 1, 1, 0, 0, 3 * interval], (blocks, 1)))
+    ahead = {side: np.append(getattr(trials.drive, side)[3:], np.zeros(3)) for side in ("v_left", "v_right")}
+    moved = open_loop_errors(trials.drive._replace(**ahead), FrozenIcrs.constant(0.5, -0.6, 0.1), trials.ends)
+    tried = (trials.ends[:, 0] >= 0) & (trials.ends[:, 0] < len(trials.t) - 5)
+    assert np.count_nonzero(tried) > 100
+    assert np.allclose(late[tried], moved[tried], atol=1e-9)
+
+
+def test_all_trials_stay_within_their_block(run: FilterRun) -> None:
+    trials = cut_trials(run, edges_of(run), (5.0, 10.0))
+    start, h = np.nonzero(trials.ends >= 0)
+    assert len(start) > 100
+    assert np.array_equal(trials.block[start], trials.block[trials.ends[start, h]])
+
+
+def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
+    """A gyro that turns as the wheels say with the ICRs adds nothing to them but the Euler step's corner."""
+    trials = cut_trials(run, edges_of(run), (5.0,))
+    blocks = count_blocks(run.table.distance_m[-1])
+    icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
+    dt = trials.drive.dt_s
+    turned = np.concatenate([[0.0], np.cumsum(dt * (trials.drive.v_left - trials.drive.v_right) / 1.1)[:-1]])
+    neutral = np.tile([0, 0, 0, 1, 1, 0, 0, 0.0], (blocks, 1))
+    model = Along(trials, turned, from_reference=True)
+    along = model.errors(model.place(neutral), icrs)
+    wheels = open_loop_errors(trials.drive, icrs, trials.ends)
+    tried = ~np.isnan(wheels)
+    assert np.max(np.abs(along[tried] - wheels[tried])) < 0.05
+
+
+def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run: FilterRun) -> None:
+    heading = run.table.heading_rad
+    gyro = MeasuredHeading("gyro", 0.97 * heading + 0.01 * run.table.t_s)
+    exact = judge_ladder(run, [MeasuredHeading("gyro", heading.copy())])
+    scaled = judge_ladder(run, [gyro])
+    assert scaled.heading == "gyro"
+    assert scaled.rung("icr_final_gyro").summary.p95[1] == pytest.approx(
+        exact.rung("icr_final_gyro").summary.p95[1], abs=0.01
+    )
+    other = judge_ladder(run, [MeasuredHeading("gyro", 0.1 * heading)])
+    assert other.heading == ""
+    assert "does not turn with the robot" in other.notes[0]
 
 
 def test_no_window_of_a_fit_touches_the_block_held_out(run: FilterRun) -> None:
@@ -67,13 +132,13 @@ def test_shuffled_reference_of_a_block_changes_neither_its_fit_nor_its_choice(ru
     after = judge_ladder(spoilt)
     assert after.chosen[block] == before.chosen[block]
     for name in ("multiplier", "window", "window_scale", "window_late", "extended"):
-        assert np.array_equal(after.held_out[name][block].parameters, before.held_out[name][block].parameters), name
-    assert not np.allclose(after.held_out["window"][0].parameters, before.held_out["window"][0].parameters, atol=1e-6)
+        assert np.array_equal(after.held_out[name][block], before.held_out[name][block]), name
+    assert not np.allclose(after.held_out["window"][0], before.held_out["window"][0], atol=1e-6)
     assert after.rung("window").summary.p95[1] > before.rung("window").summary.p95[1]
 
 
 def test_all_rungs_are_judged_on_the_same_trials(run: FilterRun) -> None:
-    ladder = judge_ladder(run, run.log.heading)
+    ladder = judge_ladder(run, measured_headings(run))
     names = [rung.name for rung in ladder.rungs]
     assert names == [
         "no_slip", "multiplier", "icr", "icr_final", "window", "extended", "no_slip_heading", "icr_heading",

@@ -61,7 +61,7 @@ def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # ty
     [
         (lambda left, right: (0 * left, right), "left wheels hardly ever move"),
         (lambda left, right: (left, left), "copy"),
-        (lambda left, right: (2 * left, 2 * right), "twice the way"),
+        (lambda left, right: (3 * left, 3 * right), "check wheel radius"),
         (
             lambda left, right: (np.repeat(left[::10], 10)[: len(left)], np.repeat(right[::10], 10)[: len(right)]),
             "held",

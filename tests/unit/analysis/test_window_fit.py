@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
-from icrtool.analysis.window_fit import CONSTANT, EXTENDED, MULTIPLIER, cut_windows, fit_windows, thin_windows
+from icrtool.analysis.window_fit import (
+    CONSTANT,
+    EXTENDED,
+    MULTIPLIER,
+    WindowModel,
+    cut_windows,
+    fit_windows,
+    thin_windows,
+)
+from icrtool.analysis.window_solve import drop_windows, fit_of, solve_windows
 from icrtool.config import Config
 from icrtool.errors import DataError
 
@@ -71,7 +80,31 @@ def test_a_multiplier_has_no_x_and_no_asymmetry() -> None:
 
 def test_a_fit_on_thinned_samples_is_near_the_full_one() -> None:
     windows = cut_windows(made(0))
-    assert fit_windows(thin_windows(windows)).icrs_m == pytest.approx(fit_windows(windows).icrs_m, abs=0.03)
+    assert fit_windows(thin_windows(windows)).icrs_m == pytest.approx(fit_windows(windows).icrs_m, abs=0.001)
+
+
+@pytest.mark.parametrize("model", [MULTIPLIER, CONSTANT, *EXTENDED], ids=lambda model: model.name)
+def test_the_many_fits_of_the_ladder_find_what_levenberg_marquardt_finds(model: WindowModel) -> None:
+    windows = thin_windows(cut_windows(made(1)))
+    kept = windows.start_m > 30.0
+    expected = fit_windows(windows.keep(kept), model)
+    plain = solve_windows(windows, CONSTANT, kept)
+    for start in (None, plain):
+        found = fit_of(solve_windows(windows, model, kept, start if model in EXTENDED else None), windows)
+        sigma = np.sqrt(np.diag(expected.covariance))
+        assert np.all(np.abs(found.terms - expected.terms) < 0.05 * sigma + 1e-5)
+        assert np.diag(found.covariance) == pytest.approx(np.diag(expected.covariance), rel=0.05)
+        assert found.windows == expected.windows
+
+
+def test_windows_taken_out_to_first_order_are_windows_not_fitted() -> None:
+    windows = thin_windows(cut_windows(made(2)))
+    everything = np.ones(len(windows.start), np.bool_)
+    dropped = (windows.start_m > 20.0) & (windows.start_m < 45.0)
+    whole = solve_windows(windows, CONSTANT, everything)
+    rest = solve_windows(windows, CONSTANT, ~dropped)
+    far = np.abs(whole.misses - rest.misses).max()
+    assert np.abs(drop_windows(whole, dropped) - rest.misses).max() < 0.3 * far
 
 
 def test_a_circle_leaves_the_icrs_outside_the_tracks() -> None:

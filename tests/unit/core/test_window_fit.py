@@ -75,7 +75,7 @@ def test_kernel_equals_its_python_source(monkeypatch: pytest.MonkeyPatch) -> Non
     plain = Motion(np.empty(m), np.empty(m, complex), np.empty((m, 7)), np.empty((m, 7), complex), np.empty(m),
                    np.empty(m, complex))  # fmt: skip
     monkeypatch.setattr(window_fit, "rates", rates.py_func)
-    march.py_func(t, dt, left, right, P, times, *plain)
+    march.py_func(t, dt, 0 * t, left, right, P, times, *plain)
     for one, other in zip(compiled, plain, strict=True):
         assert np.allclose(one, other, rtol=0, atol=1e-12)
 

@@ -639,6 +639,19 @@ def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
         assert read_log(log) == (expected, problems)
 
 
+def test_one_db3_row_without_a_message_costs_no_other(tmp_path):
+    messages = make_messages(3000)
+    path = write_directory(tmp_path / "log", messages) / "log.db3"
+    database = sqlite3.connect(path)
+    rows = [row for (row,) in database.execute("SELECT id FROM messages ORDER BY id")]
+    for place in (0, 700, 701, len(rows) - 1):
+        database.execute("UPDATE messages SET data = 7 WHERE id = ?", (rows[place],))
+    database.commit()
+    database.close()
+    expected = [message for place, message in enumerate(messages) if place not in (0, 700, 701, len(rows) - 1)]
+    assert read_log(path) == (expected, ["log.db3: rows without a time or a message left out"])
+
+
 @pytest.mark.parametrize(
     "tables", ["", "CREATE TABLE topics(id); CREATE VIEW messages AS SELECT 1", "CREATE TABLE t(x)"]
 )

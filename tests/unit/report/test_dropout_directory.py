@@ -68,7 +68,7 @@ def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: Drop
         "expected_pct",
         "p95_pct",
     ]
-    assert len(read) == 3 * len(HORIZONS_M)
+    assert len(read) == 4 * len(HORIZONS_M)
     text = (written / "summary.csv").read_text(encoding="utf-8")
     assert "nan" not in text.lower()
     assert "\nicr,900.0,0,,,," in text
@@ -78,7 +78,7 @@ def test_histogram_csv_holds_all_trials_of_every_model_and_horizon(written: Path
     read = pd.read_csv(written / "histogram.csv")
     assert list(read.columns) == ["model", "horizon_m", "bin_left_m", "bin_right_m", "percent"]
     sums = read.groupby(["model", "horizon_m"]).percent.sum()
-    assert len(sums) == 9
+    assert len(sums) == 12
     np.testing.assert_allclose(sums, 100.0)
     assert (read.bin_right_m > read.bin_left_m).all()
     bins = read[(read.model == "icr") & (read.horizon_m == 5.0)]
@@ -125,7 +125,7 @@ def test_without_track_width_the_no_slip_column_is_empty(make_run: Callable[...,
     run = make_run(track_width_m=None)
     write_content(content_of(run, gates=()), tmp_path)
     assert pd.read_csv(tmp_path / "worst.csv").no_slip_error_m.isna().all()
-    assert set(pd.read_csv(tmp_path / "summary.csv").model) == {"icr", "icr_final"}
+    assert set(pd.read_csv(tmp_path / "summary.csv").model) == {"icr", "icr_final", "icr_window"}
 
 
 def test_the_document_is_json_without_nan(content: DropoutContent) -> None:

@@ -57,6 +57,14 @@ def test_numbers_have_their_shortest_form_and_no_quotes(tmp_path: Path) -> None:
     assert first.startswith("9223372036854000000,0.1,2.5,0.30000000000000004,0.1,")
 
 
+def test_numbers_that_are_none_keep_their_kind(tmp_path: Path) -> None:
+    values = np.array([0.1, np.nan, np.inf, -np.inf, 1e-7])
+    write_states(table_of(values), tmp_path / "states.csv", "csv")
+    found = read_states(tmp_path / "states.csv", "csv")
+    for name, column in table_of(values).columns().items():
+        np.testing.assert_array_equal(getattr(found, name), column)
+
+
 def test_rows_keep_their_order_over_many_chunks(tmp_path: Path) -> None:
     values = np.random.default_rng(1).standard_normal(3 * CHUNK_ROWS + 17)
     write_states(table_of(values), tmp_path / "states.csv", "csv")

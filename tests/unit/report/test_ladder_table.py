@@ -7,14 +7,15 @@ import json
 import pytest
 
 from icrtool.analysis.ladder import Ladder, judge_ladder
-from icrtool.report.calibration_ladder import format_ladder, ladder_document
+from icrtool.analysis.measured_heading import measured_headings
+from icrtool.report.ladder_table import LADDER_COLUMNS, format_ladder, ladder_document, ladder_rows
 from icrtool.report.run_directory import json_bytes
 
 
 @pytest.fixture(scope="module")
 def ladder(make_run) -> Ladder:
     run = make_run(duration_s=90.0)
-    return judge_ladder(run, run.log.heading, heading_is_reference=True)
+    return judge_ladder(run, measured_headings(run))
 
 
 def test_every_model_has_its_line(ladder: Ladder) -> None:
@@ -22,7 +23,13 @@ def test_every_model_has_its_line(ladder: Ladder) -> None:
     for rung in ladder.rungs:
         assert any(line.startswith(rung.label) for line in text.splitlines())
     assert "held out" in text
-    assert "as good as that" in text
+
+
+def test_every_row_of_the_csv_has_a_cell_for_each_column(ladder: Ladder) -> None:
+    rows = list(ladder_rows(ladder))
+    assert len(rows) == len(ladder.rungs) * len(ladder.horizons_m)
+    assert {len(row) for row in rows} == {len(LADDER_COLUMNS)}
+    assert {row[2] for row in rows} == {"wheels", "heading"}
 
 
 def test_the_document_is_json(ladder: Ladder) -> None:

@@ -1,0 +1,64 @@
+"""What every analysis needs of a filter run, whether it was just made or read back."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from icrtool.core.open_loop import Drive
+from icrtool.tables import Bools, Ints, States
+
+
+class DrivenRun(Protocol):
+    """A filter run, just made or read back: what the analysis needs of it."""
+
+    @property
+    def name(self) -> str:
+        """Name of the log."""
+        ...
+
+    @property
+    def table(self) -> States:
+        """The recorded states."""
+        ...
+
+    @property
+    def in_gap(self) -> Bools:
+        """Whether the interval after a state is a gap in the wheel data (n,)."""
+        ...
+
+    @property
+    def outages_ns(self) -> Ints:
+        """Half-open spans without usable GNSS (k, 2)."""
+        ...
+
+    @property
+    def track_width_m(self) -> float | None:
+        """Distance b between the track centre lines, None where not given."""
+        ...
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What run.json holds, the effective configuration among it."""
+        ...
+
+
+def drive_of(run: DrivenRun) -> Drive:
+    """Return the run's states as the kernels want them."""
+    table = run.table
+    in_outage = np.zeros(len(table), np.bool_)
+    for begin, end in run.outages_ns:
+        # The last fix is still good at `begin`, and the first one again at `end`.
+        in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
+    return Drive(
+        dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
+        v_left=table.v_left_mps,
+        v_right=table.v_right_mps,
+        north=table.north_m,
+        east=table.east_m,
+        heading=table.heading_rad,
+        distance=table.distance_m,
+        gap=run.in_gap,
+        in_outage=in_outage,
+    )

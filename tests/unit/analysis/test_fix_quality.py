@@ -1,0 +1,170 @@
+"""Fixed, float and other: told by status, by variance, or by how the fixes move; RTK that is lost and regained."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.analysis.fit import FilterRun, fit
+from icrtool.analysis.outages import real_outages
+from icrtool.analysis.simulate import Drive, Sensors
+from icrtool.analysis.simulate_record import simulate
+from icrtool.config import load_config
+from icrtool.core.ekf import GATED
+from icrtool.logio import read_log
+from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
+from icrtool.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bools, Datum, RobotLog
+
+sys.path.insert(0, str(Path(__file__).parent))
+from drives import ICRS, make_log
+
+WIDTH = "robot.track_width_m=0.8"
+LOSSES_S = ((40.0, 60.0), (75.0, 85.0), (100.0, 118.0))
+FLOAT_STD_M = 0.02
+ICR_TOLERANCE_M = 0.02
+"""Against the clean log's ICRs: a fifth of what the paper's ICRs differ between two runs."""
+
+
+def clean(seed: int = 3) -> RobotLog:
+    return replace(make_log(seed, seconds=140.0), datum=Datum(40.8, -77.9, 350.0))
+
+
+def lose_rtk(log: RobotLog, seed: int = 5, *, at_once: bool = False) -> tuple[RobotLog, Bools]:
+    """Let the fixes drift off by 0.3 to 1 m (from the start, or with a jump first) and jump back; which are float."""
+    rng = np.random.default_rng(seed)
+    t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    away, float_ = np.zeros(len(t), np.complex128), np.zeros(len(t), np.bool_)
+    for begin, end in LOSSES_S:
+        inside = (t >= begin) & (t < end)
+        share = (t[inside] - begin) / (end - begin)
+        size = rng.uniform(0.3, 1.0) * (0.6 + 0.4 * share if at_once else share)
+        away[inside] = size * np.exp(1j * (rng.uniform(0, 2 * np.pi) + share))
+        away[inside] += FLOAT_STD_M * (rng.normal(size=inside.sum()) + 1j * rng.normal(size=inside.sum()))
+        float_ |= inside
+    gnss = replace(log.gnss, north_m=log.gnss.north_m + away.real, east_m=log.gnss.east_m + away.imag)
+    return replace(log, gnss=gnss), float_
+
+
+def confess(log: RobotLog, float_: Bools, how: str) -> RobotLog:
+    """Let the messages say what they are: by variance (GBAS throughout), by flag, by a plain status, or not at all."""
+    variance, told = log.gnss.var_north_m2.copy(), np.full(len(float_), RTK_FIX, np.uint8)
+    if how == "variance":
+        variance[float_] = 0.4**2
+    if how == "flags":
+        told = np.where(float_, FLOAT_FIX, FIXED_FIX).astype(np.uint8)
+    if how == "status":
+        told[float_] = OTHER_FIX
+    if how == "not":
+        told = np.full(len(float_), NOT_TOLD, np.uint8)
+    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), told_class=told))
+
+
+def icrs(run: FilterRun) -> np.ndarray:
+    return np.array([run.summary["icr"]["final"][name] for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")])
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+@pytest.mark.parametrize("how", ["variance", "flags", "status", "not"])
+def test_rtk_that_is_lost_and_regained_neither_moves_the_icrs_nor_locks_the_filter_out(how: str, at_once: bool) -> None:
+    log = clean()
+    expected = icrs(fit(log, load_config(sets=[WIDTH])))
+    lossy, float_ = lose_rtk(log, at_once=at_once)
+    run = fit(confess(lossy, float_, how), load_config(sets=[WIDTH]))
+    assert np.abs(icrs(run) - expected).max() < ICR_TOLERANCE_M
+    assert run.process_position_mps == 0.3
+    # A return to fixed is taken at once: without classes each locks the filter out for 20 fixes or more.
+    assert np.count_nonzero(run.gnss.code == GATED) <= 3
+    assert np.count_nonzero(run.fix_quality.down_weighted & float_) > 0.95 * np.count_nonzero(float_)
+    assert np.count_nonzero(run.fix_quality.down_weighted & ~float_) < 0.1 * np.count_nonzero(~float_)
+
+
+def test_rtk_losses_are_outages_with_a_miss_at_the_first_fixed_fix() -> None:
+    log = clean()
+    lossy, float_ = lose_rtk(log)
+    run = fit(confess(lossy, float_, "flags"), load_config(sets=[WIDTH]))
+    spans = (run.outages_ns - run.table.stamp_ns[0]) / 1e9
+    assert np.abs(spans - np.array(LOSSES_S)).max() < 0.11
+    assert run.summary["rtk_losses_ns"] == run.summary["outages_ns"] == run.outages_ns.tolist()
+    missed = [outage for outage in real_outages(run) if outage.kind == "real"]
+    assert [outage.begin_s for outage in missed] == pytest.approx(list(spans[:, 0]))
+    # Ten metres with known ICRs; the float fixes themselves were 0.3 to 1 m off.
+    assert all(0.0 < outage.end_error_m < 0.03 * outage.distance_m for outage in missed)
+
+
+def test_the_summary_counts_by_class() -> None:
+    lossy, float_ = lose_rtk(clean())
+    run = fit(confess(lossy, float_, "flags"), load_config(sets=[WIDTH]))
+    classes, count = run.summary["gnss"]["classes"], int(np.count_nonzero(float_))
+    assert classes["float"]["fixes"] == classes["float"]["down_weighted"] == count
+    assert classes["fixed"]["fixes"] == len(float_) - count
+    assert classes["float"]["step_std_m"] == pytest.approx(np.hypot(FLOAT_STD_M, 0.01), rel=0.2)
+    assert run.summary["gnss"]["jumps"] == len(LOSSES_S)
+
+
+def test_fixed_that_is_no_float_is_left_alone() -> None:
+    run = fit(clean(), load_config(sets=[WIDTH]))
+    assert (run.fix_quality.fix_class == FIXED_FIX).all()
+    assert not run.fix_quality.down_weighted.any()
+    assert not len(run.fix_quality.jump_m)
+    assert not len(run.outages_ns)
+    assert run.warnings == ()
+
+
+def test_outliers_are_no_jumps_and_no_float() -> None:
+    log, rng = clean(), np.random.default_rng(2)
+    north = log.gnss.north_m + 5.0 * (rng.random(len(log.gnss.north_m)) < 0.05)
+    run = fit(replace(log, gnss=replace(log.gnss, north_m=north)), load_config(sets=[WIDTH]))
+    assert not len(run.fix_quality.jump_m)
+    assert not run.fix_quality.sold.any()
+
+
+def test_float_throughout_is_no_loss_and_keeps_the_variance_it_states() -> None:
+    log = clean()
+    told = np.full(len(log.gnss.stamp_ns), FLOAT_FIX, np.uint8)
+    run = fit(replace(log, gnss=replace(log.gnss, told_class=told)), load_config(sets=[WIDTH]))
+    assert not run.fix_quality.down_weighted.any()
+    assert not len(run.outages_ns)
+    assert np.array_equal(run.log.gnss.var_north_m2, log.gnss.var_north_m2)
+
+
+def test_noise_beyond_what_is_stated_is_put_down_to_the_fixes_not_to_the_wheels() -> None:
+    log = replace(make_log(3, seconds=140.0, gnss_std=0.05), datum=Datum(40.8, -77.9, 350.0))
+    said = np.full(len(log.gnss.stamp_ns), 1e-4)
+    run = fit(replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said)), load_config(sets=[WIDTH]))
+    assert run.process_position_mps == 0.3
+    assert np.sqrt(run.log.gnss.var_north_m2) == pytest.approx(0.05, rel=0.1)
+    assert any("scatter by" in warning for warning in run.warnings)
+    assert icrs(run) == pytest.approx(ICRS, abs=0.05)
+
+
+def test_a_metric_reference_has_no_classes_and_keeps_its_variance() -> None:
+    log = make_log(3, seconds=60.0)
+    run = fit(log, load_config(sets=[WIDTH]))
+    assert list(run.summary["gnss"]["classes"]) == ["reference"]
+    assert run.log.gnss.var_north_m2 is log.gnss.var_north_m2
+
+
+def test_preset_paper_counts_classes_and_changes_no_noise() -> None:
+    lossy, float_ = lose_rtk(clean())
+    log = confess(lossy, float_, "flags")
+    run = fit(log, load_config(sets=[WIDTH, "filter.preset=paper"]))
+    assert run.summary["gnss"]["classes"]["float"]["fixes"] == int(np.count_nonzero(float_))
+    assert np.array_equal(run.log.gnss.var_north_m2, log.gnss.var_north_m2)
+    assert not len(run.outages_ns)
+
+
+def test_what_a_log_file_says_of_its_fixes_reaches_the_filter(tmp_path: Path) -> None:
+    recorded, _ = simulate(Drive(duration_s=60.0), Sensors(), seed=1)
+    columns = recorded.columns()
+    plain = (columns["gnss_stamp_ns"] - columns["gnss_stamp_ns"][0]) / 1e9 > 50.0
+    columns["gnss_status"] = np.where(plain, 0, 2)
+    options = WriteOptions(wheel_radius_m=0.08, track_width_m=0.52)
+    path = write_log(tmp_path / "drive.mcap", SensorColumns(**columns), options)
+    config = load_config(robot="pentzer-tracked")
+    run = fit(read_log(path, config), config)
+    assert run.summary["gnss"]["classes"]["other"]["down_weighted"] == int(np.count_nonzero(plain))
+    assert len(run.summary["rtk_losses_ns"]) == 1

@@ -1,0 +1,121 @@
+"""The heading detective: every convention is put right, and what no convention explains is refused."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.analysis.fit import FilterRun, fit
+from icrtool.config import load_config
+from icrtool.errors import DataError
+from icrtool.tables import Datum, Floats, RobotLog
+
+sys.path.insert(0, str(Path(__file__).parent))
+from drives import make_log
+
+WIDTH = "robot.track_width_m=0.8"
+ICR_TOLERANCE_M = 0.02
+OFFSET_TOLERANCE_DEG = 0.5
+DECLINATION_DEG = -10.55
+
+
+def clean() -> RobotLog:
+    return replace(make_log(2, seconds=140.0), datum=Datum(40.7934, -77.86, 350.0))
+
+
+def told(log: RobotLog, psi: Floats) -> RobotLog:
+    return replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * psi))))
+
+
+def icrs(run: FilterRun) -> np.ndarray:
+    return np.array([run.summary["icr"]["final"][name] for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "offset_deg", "words"),
+    [
+        (lambda psi: psi + math.radians(12.0), 12.0, ""),
+        (lambda psi: psi - math.radians(35.0), -35.0, ""),
+        (lambda psi: psi + math.pi / 2, 90.0, "a quarter turn clockwise"),
+        (lambda psi: psi - math.pi / 2, -90.0, "a quarter turn counter-clockwise"),
+        (lambda psi: psi + math.pi, 180.0, "half a turn"),
+        (lambda psi: psi - math.radians(DECLINATION_DEG), -DECLINATION_DEG, "magnetic declination here is -10.6"),
+        (lambda psi: math.pi / 2 - psi, -90.0, "other convention (ENU/NED)"),
+        (lambda psi: -psi, 0.0, "other convention (ENU/NED), offset +90"),
+    ],
+)
+def test_each_convention_is_found_and_put_right(
+    spoil: Callable[[Floats], Floats], offset_deg: float, words: str
+) -> None:
+    log = clean()
+    expected = icrs(fit(log, load_config(sets=[WIDTH])))
+    run = fit(told(log, spoil(log.heading.heading_rad)), load_config(sets=[WIDTH]))
+    assert np.abs(icrs(run) - expected).max() < ICR_TOLERANCE_M
+    applied = math.degrees(run.heading_check.applied_offset_rad)
+    assert math.remainder(applied - offset_deg, 360.0) == pytest.approx(0.0, abs=OFFSET_TOLERANCE_DEG)
+    assert any("applied" in warning and words in warning for warning in run.warnings)
+
+
+def random(log: RobotLog) -> Floats:
+    return np.random.default_rng(4).uniform(-math.pi, math.pi, len(log.heading.heading_rad))
+
+
+def wandering(log: RobotLog) -> Floats:
+    """A heading that turns smoothly, and has nothing to do with the robot's."""
+    return 0.4 * (log.heading.stamp_ns - log.heading.stamp_ns[0]) / 1e9
+
+
+def frozen(log: RobotLog) -> Floats:
+    heading = log.heading.heading_rad.copy()
+    heading[len(heading) // 3 :] = heading[len(heading) // 3]
+    return heading
+
+
+def constant(log: RobotLog) -> Floats:
+    return np.full(len(log.heading.heading_rad), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (random, "scatters so much"),
+        (wandering, "has nothing to do with the course; ENU, NED and every offset tried in"),
+        (frozen, "stays the same while the wheels turn the robot"),
+        (constant, "stays the same"),
+    ],
+)
+def test_a_heading_that_nothing_explains_is_refused_once_and_clearly(
+    make: Callable[[RobotLog], Floats], why: str
+) -> None:
+    log = clean()
+    spoilt = told(log, make(log))
+    with pytest.raises(DataError, match=r"topics\.heading") as caught:
+        fit(spoilt, load_config(sets=[WIDTH]))
+    assert why in str(caught.value)
+    insisting = fit(spoilt, load_config(sets=[WIDTH, "frames.heading_offset_deg=0.0"]))
+    assert insisting.heading_check.applied_offset_rad == 0.0
+    fit(spoilt, load_config(sets=[WIDTH, "filter.preset=paper"]))
+
+
+def test_a_noisy_heading_is_not_an_unexplained_one() -> None:
+    log, rng = clean(), np.random.default_rng(5)
+    noise = np.zeros(len(log.heading.heading_rad))
+    for k in range(1, len(noise)):
+        noise[k] = 0.98 * noise[k - 1] + rng.normal(0, math.radians(24) * math.sqrt(1 - 0.98**2))
+    run = fit(told(log, log.heading.heading_rad + noise), load_config(sets=[WIDTH]))
+    assert any("scatters by" in warning for warning in run.warnings)
+    # The scatter shortens the way along the heading by some per cent: that is no wheel radius.
+    assert run.summary["wheels"]["applied_scale"] == 1.0
+
+
+def test_outliers_among_the_fixes_do_not_condemn_the_heading() -> None:
+    log, rng = clean(), np.random.default_rng(6)
+    far = 5.0 * (rng.random(len(log.gnss.north_m)) < 0.15)
+    run = fit(replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + far)), load_config(sets=[WIDTH]))
+    assert run.heading_check.applied_offset_rad == pytest.approx(0.0, abs=math.radians(OFFSET_TOLERANCE_DEG))
