@@ -93,6 +93,8 @@ class FilterConfig(_Section):
     `heading_std_deg` those of R (Eq. 31), used where the messages do not say. `process_position_mps` is 0.2 (Eq. 30);
     in preset ``field``, ``auto`` starts at 0.3 and raises it when the fixes contradict wheels this good.
     `process_heading_degps` is 5 (Eq. 30), in preset ``field`` 7.
+    `terrain_icr_std_m` is how uncertain the ICRs are after a terrain change: 10 (Section 5.2), in preset ``field`` the
+    robot's width.
     `heading_correlation_s` is how long an AHRS errs alike: closer samples are not independent (``field`` only).
     """
 
@@ -104,6 +106,7 @@ class FilterConfig(_Section):
     process_position_mps: Literal["auto"] | NotNegative = "auto"
     process_heading_degps: NotNegative | None = None
     process_icr_mps: NotNegative = 0.01
+    terrain_icr_std_m: Positive | None = None
     gnss_std_m: Positive = 0.01
     gnss_std_floor_m: Positive = 0.01
     heading_std_deg: Positive = 1.0

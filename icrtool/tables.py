@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Complexes = NDArray[np.complex128]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 Role = Literal["wheels", "gnss", "heading"]

@@ -50,8 +50,13 @@ RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
 """Rejected measurements that agree with each other for this long are believed."""
 
-ICR_INFLATION_M2 = 100.0
-"""Pentzer 2014, Section 5.2: ICR variance after a change of terrain."""
+MIDDLE_OF_THE_TURN = 0.5
+"""Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and
+1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
+
+PAPER_TERRAIN_ICR_STD_M = 10.0
+"""Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's
+width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
 class WarmStart(NamedTuple):
@@ -243,6 +248,13 @@ def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
     return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
 
 
+def _terrain_icr_std_m(config: Config) -> float:
+    given = config.filter.terrain_icr_std_m
+    if given is not None:
+        return given
+    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config)
+
+
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
     return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
@@ -295,6 +307,7 @@ def _parameters(
     return FilterParameters(
         process_variance=(position, position, math.radians(turn) ** 2, icr, icr, icr),
         rate_invariant=not paper,
+        step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
         heading_correlation=1.0 if paper else _samples_that_err_alike(data.heading_t, heading_correlation_s),
@@ -305,6 +318,6 @@ def _parameters(
         gap_turn_variance=GAP_TURN_STD_RADPS**2,
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
-        icr_inflation_m2=ICR_INFLATION_M2,
+        icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
         least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config),
     )

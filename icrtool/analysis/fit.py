@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
+from icrtool.analysis.doubts import adaptation_notes, doubts
 from icrtool.analysis.excitation import judge_excitation
-from icrtool.analysis.filter_setup import WarmStart, configured_process_position_mps, wheel_gap_s
+from icrtool.analysis.filter_setup import WarmStart, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.stream_delays import measure_delays
@@ -24,9 +24,10 @@ from icrtool.analysis.summary import (
     segment_summary,
     used_and_rejected,
 )
+from icrtool.analysis.terrain import TerrainTest, find_terrain_changes, given_changes
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
-from icrtool.core.ekf import GATED, UNSEEN, Codes, FilterOutput
+from icrtool.core.ekf import UNSEEN, Codes, FilterOutput
 from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
@@ -75,9 +76,10 @@ class FilterRun:
     gnss, heading : what became of the measurements
     covariance : (6, 6) at the end
     process_position_mps : position process noise the run ended with
-    changes_s : terrain changes, seconds since the first recorded state
     warm_start : what another run had learned, where this one began with it
-    convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None
+    terrain : changes of the ICRs, given and detected
+    convergence : by ICR column of the states, first and last second of the 10-90 % rise, or None; until the first
+        terrain change
     """
 
     log: RobotLog
@@ -91,8 +93,8 @@ class FilterRun:
     fix_quality: FixQuality
     covariance: Floats
     process_position_mps: float
-    changes_s: tuple[float, ...]
     warm_start: WarmStart | None
+    terrain: TerrainTest
     convergence: dict[str, tuple[float, float] | None]
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(repr=False)
@@ -101,6 +103,11 @@ class FilterRun:
     def name(self) -> str:
         """Name of the log."""
         return self.log.name
+
+    @property
+    def changes_s(self) -> tuple[float, ...]:
+        """Terrain changes, seconds since the first recorded state."""
+        return self.terrain.times_s
 
     @property
     def track_width_m(self) -> float | None:
@@ -119,6 +126,7 @@ def fit(
     *,
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
+    find_changes: bool = False,
 ) -> FilterRun:
     """Learn a robot's track ICRs from a log.
 
@@ -128,6 +136,7 @@ def fit(
     config : default: all defaults
     warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
     changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
+    find_changes : look for more of them, and run the filter again with those found
 
     Returns
     -------
@@ -150,27 +159,25 @@ def fit(
     check = check_heading(log, config)
     delays = measure_delays(log, config, check)
     fixes = judge_fixes(delays.log, config, check)
-    adapted = run_adaptively(fixes.log, config, check, warm_start, changes_s)
-    log, setup, output, position_noise = adapted.log, adapted.setup, adapted.output, adapted.process_position_mps
-    table = _states(log, output)
-    gnss = _outcome(
-        log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
-    )
-    heading = _outcome(
-        log.heading.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
-        output.heading_innovation,
-    )  # fmt: skip
-    gap = wheel_gap_s(config, setup.data.wheel_t)
-    in_gap = np.append(np.diff(table.t_s) > gap, False)
-    convergence, outages = converge(table), _outages(table, gnss, fixes.losses_ns)
+    terrain = given_changes(changes_s)
+    done = _run(fixes, config, check, warm_start, terrain)
+    if find_changes:
+        terrain = _find_changes(done, terrain)
+        if len(terrain.changes) > len(done.terrain.changes):
+            done = _run(fixes, config, check, warm_start, terrain)
+    adapted, table, gnss, heading, in_gap, outages, _ = done
+    log, output, position_noise = adapted.log, adapted.output, adapted.process_position_mps
+    terrain, beyond = terrain.within(float(table.t_s[-1]))
+    convergence = converge(table, min(terrain.times_s, default=None))
     warnings = (
         *log.warnings,
         *wheels.warnings,
         *check.warnings,
         *delays.warnings,
         *fixes.warnings,
-        *_doubts(log.name, table, gnss),
-        *_adaptation_notes(log.name, config, adapted),
+        *doubts(log.name, table, gnss),
+        *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
+        *adaptation_notes(log.name, config, adapted),
     )
     summary = {
         "schema": RUN_SCHEMA,
@@ -182,7 +189,8 @@ def fit(
         "warnings": list(warnings),
         "drive": drive_summary(table),
         "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
-        "segments": segment_summary(table, changes_s),
+        "terrain": terrain.summary(),
+        "segments": segment_summary(table, terrain.times_s),
         "gnss": gnss_summary(log, gnss, fixes.down_weighted)
         | delays.gnss_summary()
         | fixes.summary(*used_and_rejected(gnss)),
@@ -211,8 +219,8 @@ def fit(
         heading_check=check,
         fix_quality=fixes,
         covariance=_square(output.P),
-        changes_s=tuple(sorted(changes_s)),
         warm_start=warm_start,
+        terrain=terrain,
         process_position_mps=position_noise,
         convergence=convergence,
         warnings=warnings,
@@ -223,6 +231,41 @@ def fit(
     summary["excitation"] = excitation.summary()
     summary["warnings"] = [*warnings, *told]
     return replace(run, warnings=(*warnings, *told))
+
+
+class _Done(NamedTuple):
+    """A pass of the filter over a log, in the words of `FilterRun`."""
+
+    adapted: AdaptedRun
+    table: States
+    gnss: MeasurementOutcome
+    heading: MeasurementOutcome
+    in_gap: Bools
+    outages_ns: Ints
+    terrain: TerrainTest
+
+
+def _run(
+    fixes: FixQuality, config: Config, check: HeadingCheck, warm_start: WarmStart | None, terrain: TerrainTest
+) -> _Done:
+    adapted = run_adaptively(fixes.log, config, check, warm_start, terrain.times_s)
+    log, setup, output = adapted.log, adapted.setup, adapted.output
+    table = _states(log, output)
+    gnss = _outcome(
+        log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
+    )
+    heading = _outcome(
+        log.heading.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
+        output.heading_innovation,
+    )  # fmt: skip
+    in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
+    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
+
+
+def _find_changes(done: _Done, terrain: TerrainTest) -> TerrainTest:
+    seen = done.heading.code > UNSEEN
+    innovations = done.heading.t_s[seen], done.heading.difference[seen]
+    return find_terrain_changes(done.table, done.in_gap, done.outages_ns, innovations, terrain.times_s)
 
 
 def _states(log: RobotLog, output: FilterOutput) -> States:
@@ -272,45 +315,6 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     if table.stamp_ns[-1] - used[-1] > longest:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)
-
-
-def _adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
-    """Say what was done about clocks and wheels that contradict the position reference."""
-    notes = []
-    if config.frames.reference_delay_s == "auto" and adapted.reference_delay_s:
-        side = "late" if adapted.reference_delay_s > 0 else "early"
-        notes.append(
-            f"{name}: the position reference is {abs(adapted.reference_delay_s):.2f} s {side} against the wheels: "
-            "taken out; frames.reference_delay_s sets it"
-        )
-    if adapted.process_position_mps != configured_process_position_mps(config):
-        notes.append(
-            f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
-            f"position noise raised to {adapted.process_position_mps:.1f} m/s; filter.process_position_mps sets it"
-        )
-    return notes
-
-
-def _doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
-    """Return what a user should know before trusting the numbers."""
-    doubts = []
-    distance = float(table.distance_m[-1])
-    if distance < 1.0:
-        doubts.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
-    elif float(np.ptp(table.heading_rad)) < math.radians(20):
-        doubts.append("the robot hardly turned: the ICRs are not observable on a straight drive")
-    if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
-        doubts.append(
-            "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
-        )
-    seen = int(np.count_nonzero(gnss.code > UNSEEN))
-    gated = int(np.count_nonzero(gnss.code == GATED))
-    if seen and gated > 0.1 * seen:
-        doubts.append(
-            f"{100 * gated / seen:.0f} % of the fixes were rejected: "
-            "clocks, antenna place or fix quality do not fit the wheels"
-        )
-    return [f"{name}: {doubt}" for doubt in doubts]
 
 
 def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:

@@ -20,6 +20,9 @@ WINDOW_IN_GNSS_STD = 12.0
 LONGEST_WINDOW_S = 30.0
 """A window that takes longer holds an outage or a stop, and no course."""
 
+SPIN_RATIO = 3.0
+"""A window is a spin where the sides part by so many times its way."""
+
 FEWEST_WINDOWS = 8
 UNSTATED_STD_M, NOISIER, FEWEST_FIXES = 0.01, 1.5, 30
 """Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
@@ -321,13 +324,16 @@ def measure_course(log: RobotLog) -> Course:
     turned = between(np.append(psi_at, psi_at[-1]))
     went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
     moved = went & led
+    # spins on the spot wind the way up whatever the heading; of a drive the sides go ahead of each other but little
+    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * np.where(interval < 1.0, interval, 0.0)
+    spun = between(np.concatenate([[0.0], np.cumsum(apart)])) > SPIN_RATIO * way
     told, mirror = real + 1j * imaginary, real - 1j * imaginary
     return Course(
         np.angle(told * np.conj(seen))[moved],
         np.angle(mirror * np.conj(seen))[moved],
         (turned / way)[moved],
         (np.abs(seen) / np.where(moved, np.hypot(real, imaginary), 1.0))[moved],
-        int(np.count_nonzero(went & ~led)),
+        int(np.count_nonzero(went & ~led & ~spun)),
         noise * math.sqrt(2.0) / length,
         white * math.sqrt(2.0) / length,
         float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,

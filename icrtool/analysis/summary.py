@@ -24,8 +24,8 @@ SMALLEST_CHANGE_M = 0.03
 """An ICR whose estimate moved less than this from its start has no rise to time."""
 
 
-def converge(table: States) -> dict[str, tuple[float, float] | None]:
-    """Time the rise of each ICR estimate.
+def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:
+    """Time the rise of each ICR estimate, up to a time where one is given.
 
     Returns
     -------
@@ -38,8 +38,10 @@ def converge(table: States) -> dict[str, tuple[float, float] | None]:
     Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
     """
     rises: dict[str, tuple[float, float] | None] = {}
+    rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
+    t_s = table.t_s[:rows]
     for column in ICR_COLUMNS:
-        estimate: Floats = getattr(table, column)
+        estimate: Floats = getattr(table, column)[:rows]
         settled = float(np.median(estimate[len(estimate) // 2 :]))
         change = settled - float(estimate[0])
         if abs(change) < SMALLEST_CHANGE_M:
@@ -47,8 +49,8 @@ def converge(table: States) -> dict[str, tuple[float, float] | None]:
             continue
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
-        last = _first_stay(table.t_s, np.abs(gone - 1.0) <= 0.1)
-        rises[column] = (float(table.t_s[first]), float(table.t_s[last])) if last is not None else None
+        last = _first_stay(t_s, np.abs(gone - 1.0) <= 0.1)
+        rises[column] = (float(t_s[first]), float(t_s[last])) if last is not None else None
     return rises
 
 

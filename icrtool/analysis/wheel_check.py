@@ -23,7 +23,7 @@ all along the way: one that comes and goes is slip, or held samples, and no radi
 FACTOR_TWO_TOLERANCE = 0.04
 """A factor two (diameter for radius, counts on both edges) is as certain as a small error when it is this exact."""
 
-CLEAR_CORRELATION = 0.5
+CLEAR_CORRELATION, WHOLE_CORRELATION = 0.5, 0.9
 SMALLEST_TURN_RAD = math.radians(20.0)
 MOSTLY_BACKWARDS = 0.8
 LONGEST_DRIVE_NS = 30 * 86_400 * 1_000_000_000
@@ -160,23 +160,24 @@ def _reversed_or_swapped(log: RobotLog) -> tuple[WheelSamples, str] | None:
     away = abs(float(np.angle(np.exp(1j * course.angle).mean())))
     if abs(np.exp(1j * course.angle).mean()) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
-    correlation = _turn_correlation(log, course)
+    correlation = _turn_correlation(log, mirrored=_mirrored(course))
     if correlation is not None and correlation < -CLEAR_CORRELATION:
         return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
     return None
 
 
-def _turn_correlation(log: RobotLog, course: Course) -> float | None:
-    """Return how heading turns and left going ahead of right correlate; None where there are too few turns.
-
-    The heading is taken in the sense in which it follows the course.
-    """
+def _turn_correlation(log: RobotLog, *, mirrored: bool) -> float | None:
+    """Return how heading turns and left going ahead of right correlate; None where there are too few turns."""
     turned, told = _turns(log)
     tells = len(turned) >= FEWEST_WINDOWS and float(np.ptp(told)) > 0 and float(np.ptp(turned)) > 0
     if not tells or float(np.abs(turned).sum()) <= SMALLEST_TURN_RAD:
         return None
-    mirrored = _agreement(course.mirrored) > _agreement(course.angle)
     return float(np.corrcoef(-turned if mirrored else turned, told)[0, 1])
+
+
+def _mirrored(course: Course) -> bool:
+    """Say whether the heading follows the course only when it is turned the other way."""
+    return _agreement(course.mirrored) > _agreement(course.angle)
 
 
 def _agreement(angle: Floats) -> float:
@@ -185,9 +186,15 @@ def _agreement(angle: Floats) -> float:
 
 
 def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
-    """Look for a side that counts backwards: then the sides cancel, and their difference makes the way."""
+    """Look for a side that counts backwards: then the sides cancel, and their difference makes the way.
+
+    Spins on the spot have no way either, but there the difference makes the turn.
+    """
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
+    correlation = _turn_correlation(log, mirrored=False)
+    if correlation is not None and abs(correlation) > WHOLE_CORRELATION:
+        return None
     for name, one in (
         ("left", WheelSamples(wheels.stamp_ns, -left, right)),
         ("right", WheelSamples(wheels.stamp_ns, left, -right)),
@@ -197,7 +204,7 @@ def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
         if len(course.angle) < FEWEST_WINDOWS or max(map(_agreement, (course.angle, course.mirrored))) < EXPLAINED:
             continue
         # Either side turned over makes a way; the wrong one is driven backwards, and turns the other way.
-        correlation = _turn_correlation(changed, course)
+        correlation = _turn_correlation(changed, mirrored=_mirrored(course))
         forwards = abs(float(np.angle(np.exp(1j * course.angle).mean()))) < math.radians(90)
         if forwards if correlation is None else correlation > CLEAR_CORRELATION:
             return one, f"the {name} wheels count backwards"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from icrtool.config import Config
 
 RUNS = Path("icrtool-runs")
+AUTO = "auto"
 
 
 class FitRequest(NamedTuple):
@@ -23,6 +25,7 @@ class FitRequest(NamedTuple):
     formats: tuple[str, ...]
     warm_start: Path | None
     changes_s: tuple[float, ...]
+    finds_changes: bool
     smooths: bool
     quiet: bool
     verbose: bool
@@ -46,17 +49,16 @@ class FitRequest(NamedTuple):
 @click.option(
     "--terrain-change",
     "changes",
-    metavar="T",
+    metavar="T|auto",
     multiple=True,
-    type=float,
-    help="Inflate the ICR covariance T seconds after the start; repeatable.",
+    help="Inflate the ICR covariance T seconds after the start; auto: where the ICRs are found to change. Repeatable.",
 )
 @click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[float, ...], smooths: bool,
+    warm_start: Path | None, changes: tuple[str, ...], smooths: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -73,8 +75,8 @@ def command(
 
     config = options.load(config_file, robot, sets)
     request = FitRequest(
-        config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start, changes, smooths,
-        quiet, verbose,
+        config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
+        change_times(changes), AUTO in changes, smooths, quiet, verbose,
     )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
@@ -88,6 +90,17 @@ def command(
             click.echo(f"Error: {err}", err=True)
     if failed:
         raise IcrToolError(f"{len(failed)} of {len(logs)} logs", "could not be used", "the others were written")
+
+
+def change_times(given: tuple[str, ...]) -> tuple[float, ...]:
+    """Return the times [s] of ``--terrain-change``; its word ``auto`` is none."""
+    try:
+        times = tuple(float(text) for text in given if text != AUTO)
+    except ValueError as err:
+        raise click.BadParameter(f"{err}; give seconds or {AUTO}", param_hint="--terrain-change") from err
+    if not all(math.isfinite(time) for time in times):
+        raise click.BadParameter("give finite seconds", param_hint="--terrain-change")
+    return times
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
@@ -138,7 +151,13 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
         measured = read_log(log, request.config, progress)
     from icrtool.analysis.fit import fit
 
-    run = fit(measured, request.config, warm_start=start, changes_s=request.changes_s)
+    run = fit(
+        measured,
+        request.config,
+        warm_start=start,
+        changes_s=request.changes_s,
+        find_changes=request.finds_changes,
+    )
     smoothed = None
     if request.smooths:
         from icrtool.analysis.smooth import smooth

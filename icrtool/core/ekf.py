@@ -41,6 +41,8 @@ class FilterParameters(NamedTuple):
     ----------
     process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
     rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
+    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
+        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
     gnss_gate, heading_gate : largest NIS accepted; inf accepts all
     heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
     antenna_forward, antenna_right : lever arm of the antenna [m], body frame
@@ -53,6 +55,7 @@ class FilterParameters(NamedTuple):
 
     process_variance: tuple[float, float, float, float, float, float]
     rate_invariant: bool
+    step_heading: float
     gnss_gate: float
     heading_gate: float
     heading_correlation: float
@@ -238,7 +241,7 @@ def advance(
         P[6] += parameters.gap_speed_variance * dt
         P[11] += parameters.gap_turn_variance * dt
     else:
-        travelled = predict(x, P, v_left, v_right, dt)
+        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading)
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]

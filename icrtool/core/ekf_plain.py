@@ -24,7 +24,7 @@ from icrtool.core.ekf_step import Floats, wrap
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 
 
-def step_state(x: Floats, v_left: float, v_right: float, dt: float) -> Floats:
+def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
     """Return f(x, u, 0) of Eq. 14 with the guard of Eqs. 32-34; x may be complex, for complex-step derivatives."""
     N, E, psi, y_r, y_l, x_v = x
     W = y_r - y_l if np.real(y_r - y_l) >= 0 else y_l - y_r
@@ -33,18 +33,18 @@ def step_state(x: Floats, v_left: float, v_right: float, dt: float) -> Floats:
     v_x = (v_left * y_r - v_right * y_l) / W
     omega = (v_left - v_right) / W
     v_y = -omega * x_v
-    c, s = np.cos(psi), np.sin(psi)
+    c, s = np.cos(psi + step_heading * dt * omega), np.sin(psi + step_heading * dt * omega)
     return np.array([N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega, y_r, y_l, x_v])
 
 
-def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float) -> Floats:
+def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
     """Return F (6, 6), the derivative of `step_state` (Eq. 17)."""
     _, _, psi, y_r, y_l, x_v = x
     W = max(abs(y_l - y_r), MIN_ICR_SEPARATION_M)
     sign = 1.0 if y_r >= y_l else -1.0
     difference = v_left - v_right
     v_x, v_y, omega = (v_left * y_r - v_right * y_l) / W, -difference * x_v / W, difference / W
-    c, s = math.cos(psi), math.sin(psi)
+    c, s = math.cos(psi + step_heading * dt * omega), math.sin(psi + step_heading * dt * omega)
     to_body = np.array(
         [
             [(v_left - sign * v_x) / W, (sign * v_x - v_right) / W, 0.0],
@@ -57,6 +57,7 @@ def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float) -> Float
     F[0, 2] = dt * (-v_x * s - v_y * c)
     F[1, 2] = dt * (v_x * c - v_y * s)
     F[:3, 3:] = dt * turn @ to_body
+    F[:2, 3:] += step_heading * np.outer(F[:2, 2], F[2, 3:])
     return F
 
 
@@ -86,8 +87,9 @@ def run_filter_plain(
                 speed, turn = parameters.gap_speed_variance, parameters.gap_turn_variance
                 P = P + dt * np.diag([speed, speed, turn, 0.0, 0.0, 0.0]) + Q
             else:
-                F = state_jacobian(x, data.v_left[held], data.v_right[held], dt)
-                stepped = step_state(x, data.v_left[held], data.v_right[held], dt)
+                speeds = (data.v_left[held], data.v_right[held])
+                F = state_jacobian(x, *speeds, dt, parameters.step_heading)
+                stepped = step_state(x, *speeds, dt, parameters.step_heading)
                 travelled += math.hypot(*(stepped[:2] - x[:2]))
                 x, P = stepped, F @ P @ F.T + Q
             t = time

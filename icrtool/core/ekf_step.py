@@ -45,13 +45,17 @@ def row_times(G0: float, G1: float, G2: float, G3: float, p: float, r: float, l:
 
 
 @njit
-def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float) -> float:
+def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, step_heading: float) -> float:
     """Propagate state and covariance over dt [s] with the track speeds [m/s] held; return the path length [m].
+
+    Parameters
+    ----------
+    step_heading : where in the step's turn the heading is taken, see `icrtool.core.ekf.FilterParameters`
 
     Notes
     -----
-    Eq. 14 (Euler) and F P F^T of Eq. 16 with F = I + G (Eqs. 17, 27-29); only rows N, E, psi and columns psi, y_r,
-    y_l, x_v of G differ from zero. The process noise is `add_noise`.
+    Eq. 14 (Euler where step_heading is 0) and F P F^T of Eq. 16 with F = I + G (Eqs. 17, 27-29); only rows N, E, psi
+    and columns psi, y_r, y_l, x_v of G differ from zero. The process noise is `icrtool.core.ekf.advance`'s.
     """
     N, E, psi, y_r, y_l, x_v = x[0], x[1], x[2], x[3], x[4], x[5]
     NN, NE, Np, Nr, Nl, Nx = P[0], P[1], P[2], P[3], P[4], P[5]
@@ -61,12 +65,15 @@ def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float) -> f
     v_x, v_y, omega = body_velocity(v_left, v_right, y_r, y_l, x_v)
     W = icr_separation(y_r, y_l)
     sign = 1.0 if y_r >= y_l else -1.0
-    c, s = math.cos(psi), math.sin(psi)
+    ahead = step_heading * dt
+    c, s = math.cos(psi + ahead * omega), math.sin(psi + ahead * omega)
     vx_r, vx_l = (v_left - v_x * sign) / W, (v_x * sign - v_right) / W
     w_r, w_l = -omega * sign / W, omega * sign / W
     n0, e0 = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
-    n1, e1 = dt * (vx_r * c + w_r * x_v * s), dt * (vx_r * s - w_r * x_v * c)
-    n2, e2 = dt * (vx_l * c + w_l * x_v * s), dt * (vx_l * s - w_l * x_v * c)
+    # the ICRs move the place by the body velocity, and by the heading at which it is turned into the world
+    a_r, a_l = ahead * w_r, ahead * w_l
+    n1, e1 = dt * (vx_r * c + w_r * x_v * s) + n0 * a_r, dt * (vx_r * s - w_r * x_v * c) + e0 * a_r
+    n2, e2 = dt * (vx_l * c + w_l * x_v * s) + n0 * a_l, dt * (vx_l * s - w_l * x_v * c) + e0 * a_l
     n3, e3 = dt * omega * s, -dt * omega * c
     p1, p2 = dt * w_r, dt * w_l
     # M = (I + G) P, the parts of it that P' needs

@@ -129,7 +129,7 @@ def square(upper: Floats, full: Floats) -> None:
 
 
 @njit
-def transition(x: Floats, step: Floats, F: Floats) -> None:
+def transition(x: Floats, step: Floats, step_heading: float, F: Floats) -> None:
     """Fill F (6, 6) of Eqs. 17, 27-29 at state x for a step of `Nodes`; the identity through a gap."""
     for i in range(6):
         for k in range(6):
@@ -140,13 +140,14 @@ def transition(x: Floats, step: Floats, F: Floats) -> None:
     v_x, v_y, omega = body_velocity(step[1], step[2], x[3], x[4], x[5])
     W = icr_separation(x[3], x[4])
     sign = 1.0 if x[3] >= x[4] else -1.0
-    c, s = math.cos(x[2]), math.sin(x[2])
+    ahead = step_heading * dt
+    c, s = math.cos(x[2] + ahead * omega), math.sin(x[2] + ahead * omega)
     F[0, 2], F[1, 2] = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
     for column, vx_by, w_by in (
         (3, (step[1] - v_x * sign) / W, -omega * sign / W), (4, (v_x * sign - step[2]) / W, omega * sign / W)
     ):  # fmt: skip
-        F[0, column] = dt * (vx_by * c + w_by * x[5] * s)
-        F[1, column] = dt * (vx_by * s - w_by * x[5] * c)
+        F[0, column] = dt * (vx_by * c + w_by * x[5] * s) + F[0, 2] * ahead * w_by
+        F[1, column] = dt * (vx_by * s - w_by * x[5] * c) + F[1, 2] * ahead * w_by
         F[2, column] = dt * w_by
     F[0, 5], F[1, 5] = dt * omega * s, -dt * omega * c
 
@@ -189,11 +190,14 @@ def multiply(A: Floats, B: Floats, out: Floats) -> None:
 
 
 @njit
-def smooth_chunk(nodes: Nodes, count: int, later: Floats, xs: Floats, Ps: Floats, out: Smoothed) -> None:
+def smooth_chunk(
+    nodes: Nodes, count: int, step_heading: float, later: Floats, xs: Floats, Ps: Floats, out: Smoothed
+) -> None:
     """Smooth the first `count` nodes of a chunk backwards, filling `out` at their rows.
 
     Parameters
     ----------
+    step_heading : as in `FilterParameters`
     later : (31,) the first node of the chunk that follows: x_predicted, P_predicted, step; step NaN where none follows
     xs, Ps : (6,), (6, 6) smoothed there; they end as the smoothed first node of this chunk. `later` likewise
     """
@@ -205,7 +209,7 @@ def smooth_chunk(nodes: Nodes, count: int, later: Floats, xs: Floats, Ps: Floats
         if math.isnan(later[27]):
             xs[:], Ps[:] = nodes.x[m], P
         else:
-            transition(nodes.x[m], later[27:31], F)
+            transition(nodes.x[m], later[27:31], step_heading, F)
             square(later[6:27], P_predicted)
             multiply(F, P, X)
             D[:] = Ps - P_predicted
@@ -262,7 +266,7 @@ def run_smoother(
         begin, end = borders[chunk], borders[chunk + 1]
         nodes = _room(data, place, begin, end)
         count = record_chunk(data, first, begin, end, clock, place, runs, x, P, parameters, nodes)
-        smooth_chunk(nodes, count, later, xs, Ps, out)
+        smooth_chunk(nodes, count, parameters.step_heading, later, xs, Ps, out)
     return out
 
 

@@ -14,6 +14,7 @@ from icrtool.report.decimate import extremes, percentiles
 from icrtool.report.figure_style import (
     BAND_COLOR,
     BAR_COLOR,
+    CHANGE,
     HALF_WIDTH,
     MEAN,
     OUTAGE_COLOR,
@@ -125,6 +126,8 @@ def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float,
     band = 2 * getattr(table, f"std_{column}")[rows]
     low, high = value - band, value + band
     shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit)
+    for change in run.changes_s:
+        axes.axvline(change / unit, zorder=2.6, **CHANGE.keywords())
     shown = extremes(low, high)
     axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
     shown = extremes(value)
@@ -179,6 +182,8 @@ def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
         keys.append(Line2D([], [], label="90 % of the way", **_mark()))
     if run.config.robot.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
+    if run.changes_s:
+        keys.append(Line2D([], [], label="terrain change", **CHANGE.keywords()))
     if len(run.outages_ns):
         keys.append(Patch(color=OUTAGE_COLOR, linewidth=0, label="no usable GNSS"))
     return keys

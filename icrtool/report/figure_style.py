@@ -79,6 +79,7 @@ FILTER = Pen("black", width=1.1)
 ICR = Pen("#2166ac", (0, (6, 2)), 1.5)
 NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
+CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)
 MEAN = Pen("black", (0, (5, 2)), 1.1)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
+from icrtool.analysis.terrain import FALSE_ALARMS_PER_HOUR, TerrainChange
 from icrtool.report.words import duration_text, length_text, position_word, run_title, way_text
 
 WIDTH = 100
@@ -37,6 +38,7 @@ def format_run(run: FilterRun) -> str:
         *_icr_lines(run),
         *_multiplier_lines(run),
         *excitation_lines(run),
+        *_terrain_lines(run),
         "",
         *_position_lines(run),
         *_heading_lines(run),
@@ -107,6 +109,40 @@ def _multiplier_lines(run: FilterRun) -> list[str]:
         return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
     multiplier = separation_multiplier(run.table, width)
     return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m")]
+
+
+def _terrain_lines(run: FilterRun) -> list[str]:
+    """Return the terrain changes, given and found, and the ICRs between them."""
+    terrain = run.terrain
+    if not (terrain.changes or terrain.searched):
+        return []
+    lines = [""]
+    if terrain.searched:
+        found = sum(change.source == "detected" for change in terrain.changes)
+        driven = duration_text(3600 * terrain.driven_h)
+        if math.isfinite(terrain.threshold):
+            said = (
+                f"{found} {'change' if found == 1 else 'changes'} of the ICRs found in {driven} of driving; "
+                f"false alarms: {FALSE_ALARMS_PER_HOUR:g} an hour"
+            )
+        else:
+            said = "too few turns, or too rough a position, to look for changes of the ICRs"
+        lines.append(_line("terrain", said))
+    if not terrain.changes:
+        return lines
+    rows: list[Row] = [("segment", "begins", "", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
+    begun = ["", *(_found_text(change, terrain.threshold) for change in terrain.changes)]
+    for number, (segment, why) in enumerate(zip(run.summary["segments"], begun, strict=True), start=1):
+        mean, std = segment["mean"], segment["std"]
+        icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
+        rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", why, *icrs))
+    return lines + [f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<22}{row[3]:<20}{row[4]:<20}{row[5]}" for row in rows]
+
+
+def _found_text(change: TerrainChange, threshold: float) -> str:
+    if change.statistic is None:
+        return "given"
+    return f"found, {change.statistic:.1f} σ > {threshold:.1f} σ"
 
 
 def _position_lines(run: FilterRun) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -40,6 +41,25 @@ def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], 
         return int(left.value.code or 0), said.err
 
     return run
+
+
+def test_terrain_changes_are_found_said_and_drawn(tmp_path: Path) -> None:
+    made = icrtool(
+        tmp_path, "simulate", "-o", "drive.mcap", "--robot", "segway-rmp400", "--icrs", "0.63,-0.76,0.06",
+        "--change", "60:0.85,-1.0,0", "--path", "figure-eight", "--duration", 120,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    fitted = icrtool(tmp_path, "fit", "drive.mcap", "--robot", "segway-rmp400", "--terrain-change", "auto", "-o", "run")
+    assert fitted.returncode == 0, fitted.stderr
+    assert "1 change of the ICRs found" in fitted.stdout
+    assert "false alarms: 0.1 an hour" in fitted.stdout
+    assert all(len(line) <= 100 for line in fitted.stdout.splitlines())
+    terrain = json.loads((tmp_path / "run" / "run.json").read_text())["terrain"]
+    assert [change["t_s"] for change in terrain["changes"]] == pytest.approx([60.0], abs=3.0)
+    assert terrain["changes"][0]["statistic"] > terrain["threshold"]
+    refused = icrtool(tmp_path, "fit", "drive.mcap", "--terrain-change", "soon")
+    assert refused.returncode == 2
+    assert "give seconds or auto" in refused.stderr
 
 
 def test_a_simulated_log_is_fitted_like_any_other(tmp_path: Path) -> None:

@@ -23,8 +23,9 @@ def make_log(
     lever: tuple[float, float] = (0.0, 0.0),
     rate: float = 50.0,
     faster: float = 1.0,
+    step_heading: float = 0.5,
 ) -> RobotLog:
-    """Drive curves for some seconds; return what the sensors said."""
+    """Drive curves for some seconds, or (``step_heading=0``) by Euler steps; return what the sensors said."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 1.0 / rate)
     v_left, v_right = 0.5 + 0.25 * np.sin(0.5 * t), 0.5 + 0.25 * np.sin(0.31 * t + 1.0)
@@ -32,7 +33,7 @@ def make_log(
     x = np.zeros((len(t), 6))
     x[0] = [10.0, -5.0, 0.3, *icrs]
     for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1.0 / rate)
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1.0 / rate, step_heading)
     stamps = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
     every = max(int(rate / 20), 1)
     psi = x[::every, 2]

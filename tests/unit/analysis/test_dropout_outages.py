@@ -9,11 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from icrtool.analysis.driven_run import drive_of
 from icrtool.analysis.filter_setup import WarmStart
-from icrtool.analysis.fit import FilterRun, fit
+from icrtool.analysis.fit import STATE_COLUMNS, FilterRun, fit
 from icrtool.analysis.outages import force_outages, plan_outages, real_outages
-from icrtool.core.open_loop import open_loop_path
+from icrtool.core.ekf_plain import step_state
 from icrtool.errors import ConfigError, DataError
 
 
@@ -68,11 +67,15 @@ def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: F
     first, last = np.searchsorted(table.t_s, [20.0, 28.0])
     # The state at the begin's own stamp has lost its fix and its heading already: the last one with them is before.
     before = int(first) - 1
-    icrs = (float(column[before]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    path = open_loop_path(drive_of(clean), *icrs, before, int(last) - 1)
-    np.testing.assert_allclose(outage.north_m, path.north[1:], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(outage.east_m, path.east[1:], rtol=0, atol=1e-9)
-    away = np.hypot(path.north[1:] - table.north_m[first:last], path.east[1:] - table.east_m[first:last])
+    x = np.array([getattr(table, column)[before] for column in STATE_COLUMNS])
+    path = []
+    for k in range(before, last - 1):
+        x = step_state(x, table.v_left_mps[k], table.v_right_mps[k], table.t_s[k + 1] - table.t_s[k], 0.5)
+        path.append(x[:2])
+    north, east = np.array(path).T
+    np.testing.assert_allclose(outage.north_m, north, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(outage.east_m, east, rtol=0, atol=1e-9)
+    away = np.hypot(north - table.north_m[first:last], east - table.east_m[first:last])
     assert outage.end_error_m == pytest.approx(away[-1], abs=1e-9)
     assert outage.max_error_m == pytest.approx(away.max(), abs=1e-9)
     assert (outage.kind, outage.begin_s, outage.end_s) == ("forced", 20.0, 28.0)

@@ -13,6 +13,9 @@ import pytest
 
 from icrtool.analysis.filter_setup import WarmStart, chi2_gate
 from icrtool.analysis.fit import fit
+from icrtool.analysis.paths import PathPlan
+from icrtool.analysis.simulate import Drive, Sensors, move, sense
+from icrtool.analysis.study_runs import readings_log
 from icrtool.config import load_config
 from icrtool.core.ekf import GATED
 from icrtool.errors import DataError
@@ -134,10 +137,13 @@ def test_a_warm_start_begins_with_the_other_runs_icrs_and_certainty() -> None:
 
 
 def test_a_terrain_change_opens_the_icrs_and_gives_segments() -> None:
-    run = fit(make_log(), load_config(sets=[WIDTH]), changes_s=(30.0,))
-    k = int(np.searchsorted(run.table.t_s, 30.0))
-    assert run.table.std_y_icr_right_m[k] > 5.0 > run.table.std_y_icr_right_m[k - 1]
-    assert [segment["begin_s"] for segment in run.summary["segments"]] == [0.0, 30.0]
+    """By the robot's width, the paper's 10 m, or what is configured."""
+    for settings, std in ((), 0.8), (("filter.preset=paper",), 10.0), (("filter.terrain_icr_std_m=3.0",), 3.0):
+        run = fit(make_log(), load_config(sets=[WIDTH, *settings]), changes_s=(30.0,))
+        k = int(np.searchsorted(run.table.t_s, 30.0))
+        assert run.table.std_y_icr_right_m[k] == pytest.approx(std, rel=0.02)
+        assert run.table.std_y_icr_right_m[k - 1] < 0.2
+        assert [segment["begin_s"] for segment in run.summary["segments"]] == [0.0, 30.0]
 
 
 def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() -> None:
@@ -159,6 +165,29 @@ def test_a_parked_robot_is_said_to_have_learned_nothing() -> None:
     )
     heading = replace(log.heading, heading_rad=0 * log.heading.heading_rad)
     run = fit(replace(log, wheels=still, gnss=gnss, heading=heading), load_config(sets=[WIDTH]))
+    assert any("nothing was learned" in warning for warning in run.warnings)
+
+
+def spun(seconds: float, speed_mps: float = 0.3) -> RobotLog:
+    """A robot that turns on the spot: its origin goes hardly anywhere."""
+    icrs, plan = (0.5, -0.5, 0.0), PathPlan("spins", speed_mps)
+    sensors = Sensors(input_noise_mps=0.01)
+    truth = move(Drive(icrs_m=icrs, path=plan, duration_s=seconds), 0.01)
+    return readings_log(sense(truth, sensors, seconds, np.random.default_rng(0)), sensors)
+
+
+def test_a_robot_that_spun_on_the_spot_has_learned_its_icrs_and_is_told_no_less() -> None:
+    run = fit(spun(60.0), load_config(sets=[WIDTH]))
+    assert run.summary["drive"]["distance_m"] < 1.0
+    final = run.summary["icr"]["final"]
+    assert [final[name] for name in final] == pytest.approx([0.5, -0.5, 0.0], abs=ICR_TOLERANCE_M)
+    assert not any("learned" in warning for warning in run.warnings)
+
+
+def test_a_parked_robot_whose_heading_drifts_has_learned_nothing() -> None:
+    log = spun(60.0)
+    still = replace(log.wheels, v_left_mps=0 * log.wheels.v_left_mps, v_right_mps=0 * log.wheels.v_right_mps)
+    run = fit(replace(log, wheels=still), load_config(sets=[WIDTH]))
     assert any("nothing was learned" in warning for warning in run.warnings)
 
 

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import fit
+from icrtool.analysis.paths import PathPlan
+from icrtool.analysis.simulate import Drive, Sensors, move, sense
+from icrtool.analysis.study_runs import readings_log
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import load_config
 from icrtool.tables import RobotLog
@@ -70,6 +73,17 @@ def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  
     check = check_wheels(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
     assert any(words in warning for warning in check.warnings)
     assert check.applied_scale == 1.0
+
+
+def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:
+    """With a side turned round, the origin's small circle would look like driving."""
+    icrs, sensors = (0.5, -0.75, -0.25), Sensors(input_noise_mps=0.03)
+    truth = move(Drive(icrs_m=icrs, path=PathPlan("spins", 0.4), duration_s=90.0), 0.01)
+    log = readings_log(sense(truth, sensors, 90.0, np.random.default_rng(0)), sensors)
+    run = fit(log, CONFIG)
+    assert run.warnings == ()
+    final = run.summary["icr"]["final"]
+    assert [final[name] for name in final] == pytest.approx(icrs, abs=ICR_TOLERANCE_M)
 
 
 def test_preset_paper_corrects_nothing() -> None:

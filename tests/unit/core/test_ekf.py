@@ -24,6 +24,7 @@ def parameters(**changes: object) -> FilterParameters:
     values: dict[str, object] = {
         "process_variance": PAPER_Q,
         "rate_invariant": True,
+        "step_heading": 0.5,
         "gnss_gate": math.inf,
         "heading_gate": math.inf,
         "heading_correlation": 1.0,
@@ -54,7 +55,7 @@ def drive(
     x = np.zeros((len(t), 6))
     x[0] = [3.0, -2.0, 2.5, *icrs]
     for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], t[k + 1] - t[k])
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], t[k + 1] - t[k], 0.5)
 
     def at(times: np.ndarray) -> np.ndarray:
         return np.column_stack([np.interp(times, t, column) for column in x.T])
@@ -98,7 +99,7 @@ def test_twins_agree_with_lever_arm_gates_and_paper_noise() -> None:
         antenna_forward=0.3, antenna_right=-0.2, gnss_gate=18.4, heading_gate=15.1, heading_correlation=40.0
     )
     assert_twins(data, settings)
-    assert_twins(data, settings._replace(rate_invariant=False))
+    assert_twins(data, settings._replace(rate_invariant=False, step_heading=0.0))
 
 
 def test_twins_agree_through_gaps_changes_and_inverted_starts() -> None:
@@ -131,14 +132,15 @@ def test_the_kernel_equals_its_python_function() -> None:
         np.testing.assert_allclose(getattr(out, name), getattr(again, name), rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.parametrize("step_heading", [0.0, 0.5])
 @pytest.mark.parametrize("icrs", [(0.5, -0.75, -0.25), (-0.3, 0.4, 0.1), (1.0, -1.0, 1.0)])
-def test_the_jacobian_equals_complex_step_differences(icrs: tuple[float, float, float]) -> None:
+def test_the_jacobian_equals_complex_step_differences(icrs: tuple[float, float, float], step_heading: float) -> None:
     x = np.array([3.0, -2.0, 0.7, *icrs])
-    F = state_jacobian(x, 0.31, 0.52, 0.01)
+    F = state_jacobian(x, 0.31, 0.52, 0.1, step_heading)
     for column in range(6):
         stepped = x.astype(complex)
         stepped[column] += 1j * COMPLEX_STEP
-        derivative = np.imag(step_state(stepped, 0.31, 0.52, 0.01)) / COMPLEX_STEP
+        derivative = np.imag(step_state(stepped, 0.31, 0.52, 0.1, step_heading)) / COMPLEX_STEP
         np.testing.assert_allclose(F[:, column], derivative, atol=DERIVATIVE_TOLERANCE)
 
 
@@ -168,7 +170,7 @@ def test_the_papers_filter_equals_a_transcription_of_its_equations() -> None:
     data, _ = drive(6, seconds=60.0, rate=100.0, coincident=True)
     t0, x0, _ = start(data, icrs=(1.0, -1.0, 1.0))
     P0 = np.diag([1e-4, 1e-4, math.radians(1) ** 2, 1.0, 1.0, 1.0])
-    out = run_filter(data, t0, x0, P0, parameters(rate_invariant=False, wheel_gap_s=math.inf))
+    out = run_filter(data, t0, x0, P0, parameters(rate_invariant=False, step_heading=0.0, wheel_gap_s=math.inf))
     np.testing.assert_allclose(out.x, transcription(data, x0, P0), atol=TRANSCRIPTION_TOLERANCE)
 
 

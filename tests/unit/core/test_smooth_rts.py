@@ -20,8 +20,9 @@ LEVER = (0.2, -0.1)
 
 def parameters(**other: object) -> FilterParameters:
     values: dict[str, object] = {
-        "process_variance": (0.04, 0.04, 0.01, 1e-4, 1e-4, 1e-4), "rate_invariant": True, "gnss_gate": math.inf,
-        "heading_gate": math.inf, "heading_correlation": 3.0, "antenna_forward": LEVER[0], "antenna_right": LEVER[1],
+        "process_variance": (0.04, 0.04, 0.01, 1e-4, 1e-4, 1e-4), "rate_invariant": True, "step_heading": 0.5,
+        "gnss_gate": math.inf, "heading_gate": math.inf, "heading_correlation": 3.0,
+        "antenna_forward": LEVER[0], "antenna_right": LEVER[1],
         "wheel_gap_s": 0.5, "gap_speed_variance": 4.0, "gap_turn_variance": 1.0, "recovery_count": 5, "recovery_s": 0.2,
         "icr_inflation_m2": 100.0, "least_icr": -math.inf,
     }  # fmt: skip
@@ -82,7 +83,7 @@ def test_smoothed_states_are_the_batch_solution() -> None:
             add({0: np.eye(6)}, X0, P0)
         else:
             F = np.empty((6, 6))
-            transition(nodes.x[i - 1], nodes.step[i], F)
+            transition(nodes.x[i - 1], nodes.step[i], settings.step_heading, F)
             dt, gap = nodes.step[i, 0], nodes.step[i, 3]
             Q = np.diag(settings.process_variance) * REFERENCE_STEP_S * dt
             Q += gap * dt * np.diag([4.0, 4.0, 1.0, 0.0, 0.0, 0.0])
@@ -161,7 +162,7 @@ def test_kernels_equal_their_python_source() -> None:
         from icrtool.core.rts import Smoothed
 
         out = Smoothed(np.empty((25, 6)), np.empty((25, 6)))
-        kernel(nodes, count, np.full(31, np.nan), np.zeros(6), np.zeros((6, 6)), out)
+        kernel(nodes, count, 0.5, np.full(31, np.nan), np.zeros(6), np.zeros((6, 6)), out)
         results.append(out)
     assert np.allclose(results[0].x, results[1].x, rtol=1e-12)
     assert np.allclose(results[0].variance, results[1].variance, rtol=1e-9)

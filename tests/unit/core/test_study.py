@@ -18,6 +18,7 @@ DERIVATIVE_TOLERANCE = 1e-12
 PARAMETERS = FilterParameters(
     process_variance=(0.04, 0.04, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4),
     rate_invariant=False,
+    step_heading=0.0,
     gnss_gate=math.inf,
     heading_gate=math.inf,
     heading_correlation=1.0,
