@@ -316,8 +316,8 @@ def measure_course(log: RobotLog) -> Course:
         return none
 
     def between(values: Floats) -> Floats:
-        at = np.interp(gnss.stamp_ns, wheels.stamp_ns, values)
-        return at[end] - at[begin]
+        first, last = (np.interp(gnss.stamp_ns[fix], wheels.stamp_ns, values) for fix in (begin, end))
+        return last - first
 
     seen = (gnss.north_m[end] - gnss.north_m[begin]) + 1j * (gnss.east_m[end] - gnss.east_m[begin])
     real, imaginary, way = between(laid.real), between(laid.imag), between(travelled)

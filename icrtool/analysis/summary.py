@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from icrtool.core.ekf import GATED, RECOVERED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.tables import Floats, RobotLog, States
+from icrtool.tables import Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
     from icrtool.analysis.fit import MeasurementOutcome
@@ -40,6 +40,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     rises: dict[str, tuple[float, float] | None] = {}
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
+    settled_by = np.searchsorted(t_s, t_s + SETTLED_S)
     for column in ICR_COLUMNS:
         estimate: Floats = getattr(table, column)[:rows]
         settled = float(np.median(estimate[len(estimate) // 2 :]))
@@ -49,16 +50,15 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
             continue
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
-        last = _first_stay(t_s, np.abs(gone - 1.0) <= 0.1)
+        last = _first_stay(settled_by, np.abs(gone - 1.0) <= 0.1)
         rises[column] = (float(t_s[first]), float(t_s[last])) if last is not None else None
     return rises
 
 
-def _first_stay(t_s: Floats, inside: NDArray[np.bool_]) -> int | None:
-    """Return the first row from which `inside` holds for `SETTLED_S`; None where it never does."""
+def _first_stay(until: Ints, inside: NDArray[np.bool_]) -> int | None:
+    """Return the first row from which `inside` holds up to row `until` of it, which must be one; None if none does."""
     outside = np.concatenate([[0], np.cumsum(~inside)])
-    until = np.searchsorted(t_s, t_s + SETTLED_S)
-    stays = inside & (outside[until] == outside[:-1]) & (t_s + SETTLED_S <= t_s[-1])
+    stays = inside & (outside[until] == outside[:-1]) & (until < len(inside))
     return int(np.argmax(stays)) if stays.any() else None
 
 

@@ -72,12 +72,14 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     corrects = config.filter.preset == "field"
     notes = [f"{log.name}: {note}" for note in _dead_or_copied(log)]
     sound = not notes
-    found = _reversed_or_swapped(log)
+    course = measure_course(log)
+    found = _reversed_or_swapped(log, course)
     if found is not None:
         wheels, note = found
         notes.append(f"{log.name}: {note}{': put right' if corrects else ''}")
-        log = replace(log, wheels=wheels) if corrects else log
-    course = measure_course(log)
+        if corrects:
+            log = replace(log, wheels=wheels)
+            course = measure_course(log)
     scale, sigma, scatter = _scale(course)
     applied = 1.0
     error = abs(scale - 1.0)
@@ -148,11 +150,10 @@ def _dead_or_copied(log: RobotLog) -> list[str]:
     return []
 
 
-def _reversed_or_swapped(log: RobotLog) -> tuple[WheelSamples, str] | None:
+def _reversed_or_swapped(log: RobotLog, course: Course) -> tuple[WheelSamples, str] | None:
     """Return the wheels put right, and what was wrong with them; None when nothing clearly is."""
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
-    course = measure_course(log)
     if len(course.angle) < FEWEST_WINDOWS or max(_agreement(course.angle), _agreement(course.mirrored)) < EXPLAINED:
         return _one_side_reversed(log)
     sum_way = float((left + right)[left + right > 0].sum()), -float((left + right)[left + right < 0].sum())

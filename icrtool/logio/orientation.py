@@ -40,12 +40,14 @@ def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, B
     yaw_rate_radps : (n,) of a gyro in the same message; a quaternion in another order must turn with it
     """
     with np.errstate(over="ignore"):
-        norm = np.linalg.norm(q, axis=1)
+        norm = np.sqrt(np.einsum("ij,ij->i", q, q))
     usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
     unit = np.where(usable[:, None], q, np.nan) / np.where(usable, norm, 1.0)[:, None]
     order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
     x, y, z, w = unit[:, order].T
-    vertical = _vertical(x, y, z, w)
+    upright = float(np.median(np.abs(1 - 2 * (x * x + y * y))[usable])) if usable.any() else 1.0
+    if upright >= UPRIGHT_COSINE:
+        return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), usable, note
     axes = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y + w * z)],
@@ -53,9 +55,7 @@ def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, B
             [2 * (x * z + w * y), 2 * (y * z - w * x)],
         ]
     )
-    upright = float(np.median(np.abs(vertical[2][usable]))) if usable.any() else 1.0
-    if upright >= UPRIGHT_COSINE:
-        return np.arctan2(axes[0, 1], axes[0, 0]), usable, note
+    vertical = _vertical(x, y, z, w)
     level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
     note = (
         f"mounted on its side: its {'xyz'[level]} axis is level and stands for the nose, at an angle still to be found"

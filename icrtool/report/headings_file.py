@@ -1,37 +1,33 @@
-"""``headings.parquet`` of a run: what its own sensors told of the heading, by state, apart from the filter."""
+"""``headings.npz`` of a run: what its own sensors told of the heading, by state, apart from the filter."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 
 from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.tables import Ints
 
-HEADINGS_FILE = "headings.parquet"
+HEADINGS_FILE = "headings.npz"
 
 COLUMNS = {"gyro": "gyro_turned_rad", "heading": "measured_heading_rad"}
 """By kind: the gyro's integrated turn since the first state, the attitude as the filter took it; clockwise."""
 
 
 def write_headings(headings: tuple[MeasuredHeading, ...], stamp_ns: Ints, path: Path) -> None:
-    """Write headings, a row per state.
+    """Write headings, a row per state, as arrays that `numpy.load` reads.
 
     Raises
     ------
     OSError
         The file cannot be written.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    columns = {"stamp_ns": pa.Array.from_buffers(pa.int64(), len(stamp_ns), [None, pa.py_buffer(stamp_ns)])}
-    for heading in headings:
-        angle = np.ascontiguousarray(heading.angle_rad)
-        columns[COLUMNS[heading.kind]] = pa.Array.from_buffers(pa.float64(), len(angle), [None, pa.py_buffer(angle)])
+    columns: dict[str, Any] = {COLUMNS[heading.kind]: heading.angle_rad for heading in headings}
     with path.open("xb") as file:
-        pq.write_table(pa.table(columns), file, compression="zstd", use_dictionary=False)
+        np.savez(file, stamp_ns=stamp_ns, **columns)
 
 
 def read_headings(path: Path, stamp_ns: Ints) -> tuple[MeasuredHeading, ...]:
@@ -44,14 +40,11 @@ def read_headings(path: Path, stamp_ns: Ints) -> tuple[MeasuredHeading, ...]:
     OSError
         The file cannot be read.
     """
-    import pyarrow.parquet as pq
-
-    stored = pq.read_table(path)
-    if not np.array_equal(np.array(stored.column("stamp_ns")), stamp_ns):
-        raise ValueError("its rows are not those of the states")
-    found: list[MeasuredHeading] = []
-    if COLUMNS["gyro"] in stored.column_names:
-        found.append(MeasuredHeading("gyro", np.array(stored.column(COLUMNS["gyro"]))))
-    if COLUMNS["heading"] in stored.column_names:
-        found.append(MeasuredHeading("heading", np.array(stored.column(COLUMNS["heading"]))))
-    return tuple(found)
+    try:
+        with np.load(path) as stored:
+            if not np.array_equal(stored["stamp_ns"], stamp_ns):
+                raise ValueError("its rows are not those of the states")
+            kinds: tuple[Literal["gyro", "heading"], ...] = ("gyro", "heading")
+            return tuple(MeasuredHeading(kind, stored[COLUMNS[kind]]) for kind in kinds if COLUMNS[kind] in stored)
+    except (BadZipFile, KeyError) as err:
+        raise ValueError(str(err)) from err

@@ -255,7 +255,7 @@ def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> 
     status, _, err = report_here(folder, RUN)
     assert (status, err) == (0, "")
     assert file.read_bytes() == of_log
-    (folder / RUN / "headings.parquet").write_bytes(b"something else")
+    (folder / RUN / "headings.npz").write_bytes(b"something else")
     status, _, err = report_here(folder, RUN)
     assert status == 1
-    assert "headings.parquet was edited" in err
+    assert "headings.npz was edited" in err

@@ -32,7 +32,7 @@ def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Filte
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
     plots = [f"plots/{name}.{form}" for name in figures.FIGURES for form in ("png", "svg")]
     assert names_in(tmp_path / "runs" / "barn") == sorted(
-        ["SHA256SUMS", "headings.parquet", "run.json", "states.csv", *plots]
+        ["SHA256SUMS", "headings.npz", "run.json", "states.csv", *plots]
     )
     assert {"trajectory", "icr_estimates", "icr_clusters", "gnss_difference"} == set(figures.FIGURES)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
@@ -99,7 +99,7 @@ def test_a_run_comes_back_as_it_was(written: Path, run: FilterRun) -> None:
 
 def test_states_may_be_parquet(tmp_path: Path, run: FilterRun) -> None:
     write_run(run, tmp_path / "barn", states="parquet", plots=())
-    assert names_in(tmp_path / "barn") == ["SHA256SUMS", "headings.parquet", "run.json", "states.parquet"]
+    assert names_in(tmp_path / "barn") == ["SHA256SUMS", "headings.npz", "run.json", "states.parquet"]
     assert read_run(tmp_path / "barn").table.north_m.tobytes() == run.table.north_m.tobytes()
 
 
@@ -127,7 +127,7 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Fi
     (written / "dropout").mkdir()
     (written / "dropout" / "summary.csv").write_text("of the old states")
     write_run(run, written, states="parquet", plots=())
-    assert names_in(written) == ["SHA256SUMS", "headings.parquet", "run.json", "states.parquet"]
+    assert names_in(written) == ["SHA256SUMS", "headings.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
 
