@@ -12,13 +12,16 @@ from icrtool.analysis.filter_setup import configured_process_position_mps
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.tables import States
+from icrtool.tables import Floats, RobotLog, States
 
 if TYPE_CHECKING:
     from icrtool.analysis.fit import MeasurementOutcome
 
 LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
 """What drives and turns less has shown nothing of the ICRs."""
+
+LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
+"""ICRs whose middle is off by more than this are not taken for even ones."""
 
 
 def adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
@@ -58,6 +61,36 @@ def doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
             "clocks, antenna place or fix quality do not fit the wheels"
         )
     return [f"{name}: {doubt}" for doubt in found]
+
+
+def antenna_doubt(log: RobotLog, config: Config, table: States, covariance: Floats) -> list[str]:
+    """Say that both ICRs lie to one side of a position reference whose place on the robot nobody told.
+
+    Parameters
+    ----------
+    covariance : (6, 6) of the last state
+
+    Notes
+    -----
+    The drive cannot tell an antenna off the centre line from sides that slip unequally: only the difference shows
+    (`icrtool.analysis.calibrate`). So nothing is moved.
+    """
+    if log.antenna_m is not None or config.frames.antenna_right_m != "auto" or not _turns(table):
+        return []
+    settled = slice(len(table) // 2, None)
+    middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
+    sigma = math.sqrt(max(float(covariance[3, 3] + covariance[4, 4] + 2 * covariance[3, 4]), 0.0)) / 2
+    if abs(middle) <= max(LOPSIDED_M, LOPSIDED_SIGMAS * sigma):
+        return []
+    side, other = ("right", "left") if middle > 0 else ("left", "right")
+    where = f"{abs(middle):.2f} m"
+    return [
+        (
+            f"{log.name}: both ICRs lie {where} to the {side} of the antenna (the position's sensor): it is {other} of "
+            f"the centre line, or the sides slip unequally; if it is {where} {other}, set "
+            f"frames.antenna_right_m={-middle:.2f} (and antenna_forward_m: x_icr is counted from it too)"
+        )
+    ]
 
 
 def _turns(table: States) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
-from icrtool.analysis.doubts import adaptation_notes, doubts
+from icrtool.analysis.doubts import adaptation_notes, antenna_doubt, doubts
 from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.filter_setup import WarmStart, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
@@ -176,6 +176,7 @@ def fit(
         *delays.warnings,
         *fixes.warnings,
         *doubts(log.name, table, gnss),
+        *antenna_doubt(log, config, table, _square(output.P)),
         *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
         *adaptation_notes(log.name, config, adapted),
     )

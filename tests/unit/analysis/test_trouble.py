@@ -180,8 +180,13 @@ def test_an_antenna_off_centre_moves_the_icrs_by_its_place_until_it_is_told(
         clean.gnss.north_m + forward * np.cos(psi) - right * np.sin(psi),
         clean.gnss.east_m + forward * np.sin(psi) + right * np.cos(psi),
     )
-    assert icrs(fit(spoilt, CONFIG)) - expected == pytest.approx([-right, -right, -forward], abs=0.01)
+    run = fit(spoilt, CONFIG)
+    assert icrs(run) - expected == pytest.approx([-right, -right, -forward], abs=0.01)
+    assert [one for one in run.warnings if "both ICRs lie 0.10 m to the right of the antenna" in one]
+    assert not [one for one in fit(clean, CONFIG).warnings if "both ICRs" in one]
     given = icrtool.load_config(
         robot="segway-rmp400", sets=[f"frames.antenna_forward_m={forward}", f"frames.antenna_right_m={right}"]
     )
-    assert icrs(fit(spoilt, given)) == pytest.approx(expected, abs=0.01)
+    told = fit(spoilt, given)
+    assert icrs(told) == pytest.approx(expected, abs=0.01)
+    assert not [one for one in told.warnings if "both ICRs" in one]
