@@ -38,6 +38,7 @@ def test_every_command_has_help_and_stands_in_the_documentation(command: str) ->
     result = CliRunner().invoke(icrtool, [command, "--help"])
     assert result.exit_code == 0
     assert "Usage" in result.output
+    assert "\\b" not in result.output
     pages = README + "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
     assert f"icrtool {command}" in pages
 

@@ -31,7 +31,7 @@ def command(
     source: Path, output: Path | None, x_icr: float | None, plot: Path | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    r"""Estimate antenna place, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.
+    """Estimate antenna place, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.
 
     What the drive could not show is said, never guessed. A RUN is calibrated from the log it was made from, with its
     configuration.
@@ -40,7 +40,7 @@ def command(
     Example:
       icrtool calibrate field.mcap --robot husky-a200
       icrtool calibrate icrtool-runs/field -o calibration.json
-    """
+    """  # noqa: D301 - click reads the escape
     from icrtool.report.calibration_picture import check_picture, write_picture
     from icrtool.report.calibration_table import calibration_file, format_calibration, write_calibration
 

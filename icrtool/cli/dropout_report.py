@@ -100,7 +100,7 @@ def command(
       icrtool dropout-report
       icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
-    """  # noqa: D301 - click wants the backspace character, not a backslash
+    """  # noqa: D301 - click reads the escape
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)

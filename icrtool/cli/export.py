@@ -19,7 +19,7 @@ TARGETS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json")
 @click.argument("run", metavar="[RUN]", required=False, type=click.Path(path_type=Path))
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the text is for.")
 def command(run: Path | None, target: str) -> None:
-    r"""Print a run's calibration, ready to paste into a robot's controller or filter.
+    """Print a run's calibration, ready to paste into a robot's controller or filter.
 
     RUN is a directory that `icrtool fit` wrote; without it, the newest below icrtool-runs/. The multipliers are fitted
     to predict the place after 5 to 10 m of way, the covariances measured on way held out of the fit.
@@ -28,7 +28,7 @@ def command(run: Path | None, target: str) -> None:
     Example:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for json > calibration.json
-    """
+    """  # noqa: D301 - click reads the escape
     from icrtool.analysis.calibrate_export import export_numbers
     from icrtool.report.dropout_source import newest_run, read_source
     from icrtool.report.export import format_export

@@ -257,7 +257,7 @@ def command(
     log: Path, config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
     **given: Any,
 ) -> None:  # fmt: skip
-    r"""Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
+    """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
     is pentzer-tracked unless --robot, --config or --set robot.… say otherwise. LOG.truth.csv holds the true pose (about
@@ -267,7 +267,7 @@ def command(
     Example:
       icrtool simulate -o drive.mcap --robot husky-a200 --path lawnmower --gnss waas
       icrtool fit drive.mcap --robot husky-a200
-    """
+    """  # noqa: D301 - click reads the escape
     config = simulated_robot(config_file, robot, sets)
     plan, sensors = _plan(config, given), _sensors(config, given)
     writing = _write_options(log, config, sensors, given)

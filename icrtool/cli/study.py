@@ -112,7 +112,7 @@ def command(
     name: StudyName, output: Path | None, seed: int, plots: str,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool, **given: Any,
 ) -> None:  # fmt: skip
-    r"""Simulate and filter many drives, and say how well, how soon and how surely the ICRs are learned.
+    """Simulate and filter many drives, and say how well, how soon and how surely the ICRs are learned.
 
     \b
     NAME is one of
@@ -133,7 +133,7 @@ def command(
     \b
     Example:
       icrtool study convergence --robot husky-a200 --wheels encoder --gnss waas
-    """
+    """  # noqa: D301 - click reads the escape
     from icrtool.report.study_directory import check_study_target, write_study
 
     formats = plot_formats(plots)
