@@ -6,19 +6,24 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.dropout import models_of
-from icrtool.core.open_loop import trial_ends
+from icrtool.core.open_loop import Drive, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.tables import Floats
 
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)
+CELLS = 20
+"""Cells of way a horizon is cut into, to find the range of the heading."""
+
 SPLIT_MODELS = ("icr", "no_slip")
 
 
 class TurningSplit(NamedTuple):
-    """Expected error [m] by model over the trials that turned less than `STRAIGHT_RAD` in all, or more."""
+    """Expected error [m] by model over the trials whose heading stayed within `STRAIGHT_RAD`, or did not."""
 
     straight: bool
     horizon_m: float
@@ -29,18 +34,12 @@ class TurningSplit(NamedTuple):
 def split_by_turning(run: DrivenRun, horizon_m: float = SPLIT_HORIZON_M) -> tuple[TurningSplit, ...]:
     """Judge straight and turning trials of one horizon apart (Pentzer 2014, Section 6.4, Figs. 33-34).
 
-    Turning is the heading change summed over the way, so that an S counts as turning. A part without trials is left
-    out.
+    What counts is the range of the heading over the way, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     starts = np.flatnonzero(ends[:, 0] >= 0)
-    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])
-    net = np.abs(drive.heading[ends[starts, 0]] - drive.heading[starts])
-    # The filter's heading jitters by measurement noise: summed over the way that is no turn.
-    noise = float(np.median(np.abs(np.diff(drive.heading)))) if len(turned) > 1 else 0.0
-    summed = turned[ends[starts, 0]] - turned[starts] - noise * (ends[starts, 0] - starts)
-    straight = np.maximum(net, np.maximum(summed, 0.0) / 2.0) < STRAIGHT_RAD
+    straight = heading_range(drive, horizon_m)[starts] < STRAIGHT_RAD
     errors = {
         model.name: open_loop_errors(drive, model.icrs, ends)[starts, 0]
         for model in models_of(run)
@@ -53,3 +52,18 @@ def split_by_turning(run: DrivenRun, horizon_m: float = SPLIT_HORIZON_M) -> tupl
         for kind, part in ((True, straight), (False, ~straight))
         if part.any()
     )
+
+
+def heading_range(drive: Drive, horizon_m: float) -> Floats:
+    """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of way."""
+    size = horizon_m / CELLS
+    cell = ((drive.distance - drive.distance[0]) / size).astype(np.int64)
+    first = np.flatnonzero(np.diff(cell, prepend=-1))
+    cells = np.arange(cell[-1] + CELLS + 1)
+    # In a cell without a state the heading is on its way between those around it.
+    highest, lowest = (
+        sliding_window_view(np.interp(cells, cell[first], extreme.reduceat(drive.heading, first)), CELLS + 1)
+        for extreme in (np.maximum, np.minimum)
+    )
+    heading_range: Floats = (highest.max(axis=1) - lowest.min(axis=1))[cell]
+    return heading_range
