@@ -8,7 +8,7 @@ import pytest
 from icrtool.analysis.turning import CELLS, STRAIGHT_RAD, heading_range
 from icrtool.core.open_loop import Drive
 
-HORIZON_M = 5.0
+HORIZON_M, STEP_M = 5.0, 0.6
 
 
 def drive_along(distance: np.ndarray, heading: np.ndarray) -> Drive:
@@ -19,10 +19,10 @@ def drive_along(distance: np.ndarray, heading: np.ndarray) -> Drive:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_range_is_that_of_the_way_to_a_cell(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # standstill, spins on the spot and steps longer than a cell
-    distance = np.cumsum(rng.choice([0.0, 0.01, 0.1, 0.6], size=600))
+    # standstill, spins on the spot and steps longer than a cell, in which the heading is between its neighbours
+    distance = np.cumsum(rng.choice([0.0, 0.01, 0.1, STEP_M], size=600))
     heading = np.cumsum(rng.normal(0, 0.05, 600))
-    found, cell = heading_range(drive_along(distance, heading), HORIZON_M), HORIZON_M / CELLS
+    found, cell = heading_range(drive_along(distance, heading), HORIZON_M), HORIZON_M / CELLS + STEP_M
     for k in np.flatnonzero(distance < distance[-1] - HORIZON_M - cell)[::7]:
         inner = heading[k:][distance[k:] <= distance[k] + HORIZON_M]
         outer = heading[(distance >= distance[k] - cell) & (distance <= distance[k] + HORIZON_M + cell)]
