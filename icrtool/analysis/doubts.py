@@ -9,6 +9,7 @@ import numpy as np
 
 from icrtool.analysis.adaptive_run import AdaptedRun
 from icrtool.analysis.filter_setup import configured_process_position_mps
+from icrtool.analysis.summary import separation_multiplier
 from icrtool.config import Config
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
 """What drives and turns less has shown nothing of the ICRs."""
+
+SMALLEST_MULTIPLIER = 0.9
+"""ICRs nearer to each other than this share of the track width are no robot's that slips."""
 
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not taken for even ones."""
@@ -41,14 +45,19 @@ def adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str
     return notes
 
 
-def doubts(name: str, table: States, gnss: MeasurementOutcome) -> list[str]:
-    """Return what a user should know before trusting the numbers."""
+def doubts(name: str, table: States, gnss: MeasurementOutcome, width: float | None = None) -> list[str]:
+    """Return what a user should know before trusting the numbers; `width` is that of the track [m], where known."""
     found = []
     distance, turns = float(table.distance_m[-1]), _turns(table)
     if distance < LITTLE_WAY_M and not turns:
         found.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
     elif not turns:
         found.append("the robot hardly turned: the ICRs are not observable on a straight drive")
+    elif width is not None and separation_multiplier(table, width) < SMALLEST_MULTIPLIER:
+        found.append(
+            f"the ICRs are {separation_multiplier(table, width):.2f} of the track width apart; slip makes it "
+            "more than 1: check robot.track_width_m, wheel radius and sides"
+        )
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"

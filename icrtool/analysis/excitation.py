@@ -176,7 +176,7 @@ def _sentences(
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
-    said = ", ".join(f"{WORDS[name]} ({verdicts[name]}, ± {stds[name]:.2f} m at best)" for name in lacking)
+    said = ", ".join(f"{WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {said}"
     total = right + left
     if total < TURNS_NEEDED_RAD:

@@ -175,7 +175,7 @@ def fit(
         *check.warnings,
         *delays.warnings,
         *fixes.warnings,
-        *doubts(log.name, table, gnss),
+        *doubts(log.name, table, gnss, config.robot.track_width_m),
         *antenna_doubt(log, config, table, _square(output.P)),
         *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
         *adaptation_notes(log.name, config, adapted),

@@ -134,15 +134,23 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     return [(output or RUNS) / name for name in names]
 
 
+def _beside(request: FitRequest) -> str:
+    """Say what else the options did."""
+    done = [f"started from {request.warm_start}"] if request.warm_start is not None else []
+    done += ["with the smoother's states"] if request.smooths else []
+    return f" ({', '.join(done)})" if done else ""
+
+
 def _reports(request: FitRequest) -> tuple[str, ...]:
     """Return the modules that write what is asked for."""
     return "icrtool.report.run_directory", *(("icrtool.report.figures",) if request.formats else ())
 
 
 def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
-    from icrtool.report.run_directory import check_target, read_warm_start, write_run
+    from icrtool.report.run_directory import check_target, log_of_run, read_warm_start, write_run
 
     check_target(directory)
+    before = log_of_run(directory)
     start = read_warm_start(request.warm_start) if request.warm_start is not None else None
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logio import read_log
@@ -164,12 +172,14 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
 
         smoothed = smooth(run)
     write_run(run, directory, states=request.states, plots=request.formats, smoothed=smoothed)
-    options.warn(run.warnings, quiet=request.quiet)
+    replaced = before is not None and before != run.summary["inputs"][0]["path"]
+    note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
+    options.warn((*run.warnings, *note), quiet=request.quiet)
     if not request.quiet:
         from icrtool.report.run_table import format_run
 
         click.echo(format_run(run))
-        click.echo(f"\nwritten to {directory}")
+        click.echo(f"\nwritten to {directory}{_beside(request)}")
     for stream in measured.streams:
         if request.verbose or ("chosen over" in stream.why and not request.quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

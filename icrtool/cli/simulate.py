@@ -367,9 +367,11 @@ def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str,
     from icrtool.errors import ConfigError
     from icrtool.logio.write_log import WriteOptions
 
-    if log.suffix == ".db3":
+    if log.suffix not in ("", ".mcap", ".bag"):
         raise ConfigError(
-            log, "a bare .db3 is not written", "name a directory for a ROS 2 bag, or an .mcap or .bag file"
+            log,
+            f"{log.suffix} is not written",
+            "name an .mcap or .bag file, or for a ROS 2 bag a directory, without a dot",
         )
     return WriteOptions(
         container="mcap" if log.suffix == ".mcap" else "bag" if log.suffix == ".bag" else "db3",

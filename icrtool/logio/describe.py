@@ -25,7 +25,8 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
     everything : list the topics of types that no role can use, too
     """
     size = sum(file.bytes for file in survey.inputs)
-    lines = [f"{survey.path}: {len(survey.channels)} topics, {size / 1e6:.1f} MB in {len(survey.inputs)} file(s)"]
+    topics, files = _count(len(survey.channels), "topic"), _count(len(survey.inputs), "file")
+    lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
     lines += _topics(survey, everything=everything)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
     for role, sources in (
@@ -33,7 +34,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
         ("gnss", survey.candidates.gnss),
         ("heading", survey.candidates.heading),
     ):
-        lines.append(f"\n{role}:")
+        lines.append(f"\n{role} (* chosen):")
         lines += _candidates(sources, chosen[role].topic if role in chosen else None)
         if role in chosen:
             stream = chosen[role]
@@ -64,13 +65,15 @@ def _topics(survey: Survey, *, everything: bool) -> list[str]:
         text = f"  {topic:<{width}}  {channel.message_type}"
         if table is not None:
             rate, _ = rate_and_jitter(table.log_time_ns)
-            text += f"  {len(table)} messages, {rate:.4g} Hz{_gaps(table.log_time_ns)}"
+            text += (
+                f"  {_count(len(table), 'message')}{f', {rate:.4g} Hz' if rate > 0 else ''}{_gaps(table.log_time_ns)}"
+            )
             if table.unreadable:
                 text += f", {table.unreadable} unreadable"
         elif topic in survey.candidates.unread:
             text += f"  not read: {survey.candidates.unread[topic]}"
         elif channel.count is not None:
-            text += f"  {channel.count} messages, no role"
+            text += f"  {_count(channel.count, 'message')}, no role"
         else:
             text += "  no role"
         lines.append(text)
@@ -87,7 +90,11 @@ def _gaps(stamps: Ints) -> str:
     long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
     if not long.any():
         return ""
-    return f", {int(np.count_nonzero(long))} gaps up to {float(interval.max()):.1f} s"
+    return f", {_count(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource], chosen: str | None) -> list[str]:
@@ -96,7 +103,10 @@ def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource],
     lines = []
     for source in sources:
         mark = "*" if source.topic == chosen else "-"
-        clock = source.stamps.note or f"header stamps, {source.stamps.delay_ns / 1e6:.1f} ms before log time"
+        clock = (
+            source.stamps.note
+            or f"header stamps, {round(source.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
+        )
         refused = "used all the same, as configured" if source.topic == chosen else "cannot be used"
         verdict = f"{refused}: {source.problem}" if source.problem else source.why
         lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")

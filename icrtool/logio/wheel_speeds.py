@@ -182,7 +182,7 @@ def _metres_per_unit(
         needed = "robot.encoder_counts_per_rev" if unit == "counts" and radius is not None else "robot.wheel_radius_m"
         raise ConfigError(
             needed,
-            f"needed to read {motion.topic} in {unit}",
-            "give it, or --robot NAME; the log has no straight driving to find it from",
+            f"needed to read {motion.topic}, which is {'of unknown unit' if unit == 'unknown' else f'in {unit}'}",
+            f"give it with --set {needed}=…; the log has no straight driving to find the scale from",
         )
     return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"

@@ -61,7 +61,9 @@ def title_of(run: DrivenRun) -> str:
 
 
 def shown_horizons(report: DropoutReport) -> list[int]:
-    """Return the places of the horizons nearest to 1, 5, 10 and 20 m, each once."""
+    """Return the places of the horizons nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
+    if len(report.horizons_m) <= len(SHOWN_HORIZONS_M):
+        return list(range(len(report.horizons_m)))
     nearest = (int(np.argmin(np.abs(report.horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
     return sorted(set(nearest))
 

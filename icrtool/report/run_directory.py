@@ -210,6 +210,14 @@ def read_warm_start(directory: Path) -> WarmStart:
     return WarmStart(icrs, covariance)
 
 
+def log_of_run(directory: Path) -> str | None:
+    """Return the path of the log that the run in a directory was made from; None where there is none that tells."""
+    try:
+        return str(json.loads((directory / RUN_FILE).read_bytes())["inputs"][0]["path"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
 def is_run_directory(directory: Path) -> bool:
     """Say whether a directory is a run of ours, of whatever version."""
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from icrtool.analysis.filter_setup import configured_process_position_mps
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
@@ -19,6 +20,9 @@ WORTH_TELLING_S = 0.05
 """A delay below this is not worth a line."""
 
 ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+
+SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
+"""What is said of an ICR by the verdict of `judge_excitation`."""
 
 Row = tuple[str, ...]
 
@@ -88,8 +92,8 @@ def _drive_lines(run: FilterRun) -> list[str]:
 
 
 def _icr_lines(run: FilterRun) -> list[str]:
-    icr = run.summary["icr"]
-    rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise")]
+    icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
+    rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise", "")]
     for column in ICR_COLUMNS:
         rise = icr["convergence_s"][column]
         rows.append(
@@ -98,9 +102,10 @@ def _icr_lines(run: FilterRun) -> list[str]:
                 f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}",
                 f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}",
                 f"{rise:.1f} s" if rise is not None else "hardly moved",
+                SHOWN_WORDS.get(verdicts[column], ""),
             )
         )
-    return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]}" for row in rows]
+    return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]:<24}{row[4]}" for row in rows]
 
 
 def _multiplier_lines(run: FilterRun) -> list[str]:
@@ -108,7 +113,10 @@ def _multiplier_lines(run: FilterRun) -> list[str]:
     if width is None:
         return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
     multiplier = separation_multiplier(run.table, width)
-    return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m")]
+    verdicts = run.summary["excitation"]["verdict"]
+    shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
+    doubt = "" if shown else ": not shown well enough to be used"
+    return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m{doubt}")]
 
 
 def _terrain_lines(run: FilterRun) -> list[str]:
@@ -123,7 +131,7 @@ def _terrain_lines(run: FilterRun) -> list[str]:
         if math.isfinite(terrain.threshold):
             said = (
                 f"{found} {'change' if found == 1 else 'changes'} of the ICRs found in {driven} of driving; "
-                f"false alarms: {FALSE_ALARMS_PER_HOUR:g} an hour"
+                f"by chance: {FALSE_ALARMS_PER_HOUR:g} an hour at most"
             )
         else:
             said = "too few turns, or too rough a position, to look for changes of the ICRs"
@@ -151,7 +159,9 @@ def _position_lines(run: FilterRun) -> list[str]:
     lines = []
     if gnss["mean_difference_m"] is not None:
         mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
-        lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}"))
+        raised = run.process_position_mps != configured_process_position_mps(run.config)
+        why = "; follows them closely, for its position noise was raised" if raised else ""
+        lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}{why}"))
     reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
     why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
     lines.append(
@@ -162,7 +172,8 @@ def _position_lines(run: FilterRun) -> list[str]:
     )
     lines += _class_lines(gnss["classes"], gnss["jumps"])
     if gnss["recoveries"]:
-        lines.append(_line("", f"believed again after rejection: {gnss['recoveries']:,} times"))
+        times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
+        lines.append(_line("", f"believed again after rejection: {times}"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
         lost = len(run.summary["rtk_losses_ns"])
