@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.dropout import STANDING_MPS
 from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter
@@ -51,7 +52,7 @@ class Outage:
 
 
 def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
-    """Place outages of one length: at given seconds, or spaced evenly after the ICRs have converged.
+    """Place outages of one length: at given seconds, or spaced over the time in which the robot moves.
 
     Returns
     -------
@@ -161,12 +162,18 @@ def real_outages(run: DrivenRun) -> tuple[Outage, ...]:
 
 
 def _spaced(run: FilterRun, length_s: float) -> list[float]:
-    """Return the begins [s] of as many outages as leave half of the drive to learn, evenly after convergence."""
-    last = float(run.table.t_s[-1])
+    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn."""
+    t, last = run.table.t_s, float(run.table.t_s[-1])
+    moves = np.diff(run.table.distance_m) >= STANDING_MPS * np.diff(t)
+    moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
     settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
-    settled = min(settled, last / 4)
-    count = min(MOST_SPACED, int((last - settled) * LONGEST_SHARE / length_s))
+    before = float(np.interp(min(settled, last / 4), t, moved))
+    rest = float(moved[-1]) - before
+    count = min(MOST_SPACED, int(rest * LONGEST_SHARE / length_s))
     if count < 1:
-        raise ConfigError("outage", f"{length_s:g} s is too long for a drive of {last:.1f} s", "choose a shorter one")
-    free = (last - settled - count * length_s) / (count + 1)
-    return [settled + free + i * (length_s + free) for i in range(count)]
+        text = f"{length_s:g} s is too long for a drive of {last:.1f} s, {moved[-1]:.1f} s of it moving"
+        raise ConfigError("outage", text, "choose a shorter one")
+    free = (rest - count * length_s) / (count + 1)
+    begins = before + free + np.arange(count) * (length_s + free)
+    # Where the robot stood for a while, the outage begins when it goes on.
+    return [float(t[place - 1]) for place in np.searchsorted(moved, begins, side="right")]

@@ -37,7 +37,18 @@ def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: FilterRun) -> No
         assert all(end - begin == pytest.approx(length) for begin, end in spans)
         pauses = [later[0] - earlier[1] for earlier, later in pairwise(spans)]
         assert all(pause > 0 for pause in pauses)
-        assert pauses == pytest.approx(pauses[:1] * len(pauses))
+        assert pauses == pytest.approx(pauses[:1] * len(pauses), abs=0.03)
+
+
+def test_no_spaced_outage_begins_where_the_robot_stands(clean: FilterRun) -> None:
+    t, way = clean.table.t_s, clean.table.distance_m
+    stood = np.interp(np.where(t < 20, t, np.maximum(t - 20, 20)), t, way)
+    parked = replace(clean, table=replace(clean.table, distance_m=stood))
+    spans = seconds(parked, plan_outages(parked, 2.0))
+    assert len(spans) > 3
+    for begin, end in spans:
+        assert not 20 < begin < 39.9
+        assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.1
 
 
 def test_outages_stand_where_they_are_asked_for(clean: FilterRun) -> None:
