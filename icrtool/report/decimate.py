@@ -18,13 +18,13 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
 
     Parameters
     ----------
-    columns : float64 (n,) each; NaN is passed over
+    columns : float64 (n,) each; NaN breaks the line
     points : about how many rows to choose
 
     Returns
     -------
     int64 (m,), increasing: first and last row, and in each of equally many rows those of the least and the greatest
-    value of each column. All rows where there are no more than `points`.
+    value of each column; and the first row of every break. All rows where there are no more than `points`.
     """
     rows = len(columns[0])
     if rows <= points:
@@ -35,6 +35,7 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
     chosen = [np.array([0, rows - 1])]
     for column in columns:
         missing = np.isnan(column)
+        chosen.append(np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]])))
         for sign in (1.0, -1.0):
             padded = np.full(len(begin) * width, np.inf)
             np.multiply(column, sign, out=padded[:rows])

@@ -36,6 +36,13 @@ def test_missing_values_hide_no_extreme() -> None:
     assert np.nanmin(shown) == np.nanmin(column)
 
 
+def test_a_break_in_the_line_stays_a_break() -> None:
+    column = np.linspace(0.0, 1.0, 10_000)
+    column[[4321, 7000, 7001]] = np.nan
+    shown = column[extremes(column, points=200)]
+    assert np.count_nonzero(np.isnan(shown)) == 2
+
+
 def test_short_columns_are_left_whole() -> None:
     assert extremes(np.array([3.0, 1.0, 2.0])).tolist() == [0, 1, 2]
 
