@@ -10,6 +10,7 @@ import numpy as np
 
 from icrtool.analysis.calibrate import NAMES, PRIOR_STD, Estimate, WindowMisses, estimate
 from icrtool.analysis.calibrate_evidence import DriveFacts
+from icrtool.analysis.usable_streams import check_streams
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.tables import Floats, RobotLog
@@ -158,9 +159,10 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
     Raises
     ------
     DataError
-        Too little way, or a stream is missing.
+        Too little way, or streams that cannot be used together.
     """
     config = config if config is not None else Config()
+    check_streams(log)
     checked = check_wheels(log, config)
     found = estimate(checked.log, config)
     found = replace(found, values=found.values * np.where(np.isin(NAMES, SCALES), checked.applied_scale, 1.0))

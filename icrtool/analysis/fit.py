@@ -25,6 +25,7 @@ from icrtool.analysis.summary import (
     used_and_rejected,
 )
 from icrtool.analysis.terrain import TerrainTest, find_terrain_changes, given_changes
+from icrtool.analysis.usable_streams import check_streams
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import UNSEEN, Codes, FilterOutput
@@ -146,7 +147,7 @@ def fit(
     Raises
     ------
     DataError
-        Streams that cannot be used together.
+        Streams that cannot be used together, or hold values that are not finite numbers.
 
     Notes
     -----
@@ -154,6 +155,7 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
+    check_streams(log)
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
