@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from icrtool.analysis.ladder import Ladder, Rung
+from icrtool.analysis.ladder_fits import FEWEST_TO_CHOOSE
+from icrtool.analysis.window_fit import CONSTANT
 
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 TERM_KEYS = (
@@ -43,12 +45,15 @@ def format_ladder(ladder: Ladder) -> str:
 
 
 def extended_line(ladder: Ladder) -> str:
-    """Say which extended models were chosen."""
+    """Say which extended models were chosen for the blocks, and which one for the whole drive."""
     names = {name: fit.model.label for name, fit in ladder.fits.items()}
+    whole = f"for all of the way: {names[ladder.best]}"
+    if ladder.blocks < FEWEST_TO_CHOOSE:
+        return f"extended: not chosen, {ladder.blocks} blocks are too few, it is the window fit; {whole}"
+    if set(ladder.chosen) == {CONSTANT.name}:
+        return f"extended: none pays without the block judged, it is the window fit; {whole}"
     used = dict.fromkeys(names[name] for name in ladder.chosen)
-    if ladder.chosen and set(ladder.chosen) == {"window"}:
-        return "extended: none pays on this drive, it is the window fit"
-    return f"extended, chosen without the block judged: {', '.join(used)}; for all of the way: {names[ladder.best]}"
+    return f"extended, chosen without the block judged: {', '.join(used)}; {whole}"
 
 
 def ladder_rows(ladder: Ladder) -> Iterator[Sequence[str | int | float]]:
