@@ -74,7 +74,7 @@ class Ladder:
     best : the model cross-validation prefers for the whole log
     held_out : by model name, the parameters (blocks, 8) fitted without each block
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
-    notes : what was left out of the table and why
+    notes : what was left out of the table and why, and what was put right
     """
 
     horizons_m: tuple[float, ...]
@@ -198,6 +198,8 @@ def _usable_heading(
             return heading, tuple(notes)
         found = calibrate_gyro(heading.angle_rad, trials.drive, trials.t, windows, clear)
         if found is not None:
+            if found[0, 0] < 0.0:
+                notes.append("the gyro counts turns the other way: its sign was turned")
             scale, bias = found[trials.block].T
             # turns within a block are all that counts: the angle may jump where blocks meet
             return MeasuredHeading("gyro", scale * heading.angle_rad + bias * trials.t), tuple(notes)

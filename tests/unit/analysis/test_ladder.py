@@ -110,6 +110,16 @@ def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run
     assert "does not turn with the robot" in other.notes[0]
 
 
+def test_a_gyro_of_the_other_sign_is_turned_and_said(run: FilterRun) -> None:
+    told = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
+    usual, turned = (judge_ladder(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
+    assert usual.notes == ()
+    assert turned.notes == ("the gyro counts turns the other way: its sign was turned",)
+    for one, other in zip(usual.rungs, turned.rungs, strict=True):
+        assert one.name == other.name
+        assert np.allclose(one.summary.p95, other.summary.p95, atol=ROUNDING_M, equal_nan=True)
+
+
 def test_no_window_of_a_fit_touches_the_block_held_out(run: FilterRun) -> None:
     windows, edges = cut_windows(run), edges_of(run)
     borders = np.concatenate([[0.0], edges, [np.inf]])
