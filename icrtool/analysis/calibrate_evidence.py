@@ -10,9 +10,8 @@ import numpy as np
 from icrtool.analysis.filter_setup import wheel_gap_s
 from icrtool.analysis.heading_check import check_heading
 from icrtool.config import Config
-from icrtool.core.window_fit import Complexes
 from icrtool.errors import DataError
-from icrtool.tables import Floats, Ints, RobotLog
+from icrtool.tables import Complexes, Floats, Ints, RobotLog
 
 SHORT_WINDOW_M = 1.0
 SHORT_WINDOW_IN_GNSS_STD = 12.0

@@ -38,7 +38,7 @@ LABELS = {
     "no_slip": "no slip", "multiplier": "best multiplier", "icr": "ICR, momentary", "icr_final": "ICR, final",
     "window": "window fit", "extended": "extended",
 }  # fmt: skip
-FITTED = {
+FITTED_TO = {
     "no_slip": "never", "multiplier": "others", "icr": "before", "icr_final": "all", "window": "others",
     "extended": "others",
 }  # fmt: skip
@@ -166,7 +166,7 @@ def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> 
         errors = open_loop_errors(trials.drive, icrs, trials.ends)
     else:
         return None
-    return Rung(name, LABELS[name], FITTED[name], False, summarise(errors))
+    return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors))
 
 
 def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
@@ -185,7 +185,7 @@ def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: Measu
             place, icrs = plain, _icrs_of(run, name)
         if icrs is not None:
             summary = summarise(along.errors(place, icrs))
-            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED[name], True, summary)
+            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED_TO[name], True, summary)
 
 
 def _usable_heading(

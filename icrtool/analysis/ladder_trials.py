@@ -14,8 +14,7 @@ from icrtool.analysis.window_fit import Windows, coarse_rows
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.window_fit import Complexes
-from icrtool.tables import Floats, Ints
+from icrtool.tables import Complexes, Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
 """Gyros are scaled this well; how much a drive adds is weighed against it."""

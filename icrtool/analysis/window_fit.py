@@ -16,9 +16,9 @@ import numpy as np
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
 from icrtool.core.open_loop import trial_ends
-from icrtool.core.window_fit import NEUTRAL, Complexes, move, window_misses
+from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import DataError
-from icrtool.tables import Bools, Floats, Ints
+from icrtool.tables import Bools, Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows. One length alone lets a circle of just that circumference say nothing."""

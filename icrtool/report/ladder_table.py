@@ -12,13 +12,12 @@ import numpy as np
 from icrtool.analysis.ladder import Ladder, Rung
 from icrtool.analysis.ladder_fits import FEWEST_TO_CHOOSE
 from icrtool.analysis.window_fit import CONSTANT
+from icrtool.report.words import FITTED, TABLE_WIDTH
 
-FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 TERM_KEYS = (
     "y_icr_right_m", "y_icr_left_m", "x_icr_m", "left_scale", "right_scale", "bend", "speed_spm", "wheels_read_later_s"
 )  # fmt: skip
 
-WIDTH = 100
 
 LADDER_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -39,7 +38,7 @@ def format_ladder(ladder: Ladder) -> str:
             for p95, expected in zip(rung.summary.p95, rung.summary.expected, strict=True)
         )
         lines.append(f"{rung.label:<26}{FITTED[rung.fitted]:<16}{cells}")
-    lines += wrap(extended_line(ladder), WIDTH, subsequent_indent="  ")
+    lines += wrap(extended_line(ladder), TABLE_WIDTH, subsequent_indent="  ")
     lines += ladder.notes
     return "\n".join(line.rstrip() for line in lines)
 
