@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.window_fit import CONSTANT, EXTENDED, MULTIPLIER, WindowFit, WindowModel, Windows, thin_windows
+from icrtool.analysis.window_fit import WindowFit, Windows, thin_windows
+from icrtool.analysis.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.analysis.window_solve import Solution, drop_windows, fit_of, solve_windows
 from icrtool.tables import Bools, Floats
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.analysis.ladder import Ladder, Rung
 from icrtool.analysis.ladder_fits import FEWEST_TO_CHOOSE
-from icrtool.analysis.window_fit import CONSTANT
+from icrtool.analysis.window_models import CONSTANT
 from icrtool.report.words import FITTED, TABLE_WIDTH
 
 TERM_KEYS = (
