@@ -33,8 +33,7 @@ from icrtool.analysis.calibrate_evidence import (
 )
 from icrtool.analysis.filter_setup import half_width_m
 from icrtool.config import Config
-from icrtool.core.window_fit import Complexes
-from icrtool.tables import Floats, RobotLog
+from icrtool.tables import Complexes, Floats, RobotLog
 
 HUBER_SIGMAS = 2.0
 ITERATIONS = 30

@@ -12,14 +12,8 @@ from icrtool.analysis.driven_run import DrivenRun
 from icrtool.analysis.excitation import judge_excitation
 from icrtool.analysis.ladder import count_blocks
 from icrtool.analysis.ladder_fits import clear_of
-from icrtool.analysis.window_fit import (
-    EXTENDED,
-    WindowFit,
-    WindowModel,
-    Windows,
-    cut_windows,
-    fit_windows,
-)
+from icrtool.analysis.window_fit import WindowFit, Windows, cut_windows, fit_windows
+from icrtool.analysis.window_models import EXTENDED, WindowModel
 from icrtool.core.window_fit import displace, move
 from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Floats

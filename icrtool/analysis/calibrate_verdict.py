@@ -10,6 +10,7 @@ import numpy as np
 
 from icrtool.analysis.calibrate import NAMES, PRIOR_STD, Estimate, WindowMisses, estimate
 from icrtool.analysis.calibrate_evidence import DriveFacts
+from icrtool.analysis.usable_streams import check_streams
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.tables import Floats, RobotLog
@@ -158,9 +159,10 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
     Raises
     ------
     DataError
-        Too little way, or a stream is missing.
+        Too little way, or streams that cannot be used together.
     """
     config = config if config is not None else Config()
+    check_streams(log)
     checked = check_wheels(log, config)
     found = estimate(checked.log, config)
     found = replace(found, values=found.values * np.where(np.isin(NAMES, SCALES), checked.applied_scale, 1.0))
@@ -283,10 +285,8 @@ def _settings(findings: tuple[Finding, ...], config: Config) -> tuple[Setting, .
             settings.append(Setting(key, round(times * finding.value, 4), why or finding.note))
 
     add("frames.heading_offset_deg", by_key["heading_offset_deg"], neutral=0.0, least=0.3)
-    add(
-        "frames.reference_delay_s", by_key["gnss_delay_s"], neutral=0.0, least=RESPONSE_S,
-        why="position late against the wheels",
-    )  # fmt: skip
+    for key, stream in (("frames.reference_delay_s", "gnss_delay"), ("frames.heading_delay_s", "heading_delay")):
+        add(key, by_key[KEYS[stream]], neutral=0.0, least=RESPONSE_S, why=LABELS[stream])
     add("frames.antenna_forward_m", by_key["antenna_forward_m"], neutral=0.0, least=0.02)
     add("frames.antenna_right_m", by_key["antenna_right_m"], neutral=0.0, least=0.02)
     for side in ("left", "right"):

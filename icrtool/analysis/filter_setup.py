@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.usable_streams import check_streams
 from icrtool.config import Config, FilterConfig
 from icrtool.core.ekf import FilterParameters, Measurements
 from icrtool.errors import DataError
@@ -115,9 +116,9 @@ def set_up_filter(
     Raises
     ------
     DataError
-        Streams that do not overlap, or hold fewer than two usable samples.
+        Streams that cannot be used together (`check_streams`), or outages that leave nothing of them.
     """
-    _check_streams(log)
+    check_streams(log)
     epoch = int(log.wheels.stamp_ns[0])
     gnss_index, heading_index = _kept(log.gnss.stamp_ns, outages_ns), _kept(log.heading.stamp_ns, outages_ns)
     paper = config.filter.preset == "paper"
@@ -154,18 +155,6 @@ def chi2_gate(probability: float, degrees: int) -> float:
     if degrees == 2:
         return -2.0 * math.log(1.0 - probability)
     return NormalDist().inv_cdf((1.0 + probability) / 2.0) ** 2
-
-
-def _check_streams(log: RobotLog) -> None:
-    needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
-    for what, stamps in needed.items():
-        if len(stamps) < 2:
-            raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
-    begin = max(int(stamps[0]) for stamps in needed.values())
-    end = min(int(stamps[-1]) for stamps in needed.values())
-    if begin >= end:
-        spans = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in needed.items())
-        raise DataError(log.name, "wheels, position and heading do not overlap in time", spans)
 
 
 def _seconds(stamps_ns: Ints, epoch_ns: int) -> Floats:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from icrtool import __version__
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
 from icrtool.analysis.doubts import adaptation_notes, antenna_doubt, doubts
 from icrtool.analysis.excitation import judge_excitation
@@ -15,16 +14,9 @@ from icrtool.analysis.filter_setup import WarmStart, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.stream_delays import measure_delays
-from icrtool.analysis.summary import (
-    converge,
-    drive_summary,
-    gnss_summary,
-    icr_summary,
-    nis_summary,
-    segment_summary,
-    used_and_rejected,
-)
+from icrtool.analysis.summary import converge, run_summary
 from icrtool.analysis.terrain import TerrainTest, find_terrain_changes, given_changes
+from icrtool.analysis.usable_streams import check_streams
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
 from icrtool.core.ekf import UNSEEN, Codes, FilterOutput
@@ -32,8 +24,6 @@ from icrtool.tables import Bools, Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
     import pandas as pd
-
-RUN_SCHEMA = "icrtool/run/1"
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", "y_icr_right_m", "y_icr_left_m", "x_icr_m")
 """The state's entries, in the kernel's order."""
@@ -146,7 +136,7 @@ def fit(
     Raises
     ------
     DataError
-        Streams that cannot be used together.
+        Streams that cannot be used together, or hold values that are not finite numbers.
 
     Notes
     -----
@@ -154,84 +144,37 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
+    check_streams(log)
     wheels = check_wheels(log, config)
     log = wheels.log
     check = check_heading(log, config)
     delays = measure_delays(log, config, check)
     fixes = judge_fixes(delays.log, config, check)
-    terrain = given_changes(changes_s)
-    done = _run(fixes, config, check, warm_start, terrain)
+    done = _run(fixes, config, check, warm_start, given_changes(changes_s))
     if find_changes:
-        terrain = _find_changes(done, terrain)
-        if len(terrain.changes) > len(done.terrain.changes):
-            done = _run(fixes, config, check, warm_start, terrain)
-    adapted, table, gnss, heading, in_gap, outages, _ = done
-    log, output, position_noise = adapted.log, adapted.output, adapted.process_position_mps
+        terrain = _find_changes(done)
+        again = len(terrain.changes) > len(done.terrain.changes)
+        done = _run(fixes, config, check, warm_start, terrain) if again else done._replace(terrain=terrain)
+    adapted, table, gnss, heading, in_gap, outages, terrain = done
+    log, covariance = adapted.log, _square(adapted.output.P)
     terrain, beyond = terrain.within(float(table.t_s[-1]))
     convergence = converge(table, min(terrain.times_s, default=None))
     warnings = (
-        *log.warnings,
-        *wheels.warnings,
-        *check.warnings,
-        *delays.warnings,
-        *fixes.warnings,
+        *(warning for part in (log, wheels, check, delays, fixes) for warning in part.warnings),
         *doubts(log.name, table, gnss, config.robot.track_width_m),
-        *antenna_doubt(log, config, table, _square(output.P)),
+        *antenna_doubt(log, config, table, covariance),
         *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
         *adaptation_notes(log.name, config, adapted),
     )
-    summary = {
-        "schema": RUN_SCHEMA,
-        "tool_version": __version__,
-        "log": log.name,
-        "inputs": [asdict(file) for file in log.inputs],
-        "config": config.effective(),
-        "streams": [asdict(stream) for stream in log.streams],
-        "warnings": list(warnings),
-        "drive": drive_summary(table),
-        "icr": icr_summary(table, convergence) | {"final_covariance_m2": _square(output.P)[3:, 3:].tolist()},
-        "terrain": terrain.summary(),
-        "segments": segment_summary(table, terrain.times_s),
-        "gnss": gnss_summary(log, gnss, fixes.down_weighted)
-        | delays.gnss_summary()
-        | fixes.summary(*used_and_rejected(gnss)),
-        "heading": check.summary() | delays.heading_summary(),
-        "wheels": wheels.summary(),
-        "outages_ns": outages.tolist(),
-        "rtk_losses_ns": fixes.losses_ns.tolist(),
-        "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(in_gap)],
-        "filter": {
-            "preset": config.filter.preset,
-            "process_position_mps": position_noise,
-            "reference_delay_s": delays.applied_gnss_s + adapted.reference_delay_s,
-            "states": len(table),
-            "warm_start": _began_with(warm_start),
-            **nis_summary(gnss, heading),
-        },
-    }
     run = FilterRun(
-        log=log,
-        config=config,
-        table=table,
-        in_gap=in_gap,
-        outages_ns=outages,
-        gnss=gnss,
-        heading=heading,
-        heading_check=check,
-        fix_quality=fixes,
-        covariance=_square(output.P),
-        warm_start=warm_start,
-        terrain=terrain,
-        process_position_mps=position_noise,
-        convergence=convergence,
-        warnings=warnings,
-        summary=summary,
-    )
+        log=log, config=config, table=table, in_gap=in_gap, outages_ns=outages, gnss=gnss, heading=heading,
+        heading_check=check, fix_quality=fixes, covariance=covariance, warm_start=warm_start, terrain=terrain,
+        process_position_mps=adapted.process_position_mps, convergence=convergence, warnings=warnings, summary={},
+    )  # fmt: skip
     excitation = judge_excitation(run)
-    told = tuple(f"{log.name}: {sentence}" for sentence in excitation.sentences)
-    summary["excitation"] = excitation.summary()
-    summary["warnings"] = [*warnings, *told]
-    return replace(run, warnings=(*warnings, *told))
+    run = replace(run, warnings=(*warnings, *(f"{log.name}: {sentence}" for sentence in excitation.sentences)))
+    delay_s = delays.applied_gnss_s + adapted.reference_delay_s
+    return replace(run, summary=run_summary(run, wheels, delays, excitation, reference_delay_s=delay_s))
 
 
 class _Done(NamedTuple):
@@ -263,10 +206,10 @@ def _run(
     return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
 
 
-def _find_changes(done: _Done, terrain: TerrainTest) -> TerrainTest:
+def _find_changes(done: _Done) -> TerrainTest:
     seen = done.heading.code > UNSEEN
     innovations = done.heading.t_s[seen], done.heading.difference[seen]
-    return find_terrain_changes(done.table, done.in_gap, done.outages_ns, innovations, terrain.times_s)
+    return find_terrain_changes(done.table, done.in_gap, done.outages_ns, innovations, done.terrain.times_s)
 
 
 def _states(log: RobotLog, output: FilterOutput) -> States:
@@ -316,12 +259,6 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     if table.stamp_ns[-1] - used[-1] > longest:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)
-
-
-def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
-    if warm_start is None:
-        return None
-    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
 
 
 def _square(upper: Floats) -> Floats:

@@ -38,7 +38,7 @@ LABELS = {
     "no_slip": "no slip", "multiplier": "best multiplier", "icr": "ICR, momentary", "icr_final": "ICR, final",
     "window": "window fit", "extended": "extended",
 }  # fmt: skip
-FITTED = {
+FITTED_TO = {
     "no_slip": "never", "multiplier": "others", "icr": "before", "icr_final": "all", "window": "others",
     "extended": "others",
 }  # fmt: skip
@@ -74,7 +74,7 @@ class Ladder:
     best : the model cross-validation prefers for the whole log
     held_out : by model name, the parameters (blocks, 8) fitted without each block
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
-    notes : what was left out of the table and why
+    notes : what was left out of the table and why, and what was put right
     """
 
     horizons_m: tuple[float, ...]
@@ -166,7 +166,7 @@ def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> 
         errors = open_loop_errors(trials.drive, icrs, trials.ends)
     else:
         return None
-    return Rung(name, LABELS[name], FITTED[name], False, summarise(errors))
+    return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors))
 
 
 def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
@@ -185,7 +185,7 @@ def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: Measu
             place, icrs = plain, _icrs_of(run, name)
         if icrs is not None:
             summary = summarise(along.errors(place, icrs))
-            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED[name], True, summary)
+            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED_TO[name], True, summary)
 
 
 def _usable_heading(
@@ -198,6 +198,8 @@ def _usable_heading(
             return heading, tuple(notes)
         found = calibrate_gyro(heading.angle_rad, trials.drive, trials.t, windows, clear)
         if found is not None:
+            if found[0, 0] < 0.0:
+                notes.append("the gyro counts turns the other way: its sign was turned")
             scale, bias = found[trials.block].T
             # turns within a block are all that counts: the angle may jump where blocks meet
             return MeasuredHeading("gyro", scale * heading.angle_rad + bias * trials.t), tuple(notes)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.window_fit import CONSTANT, EXTENDED, MULTIPLIER, WindowFit, WindowModel, Windows, thin_windows
+from icrtool.analysis.window_fit import WindowFit, Windows, thin_windows
+from icrtool.analysis.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.analysis.window_solve import Solution, drop_windows, fit_of, solve_windows
 from icrtool.tables import Bools, Floats
 
@@ -18,6 +19,9 @@ FITS_AT_ONCE = 2
 
 WORTHWHILE = 0.95
 """An extended model is chosen only where it brings the expected error below this part of the plain window fit's."""
+
+FEWEST_TO_CHOOSE = 3
+"""With fewer blocks, what is left beside the one judged cannot be cut once more to choose a model."""
 
 CHOICES: tuple[WindowModel, ...] = (CONSTANT, *EXTENDED)
 
@@ -59,7 +63,7 @@ def fit_blocks(windows: Windows, edges_m: Floats) -> BlockFits:
     with ThreadPoolExecutor(FITS_AT_ONCE) as pool:
         jobs = [pool.submit(_fit_all, thin, kept) for kept in (everything, *clear)]
         whole, *solved = (job.result() for job in jobs)
-        chosen = tuple(pool.map(lambda block: _choose(solved[block], clear, inside, block, blocks > 2), range(blocks)))
+        chosen = tuple(pool.map(lambda block: _choose(solved[block], clear, inside, block), range(blocks)))
     held_out = {name: np.array([fits[name].parameters for fits in solved]) for name in whole}
     held_out["extended"] = np.array([fits[name].parameters for fits, name in zip(solved, chosen, strict=True)])
     scores = {
@@ -97,11 +101,9 @@ def _fit_all(windows: Windows, kept: Bools) -> dict[str, Solution]:
     return fits
 
 
-def _choose(
-    fits: dict[str, Solution], clear: Sequence[Bools], inside: Sequence[Bools], block: int, possible: bool
-) -> str:
-    """Choose the model of a block by its fits without it; the plain one where there are only two blocks."""
-    if not possible:
+def _choose(fits: dict[str, Solution], clear: Sequence[Bools], inside: Sequence[Bools], block: int) -> str:
+    """Choose the model of a block by its fits without it; the plain one where there are too few blocks."""
+    if len(clear) < FEWEST_TO_CHOOSE:
         return CONSTANT.name
     others = [other for other in range(len(clear)) if other != block]
     scores = {}

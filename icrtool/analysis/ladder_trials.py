@@ -14,14 +14,13 @@ from icrtool.analysis.window_fit import Windows, coarse_rows
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.window_fit import Complexes
-from icrtool.tables import Floats, Ints
+from icrtool.tables import Complexes, Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
 """Gyros are scaled this well; how much a drive adds is weighed against it."""
 
 TURNS_WITH_ROBOT = 0.1
-"""A gyro whose scale is further than this from one does not measure the robot's yaw."""
+"""A gyro whose scale, but for its sign, is further than this from one does not measure the robot's yaw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,26 +152,30 @@ def calibrate_gyro(
 
     Parameters
     ----------
-    gyro : (n,) integrated turn rate [rad], clockwise
+    gyro : (n,) integrated turn rate [rad]
     windows : of `cut_windows`
     kept : by block, the windows clear of it, (w,) each
 
     Returns
     -------
-    (blocks, 2) scale and bias [rad/s]; None where it does not turn with the robot.
+    (blocks, 2) scale and bias [rad/s], a scale near -1 where its turns count the other way; None where it does not
+    turn with the robot.
     """
     rows = np.searchsorted(t, windows.knot_t)
     start, end = rows[windows.start], rows[windows.end]
     turned, told, took = drive.heading[end] - drive.heading[start], gyro[end] - gyro[start], t[end] - t[start]
+    if not np.isfinite(told).all():
+        return None
     found = np.empty((len(kept), 2))
     for block, clear in enumerate(kept):
         columns, target = np.column_stack([told, took])[clear], turned[clear]
-        if not np.isfinite(columns).all():
-            return None
-        noise = np.median(np.abs(target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0])) + 1e-6
+        plain = np.linalg.lstsq(columns, target, rcond=None)[0]
+        noise = np.median(np.abs(target - columns @ plain)) + 1e-6
         pull = np.array([noise / GYRO_SCALE_PRIOR, 0.0]) * np.sqrt(len(columns) / len(kept))
-        found[block] = np.linalg.lstsq(np.vstack([columns, pull]), np.append(target, pull[0]), rcond=None)[0]
-    return found if np.all(np.abs(found[:, 0] - 1.0) < TURNS_WITH_ROBOT) else None
+        near = math.copysign(pull[0], plain[0])
+        found[block] = np.linalg.lstsq(np.vstack([columns, pull]), np.append(target, near), rcond=None)[0]
+    along = np.abs(found[:, 0] - math.copysign(1.0, found[0, 0])) < TURNS_WITH_ROBOT
+    return found if along.all() else None
 
 
 def _direction(angle_rad: Floats) -> Complexes:

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool import __version__
 from icrtool.core.ekf import GATED, RECOVERED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.tables import Floats, Ints, RobotLog, States
 
 if TYPE_CHECKING:
-    from icrtool.analysis.fit import MeasurementOutcome
+    from icrtool.analysis.excitation import Excitation
+    from icrtool.analysis.filter_setup import WarmStart
+    from icrtool.analysis.fit import FilterRun, MeasurementOutcome
+    from icrtool.analysis.stream_delays import StreamDelays
+    from icrtool.analysis.wheel_check import WheelCheck
+
+RUN_SCHEMA = "icrtool/run/1"
 
 ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 
@@ -22,6 +30,49 @@ SETTLED_S = 2.0
 
 SMALLEST_CHANGE_M = 0.03
 """An ICR whose estimate moved less than this from its start has no rise to time."""
+
+
+def run_summary(
+    run: FilterRun, wheels: WheelCheck, delays: StreamDelays, excitation: Excitation, *, reference_delay_s: float
+) -> dict[str, Any]:
+    """Return all of a run as plain data for run.json; `reference_delay_s` is how far the fixes' stamps were moved."""
+    log, config, table, fixes = run.log, run.config, run.table, run.fix_quality
+    return {
+        "schema": RUN_SCHEMA,
+        "tool_version": __version__,
+        "log": log.name,
+        "inputs": [asdict(file) for file in log.inputs],
+        "config": config.effective(),
+        "streams": [asdict(stream) for stream in log.streams],
+        "warnings": list(run.warnings),
+        "drive": drive_summary(table),
+        "icr": icr_summary(table, run.convergence) | {"final_covariance_m2": run.covariance[3:, 3:].tolist()},
+        "terrain": run.terrain.summary(),
+        "segments": segment_summary(table, run.changes_s),
+        "gnss": gnss_summary(log, run.gnss, fixes.down_weighted)
+        | delays.gnss_summary()
+        | fixes.summary(*used_and_rejected(run.gnss)),
+        "heading": run.heading_check.summary() | delays.heading_summary(),
+        "wheels": wheels.summary(),
+        "outages_ns": run.outages_ns.tolist(),
+        "rtk_losses_ns": fixes.losses_ns.tolist(),
+        "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(run.in_gap)],
+        "filter": {
+            "preset": config.filter.preset,
+            "process_position_mps": run.process_position_mps,
+            "reference_delay_s": reference_delay_s,
+            "states": len(table),
+            "warm_start": _began_with(run.warm_start),
+            **nis_summary(run.gnss, run.heading),
+        },
+        "excitation": excitation.summary(),
+    }
+
+
+def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
+    if warm_start is None:
+        return None
+    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
 
 
 def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:

@@ -145,8 +145,8 @@ class _Blocks(NamedTuple):
 
 
 def given_changes(changes_s: tuple[float, ...]) -> TerrainTest:
-    """Return given changes alone."""
-    return TerrainTest(tuple(TerrainChange(t, "given") for t in sorted(changes_s)))
+    """Return given changes alone, each time once."""
+    return TerrainTest(tuple(TerrainChange(t, "given") for t in sorted(set(changes_s))))
 
 
 def find_terrain_changes(
@@ -186,7 +186,7 @@ def find_terrain_changes(
         np.maximum(np.median(blocks.std, axis=0) / usual, SLIP_SHARE),
         LEAST_STEP_SHARE,
         FALSE_ALARMS_PER_HOUR * driven_h,
-        tuple(int(np.searchsorted(begins, t)) for t in given_s),
+        tuple(int(np.searchsorted(begins, t)) for t in given.times_s),
     )
     found = []
     for step in tested.steps:

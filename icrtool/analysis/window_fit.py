@@ -15,10 +15,11 @@ import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
+from icrtool.analysis.window_models import CONSTANT, WindowModel, base_parameters, basis_of, usual_terms
 from icrtool.core.open_loop import trial_ends
-from icrtool.core.window_fit import NEUTRAL, Complexes, move, window_misses
+from icrtool.core.window_fit import move, window_misses
 from icrtool.errors import DataError
-from icrtool.tables import Bools, Floats, Ints
+from icrtool.tables import Bools, Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows. One length alone lets a circle of just that circumference say nothing."""
@@ -46,51 +47,6 @@ MOST_STEPS, LONGEST_STEP_S, COARSE_STEP_M = 10_000, 0.4, 0.25
 
 STRETCH_M = 20.0
 """Way that errs alike, for the covariance: twice the longest window."""
-
-USUAL_MULTIPLIER = 1.4
-"""W / b of the prior: published skid factors are 1.1 to 1.9 (logs.md, section 1)."""
-
-TERMS = ("separation", "asymmetry", "x_icr", "scale", "scale_difference", "bend", "speed", "late")
-"""What can be fitted: W [m], (y_r + y_l) / 2 [m], x_icr [m], scale of both sides, left minus right, and ``bend``,
-``speed`` of `icrtool.core.window_fit`; ``late`` [s]: the wheels are read this much later than the pose."""
-
-_BASIS = np.array(
-    [
-        [0.5, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, 0.5, -0.5, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Rows: what one unit of each term adds to (y_r, y_l, x, k_l, k_r, bend, speed, late)."""
-
-_PRIOR_STD = {"scale": 0.05, "scale_difference": 0.05, "bend": 0.3, "speed": 0.3, "late": 0.2}
-"""How far the terms stray on real robots: a drive that says nothing of a term leaves it where it belongs."""
-
-
-@dataclass(frozen=True, slots=True)
-class WindowModel:
-    """A model to fit: what is free, of `TERMS`; the rest is neutral."""
-
-    name: str
-    label: str
-    terms: tuple[str, ...]
-
-
-MULTIPLIER = WindowModel("multiplier", "best single multiplier", ("separation",))
-CONSTANT = WindowModel("window", "window fit", ("separation", "asymmetry", "x_icr"))
-EXTENDED = (
-    WindowModel("window_scale", "with scales", (*CONSTANT.terms, "scale", "scale_difference")),
-    WindowModel("window_late", "with delay", (*CONSTANT.terms, "late")),
-    WindowModel("window_scale_late", "with scales and delay", (*CONSTANT.terms, "scale", "scale_difference", "late")),
-    WindowModel("window_bend", "with scales and curvature", (*CONSTANT.terms, "scale", "scale_difference", "bend")),
-    WindowModel("window_speed", "with scales and speed", (*CONSTANT.terms, "scale", "scale_difference", "speed")),
-)
-"""Models that pay on some robots and not on others: cross-validation chooses."""
 
 
 class Windows(NamedTuple):
@@ -339,16 +295,6 @@ class _Problem:
         return self._last[1]
 
 
-def basis_of(model: WindowModel) -> Floats:
-    """Return what one unit of each of a model's terms adds to the parameters (k, 8)."""
-    return _BASIS[[TERMS.index(term) for term in model.terms]]
-
-
-def base_parameters() -> Floats:
-    """Return the parameters (8,) to which the terms add."""
-    return np.array([*NEUTRAL, 0.0])
-
-
 def prior_of(windows: Windows, model: WindowModel, kept: Bools | None = None) -> tuple[Floats, Floats, Floats]:
     """Return mean (k,) of a model's terms, square roots of their information, and their standard deviations.
 
@@ -360,17 +306,10 @@ def prior_of(windows: Windows, model: WindowModel, kept: Bools | None = None) ->
     start_m, length_m = (
         (windows.start_m, windows.length_m) if kept is None else (windows.start_m[kept], windows.length_m[kept])
     )
-    mean, std = _prior(windows.width_m, model)
+    mean, std = usual_terms(windows.width_m, model)
     way_m = max(float(np.ptp(start_m)), EVERY_M) if len(start_m) else EVERY_M
     alike = max(float(length_m.sum()) / way_m, 1.0)
     return mean, np.sqrt(alike) / std, std
-
-
-def _prior(width_m: float, model: WindowModel) -> tuple[Floats, Floats]:
-    """Return mean and standard deviation of the model's terms before any window is seen."""
-    means = {"separation": USUAL_MULTIPLIER * width_m}
-    stds = {"separation": width_m, "asymmetry": width_m / 2, "x_icr": width_m / 2, **_PRIOR_STD}
-    return np.array([means.get(term, 0.0) for term in model.terms]), np.array([stds[term] for term in model.terms])
 
 
 def clustered_covariance(misses: Floats, slopes: Floats, prior: Floats, way_m: Floats) -> Floats:

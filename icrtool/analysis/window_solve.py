@@ -15,15 +15,13 @@ import numpy as np
 from icrtool.analysis.window_fit import (
     HUBER_SIGMAS,
     WindowFit,
-    WindowModel,
     Windows,
-    base_parameters,
-    basis_of,
     clustered_covariance,
     evaluate_windows,
     prior_of,
     robust_scale,
 )
+from icrtool.analysis.window_models import WindowModel, base_parameters, basis_of
 from icrtool.tables import Bools, Floats
 
 SETTLED = 1e-4

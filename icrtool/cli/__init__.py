@@ -10,7 +10,8 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
-    # No kernel of ours uses BLAS. Its threads take time to start, and a process with threads should not be forked.
+    # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save
+    # there, and a process with threads should not be forked.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from icrtool.cli.commands import icrtool
     from icrtool.errors import IcrToolError

@@ -12,14 +12,13 @@ from icrtool.analysis.outages import Outage
 from icrtool.analysis.turning import TurningSplit
 from icrtool.report.dropout_content import DropoutContent, p95_at, shown_horizons
 from icrtool.report.ladder_table import format_ladder
-from icrtool.report.words import duration_text, way_text
+from icrtool.report.words import TABLE_WIDTH, duration_text, way_text
 
 LABEL = 26
 MODEL = 15
 """Columns of the left margin; of them, for a model's name."""
 CELL = 18
 
-WIDTH = 100
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -40,7 +39,7 @@ def format_dropout(content: DropoutContent) -> str:
     lines += [_turning_line(one) for one in content.by_turning]
     lines += [
         "",
-        *(part for line in budget_lines(content.budgets) for part in wrap(line, WIDTH, subsequent_indent="  ")),
+        *(part for line in budget_lines(content.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
     ]
     if content.ladder is not None:
         lines += ["", *format_ladder(content.ladder).splitlines()]

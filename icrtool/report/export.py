@@ -12,6 +12,7 @@ from typing import Literal, get_args
 from icrtool import __version__
 from icrtool.analysis.calibrate_export import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers
 from icrtool.report.run_directory import json_bytes
+from icrtool.report.words import TABLE_WIDTH
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json"]
 TARGETS: tuple[Target, ...] = get_args(Target)
@@ -23,8 +24,6 @@ NOT_PLANAR = 0.001
 
 ODOMETRY_USED = (6, 11)
 """Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
-
-WIDTH = 100
 
 
 def format_export(numbers: ExportNumbers, target: Target) -> str:
@@ -135,7 +134,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
     )
     sentences = [origin, icrs, judged, lost, *(f"WARNING: {_one_line(doubt)}" for doubt in numbers.doubts)]
-    return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, WIDTH)]
+    return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
 
 
 def _diagonal(planar: tuple[float, float, float]) -> str:

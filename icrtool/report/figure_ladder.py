@@ -11,13 +11,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from icrtool.analysis.ladder import Ladder, Rung
 from icrtool.analysis.ladder_fits import CHOICE_HORIZON_M
 from icrtool.report.figure_style import ICR, inches, new_figure
+from icrtool.report.words import FITTED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 WIDTH_IN, ROW_IN = 7.2, 0.27
-NOTES = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 
 
 def draw_ladder(title: str, ladder: Ladder) -> Figure:
@@ -68,7 +68,7 @@ def _draw_rows(axes: Axes, rungs: list[Rung], h: int) -> None:
             annotation_clip=False,
         )  # fmt: skip
         places.append(y)
-        note = NOTES[rung.fitted]
+        note = FITTED[rung.fitted]
         labels.append(f"{rung.label} ({note})" if note else rung.label)
     axes.set_yticks(places, labels)
     axes.set_ylim(y - 0.7, -0.3)

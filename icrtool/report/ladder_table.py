@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from icrtool.analysis.ladder import Ladder, Rung
+from icrtool.analysis.ladder_fits import FEWEST_TO_CHOOSE
+from icrtool.analysis.window_models import CONSTANT
+from icrtool.report.words import FITTED, TABLE_WIDTH
 
-FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 TERM_KEYS = (
     "y_icr_right_m", "y_icr_left_m", "x_icr_m", "left_scale", "right_scale", "bend", "speed_spm", "wheels_read_later_s"
 )  # fmt: skip
 
-WIDTH = 100
 
 LADDER_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -37,18 +38,21 @@ def format_ladder(ladder: Ladder) -> str:
             for p95, expected in zip(rung.summary.p95, rung.summary.expected, strict=True)
         )
         lines.append(f"{rung.label:<26}{FITTED[rung.fitted]:<16}{cells}")
-    lines += wrap(extended_line(ladder), WIDTH, subsequent_indent="  ")
+    lines += wrap(extended_line(ladder), TABLE_WIDTH, subsequent_indent="  ")
     lines += ladder.notes
     return "\n".join(line.rstrip() for line in lines)
 
 
 def extended_line(ladder: Ladder) -> str:
-    """Say which extended models were chosen."""
+    """Say which extended models were chosen for the blocks, and which one for the whole drive."""
     names = {name: fit.model.label for name, fit in ladder.fits.items()}
+    whole = f"for all of the way: {names[ladder.best]}"
+    if ladder.blocks < FEWEST_TO_CHOOSE:
+        return f"extended: not chosen, {ladder.blocks} blocks are too few, it is the window fit; {whole}"
+    if set(ladder.chosen) == {CONSTANT.name}:
+        return f"extended: none pays without the block judged, it is the window fit; {whole}"
     used = dict.fromkeys(names[name] for name in ladder.chosen)
-    if ladder.chosen and set(ladder.chosen) == {"window"}:
-        return "extended: none pays on this drive, it is the window fit"
-    return f"extended, chosen without the block judged: {', '.join(used)}; for all of the way: {names[ladder.best]}"
+    return f"extended, chosen without the block judged: {', '.join(used)}; {whole}"
 
 
 def ladder_rows(ladder: Ladder) -> Iterator[Sequence[str | int | float]]:

@@ -14,9 +14,10 @@ from typing import Any, cast
 import numpy as np
 
 from icrtool.analysis.filter_setup import WarmStart
-from icrtool.analysis.fit import RUN_SCHEMA, FilterRun
+from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.analysis.measured_heading import measured_headings
+from icrtool.analysis.summary import RUN_SCHEMA
 from icrtool.errors import RunError
 from icrtool.report.headings_file import HEADINGS_FILE, read_headings, write_headings
 from icrtool.report.states_csv import StatesFileError, StatesFormat, file_sha256, read_states, write_states

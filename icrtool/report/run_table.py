@@ -10,9 +10,8 @@ from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.analysis.summary import ICR_COLUMNS, separation_multiplier
 from icrtool.analysis.terrain import FALSE_ALARMS_PER_HOUR, TerrainChange
-from icrtool.report.words import duration_text, length_text, position_word, run_title, way_text
+from icrtool.report.words import TABLE_WIDTH, duration_text, length_text, position_word, run_title, way_text
 
-WIDTH = 100
 LABEL = 12
 """Columns of the left margin: what a line is about."""
 
@@ -73,7 +72,7 @@ def _stream_lines(run: FilterRun) -> list[str]:
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
     widths[0] = LABEL - 2
     # Long names give way: the topic keeps its end, the type its begin.
-    room = WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
+    room = TABLE_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
     widths[1] = min(widths[1], max(room - widths[2], room // 2))
     widths[2] = min(widths[2], room - widths[1])
     return [

@@ -7,8 +7,6 @@ from typing import Any
 
 from icrtool.analysis.study import KINDS, Finding, StudyResult
 
-WIDTH = 100
-
 ERRORS = tuple(
     (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
 )

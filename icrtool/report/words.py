@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from icrtool.analysis.fit import FilterRun
 
+TABLE_WIDTH = 100
+"""Letters in a line of a printed table."""
+
+FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
+"""What the numbers of a ladder's model were fitted to, by `icrtool.analysis.ladder.Rung.fitted`."""
+
 
 def run_title(run: FilterRun) -> str:
     """Return the log's name, and the robot's where it has one."""

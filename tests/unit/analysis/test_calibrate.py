@@ -175,6 +175,14 @@ def test_settings_put_back_what_was_wrong() -> None:
     assert settings["wheels.right_scale"] == pytest.approx(0.98, abs=0.005)
 
 
+def test_a_late_heading_is_proposed_as_a_setting_and_one_on_time_is_not() -> None:
+    assert "frames.heading_delay_s" not in {setting.key for setting in calibrate(simulate(0), CONFIG).settings}
+    late = calibrate(simulate(0, heading_delay=0.3), CONFIG)
+    settings = {setting.key: setting for setting in late.settings}
+    assert settings["frames.heading_delay_s"].value == pytest.approx(0.3, abs=0.02)
+    assert settings["frames.heading_delay_s"].why == "heading late against the wheels"
+
+
 def test_too_short_a_drive_is_refused() -> None:
     with pytest.raises(DataError, match=r"windows of 1\.0 m of way"):
         calibrate(simulate(0, seconds=8.0), CONFIG)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icrtool.analysis.calibrate_verdict import calibrate
 from icrtool.analysis.filter_setup import WarmStart, chi2_gate
 from icrtool.analysis.fit import fit
 from icrtool.analysis.paths import PathPlan
@@ -19,7 +20,7 @@ from icrtool.analysis.study_runs import readings_log
 from icrtool.config import load_config
 from icrtool.core.ekf import GATED
 from icrtool.errors import DataError
-from icrtool.tables import PositionFixes, RobotLog
+from icrtool.tables import PositionFixes, RobotLog, WheelSamples
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import ICRS, make_log
@@ -212,6 +213,42 @@ def test_streams_that_do_not_overlap_are_refused() -> None:
 def test_a_single_sample_is_refused() -> None:
     with pytest.raises(DataError, match="1 usable heading samples"):
         fit(cut(make_log(), slice(0, 1)))
+
+
+def spoilt(log: RobotLog, stream: str, column: str, value: float) -> RobotLog:
+    table = getattr(log, stream)
+    values = getattr(table, column).copy()
+    values[500] = value
+    return replace(log, **{stream: replace(table, **{column: values})})
+
+
+@pytest.mark.parametrize("preset", ["field", "paper"])
+@pytest.mark.parametrize(
+    ("stream", "column", "value", "why"),
+    [
+        ("wheels", "v_left_mps", math.nan, "1 wheel samples are not finite numbers, the first at row 500"),
+        ("wheels", "v_right_mps", 1e160, r"a wheel speed of 1e\+160 m/s"),
+        ("gnss", "east_m", math.inf, "1 position samples are not finite"),
+        ("heading", "heading_rad", math.nan, "1 heading samples are not finite"),
+    ],
+)
+def test_values_that_are_no_measurement_are_refused(
+    preset: str, stream: str, column: str, value: float, why: str
+) -> None:
+    config = load_config(sets=[f"filter.preset={preset}"])
+    for use in (fit, calibrate):
+        with pytest.raises(DataError, match=why):
+            use(spoilt(make_log(), stream, column, value), config)
+
+
+def test_an_empty_stream_is_refused() -> None:
+    log = make_log()
+    none = WheelSamples(log.wheels.stamp_ns[:0], log.wheels.v_left_mps[:0], log.wheels.v_right_mps[:0])
+    for use in (fit, calibrate):
+        with pytest.raises(DataError, match="0 usable heading samples"):
+            use(cut(log, slice(0, 0)))
+        with pytest.raises(DataError, match="0 usable wheel samples"):
+            use(replace(log, wheels=none))
 
 
 @pytest.mark.parametrize(("degrees", "quantile"), [(1, 15.1367), (2, 18.4207)])

@@ -25,6 +25,8 @@ from drives import make_log
 
 CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
 ROUNDING_M = 1e-9
+CHORD_M = 1e-5
+"""The lever's way is its arc along a measured heading, the chord of each turn in steps: over 5 m at 20 Hz, 3 um."""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,7 @@ def test_all_trials_stay_within_their_block(run: FilterRun) -> None:
 
 
 def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
-    """A gyro that turns as the wheels say with the ICRs adds nothing to them but the Euler step's corner."""
+    """A gyro that turns as the wheels say with the ICRs: the way is that of steps along the middle of each turn."""
     trials = cut_trials(run, edges_of(run), (5.0,))
     blocks = count_blocks(run.table.distance_m[-1])
     icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
@@ -91,9 +93,17 @@ def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
     neutral = np.tile([0, 0, 0, 1, 1, 0, 0, 0.0], (blocks, 1))
     model = Along(trials, turned, from_reference=True)
     along = model.errors(model.place(neutral), icrs)
-    wheels = open_loop_errors(trials.drive, icrs, trials.ends)
-    tried = ~np.isnan(wheels)
-    assert np.max(np.abs(along[tried] - wheels[tried])) < 0.05
+    ahead = (0.5 * trials.drive.v_left + 0.6 * trials.drive.v_right) / 1.1
+    aside = -0.1 * (trials.drive.v_left - trials.drive.v_right) / 1.1
+    step = (dt * (ahead + 1j * aside))[:-1] * np.exp(0.5j * (turned[1:] + turned[:-1]))
+    place = np.concatenate([[0.0], np.cumsum(np.where(trials.drive.gap[:-1], 0.0, step))])
+    reference = trials.drive.north + 1j * trials.drive.east
+    start = np.flatnonzero(trials.ends[:, 0] >= 0)
+    end = trials.ends[start, 0]
+    assert len(start) > 1000
+    nose = np.exp(1j * (trials.drive.heading - turned)[start])
+    expected = np.abs(nose * (place[end] - place[start]) - (reference[end] - reference[start]))
+    assert np.max(np.abs(along[start, 0] - expected)) < CHORD_M
 
 
 def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run: FilterRun) -> None:
@@ -108,6 +118,16 @@ def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run
     other = judge_ladder(run, [MeasuredHeading("gyro", 0.1 * heading)])
     assert other.heading == ""
     assert "does not turn with the robot" in other.notes[0]
+
+
+def test_a_gyro_of_the_other_sign_is_turned_and_said(run: FilterRun) -> None:
+    told = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
+    usual, turned = (judge_ladder(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
+    assert usual.notes == ()
+    assert turned.notes == ("the gyro counts turns the other way: its sign was turned",)
+    for one, other in zip(usual.rungs, turned.rungs, strict=True):
+        assert one.name == other.name
+        assert np.allclose(one.summary.p95, other.summary.p95, atol=ROUNDING_M, equal_nan=True)
 
 
 def test_no_window_of_a_fit_touches_the_block_held_out(run: FilterRun) -> None:

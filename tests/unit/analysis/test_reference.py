@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.dropout import dropout, models_of
+from icrtool.analysis.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.reference import held_against
 from icrtool.analysis.smooth import smooth
@@ -30,12 +31,12 @@ def noisy() -> tuple[FilterRun, States]:
 
 
 def true_places(run: FilterRun) -> np.ndarray:
-    """Drive the log's wheel speeds with its true ICRs from its true start."""
+    """Drive the log's wheel speeds with its true ICRs from its true start, in steps as the log was made."""
     wheels = run.log.wheels
     x = np.array([10.0, -5.0, 0.3, *ICRS])
     places = [x[:2]]
     for k, dt in enumerate(np.diff(wheels.stamp_ns) / 1e9):
-        x = step_state(x, wheels.v_left_mps[k], wheels.v_right_mps[k], dt)
+        x = step_state(x, wheels.v_left_mps[k], wheels.v_right_mps[k], dt, MIDDLE_OF_THE_TURN)
         places.append(x[:2])
     first = len(places) - len(run.table)
     return np.array(places[first:])

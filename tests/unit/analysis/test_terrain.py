@@ -112,6 +112,14 @@ def test_given_changes_are_kept_and_not_found_again() -> None:
     assert run.changes_s == pytest.approx((80.0, 160.0), abs=3.0)
 
 
+def test_a_change_given_twice_is_one() -> None:
+    log = drive(0, PATHS["curved"], 30.0)
+    once, twice = (fit(log, CONFIG, changes_s=(20.0,) * times) for times in (1, 2))
+    assert twice.summary["terrain"] == once.summary["terrain"]
+    assert twice.summary["segments"] == once.summary["segments"]
+    np.testing.assert_array_equal(twice.table.std_x_icr_m, once.table.std_x_icr_m)
+
+
 def test_a_change_beyond_the_drive_is_none_and_said() -> None:
     run = fit(drive(0, PATHS["curved"], 30.0), CONFIG, changes_s=(10.0, 31.0))
     assert run.changes_s == (10.0,)

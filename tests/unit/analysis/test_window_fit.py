@@ -10,15 +10,8 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
-from icrtool.analysis.window_fit import (
-    CONSTANT,
-    EXTENDED,
-    MULTIPLIER,
-    WindowModel,
-    cut_windows,
-    fit_windows,
-    thin_windows,
-)
+from icrtool.analysis.window_fit import cut_windows, fit_windows, thin_windows
+from icrtool.analysis.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.analysis.window_solve import drop_windows, fit_of, solve_windows
 from icrtool.config import Config
 from icrtool.errors import DataError

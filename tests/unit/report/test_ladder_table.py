@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from icrtool.analysis.ladder import Ladder, judge_ladder
 from icrtool.analysis.measured_heading import measured_headings
-from icrtool.report.ladder_table import LADDER_COLUMNS, format_ladder, ladder_document, ladder_rows
+from icrtool.report.ladder_table import LADDER_COLUMNS, extended_line, format_ladder, ladder_document, ladder_rows
 from icrtool.report.run_directory import json_bytes
 
 
@@ -36,3 +37,18 @@ def test_the_document_is_json(ladder: Ladder) -> None:
     document = json.loads(json_bytes(ladder_document(ladder)))
     assert [model["name"] for model in document["models"]] == [rung.name for rung in ladder.rungs]
     assert set(document["fits"]["window"]["value"]) >= {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}
+
+
+@pytest.mark.parametrize(
+    ("blocks", "chosen", "best", "said"),
+    [
+        (2, "window", "window_late", "extended: not chosen, 2 blocks are too few, it is the window fit"),
+        (3, "window", "window_late", "extended: none pays without the block judged, it is the window fit"),
+        (3, "window_late", "window_late", "extended, chosen without the block judged: with delay"),
+    ],
+)
+def test_the_line_says_what_was_chosen_and_why_not(
+    ladder: Ladder, blocks: int, chosen: str, best: str, said: str
+) -> None:
+    line = extended_line(replace(ladder, blocks=blocks, chosen=(chosen,) * blocks, best=best))
+    assert line == f"{said}; for all of the way: with delay"

@@ -7,8 +7,8 @@ import pytest
 
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.summary import separation_multiplier
-from icrtool.report.run_table import WIDTH, format_run
-from icrtool.report.words import duration_text, length_text, signed, way_text
+from icrtool.report.run_table import format_run
+from icrtool.report.words import TABLE_WIDTH, duration_text, length_text, signed, way_text
 
 
 def line_of(text: str, begin: str) -> str:
@@ -52,7 +52,7 @@ def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: FilterRun) -> None:
     )
     wide = replace(run, log=replace(run.log, streams=long_names))
     for text in (format_run(run), format_run(wide)):
-        assert max(map(len, text.splitlines())) <= WIDTH
+        assert max(map(len, text.splitlines())) <= TABLE_WIDTH
         assert "\x1b" not in text
         assert not any(line != line.rstrip() for line in text.splitlines())
         assert not text.endswith("\n")

@@ -1,0 +1,47 @@
+"""The door of the analysis: whether the streams of a log can be used together at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.errors import DataError
+from icrtool.tables import RobotLog
+
+IMPOSSIBLE_MPS = 1e6
+"""A wheel speed from here on is a broken value: its way is longer than can be cut into windows."""
+
+
+def check_streams(log: RobotLog) -> None:
+    """Refuse streams that cannot be used together.
+
+    Raises
+    ------
+    DataError
+        Fewer than two samples of a stream, none at the same time, or a value that is not a finite number. Logs that
+        were read hold no such values (`icrtool.read_log` leaves their rows out), tables made by a program may.
+    """
+    needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
+    for what, stamps in needed.items():
+        if len(stamps) < 2:
+            raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
+    columns = {
+        "wheel": (log.wheels.v_left_mps, log.wheels.v_right_mps),
+        "position": (log.gnss.north_m, log.gnss.east_m),
+        "heading": (log.heading.heading_rad,),
+    }
+    for what, values in columns.items():
+        bad = ~np.logical_and.reduce(np.isfinite(values))
+        if bad.any():
+            raise DataError(
+                log.name,
+                f"{np.count_nonzero(bad)} {what} samples are not finite numbers, the first at row {int(bad.argmax())}",
+                "leave those rows out",
+            )
+    fastest = float(np.abs(columns["wheel"]).max())
+    if fastest >= IMPOSSIBLE_MPS:
+        raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
+    begin = max(int(stamps[0]) for stamps in needed.values())
+    end = min(int(stamps[-1]) for stamps in needed.values())
+    if begin >= end:
+        spans = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in needed.items())
+        raise DataError(log.name, "wheels, position and heading do not overlap in time", spans)
