@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.tables import Floats, Ints, PositionFixes, RobotLog
+from icrtool.tables import Floats, Ints, PositionFixes, RobotLog, WheelSamples
 
 SHORTEST_WINDOW_M = 1.0
 WINDOW_IN_GNSS_STD = 12.0
@@ -41,6 +41,13 @@ outliers among the fixes spoil some windows, not most."""
 STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
 """A heading that stays the very same for so long, while one side goes so far ahead of the other, over so much of the
 way, is stuck."""
+
+STUCK_WAY_M, WHEELS_OFF = 1.0, 0.1
+"""A side that goes ahead by less than this part of the way, over so much of it, does not show a turn: wheels of unequal
+size do so on a straight row."""
+
+LONGEST_INTERVAL_S = 1.0
+"""Between wheel samples further apart the way is not known."""
 
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course, beyond what the fixes explain, above which the heading's noise is raised to it."""
@@ -150,8 +157,7 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     if len(course.angle) < FEWEST_WINDOWS:
         nan = math.nan
         return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
-    agreement = float(abs(np.exp(1j * course.angle).mean()))
-    mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
+    agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
     if free and max(agreement, mirrored) < EXPLAINED:
         _refuse_unexplained(log, course, agreement, mirrored)
     turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
@@ -164,30 +170,19 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     name = NO_NAME
     if _is_significant(rest, sigma):
         name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0]))
-    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
     cause = f" ({name.text})" if name.text else ""
-    applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
+    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
+    applied, warnings = fixed, _disagreement(agreement, mirrored)
     if turned_over:
         applied = offset if given == "auto" else fixed
         warnings = [_name_turned_over(text + cause, len(angle))]
-    elif agreement < EXPLAINED and mirrored >= EXPLAINED:
-        applied, warnings = (
-            fixed,
-            ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"],
-        )
-    elif agreement < EXPLAINED:
-        applied, warnings = (
-            fixed,
-            [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"],
-        )
+    elif not warnings:
+        applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
     raised, alike_s = 0.0, 0.0
     if not paper and max(agreement, mirrored if turned_over else 0.0) >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
         # The scatter is that of window means: the heading errs alike for as long as a window lasts.
         raised, alike_s = own_scatter, course.duration_s
-        warnings.append(
-            f"the heading scatters by {math.degrees(own_scatter):.0f}° about the course, over whole windows: "
-            "its noise is raised accordingly"
-        )
+        warnings.append(_name_scatter(own_scatter))
     return HeadingCheck(
         windows=len(angle),
         offset_rad=offset,
@@ -202,6 +197,20 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         name=name,
         warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
     )
+
+
+def resultant_length(angle: Floats) -> float:
+    """Return the mean resultant length of angles (n,): 1 where all are the same, about 0 where they are anything."""
+    return float(abs(np.exp(1j * angle).mean()))
+
+
+def _disagreement(agreement: float, mirrored: float) -> list[str]:
+    """Say that a heading does not follow the course as it is given, where it does not."""
+    if agreement >= EXPLAINED:
+        return []
+    if mirrored >= EXPLAINED:
+        return ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"]
+    return [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"]
 
 
 def _refuse_unexplained(log: RobotLog, course: Course, agreement: float, mirrored: float) -> None:
@@ -223,10 +232,10 @@ def _refuse_stuck(log: RobotLog) -> None:
     long = end - begin > STUCK_S * 1e9
     if not long.any():
         return
-    interval = np.diff(wheels.stamp_ns) / 1e9
+    interval = _known_intervals(wheels)
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
-    ahead, way = (np.concatenate([[0.0], np.cumsum(step)]) for step in (left - right, np.abs(left) + np.abs(right)))
-
+    way = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
+    ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), way)
     rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin[long], end[long]]))
     turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
     last_row = len(way) - 1
@@ -235,6 +244,19 @@ def _refuse_stuck(log: RobotLog) -> None:
     if share > STUCK_SHARE:
         seconds = float((end - begin)[long][turning].sum()) / 1e9
         raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")
+
+
+def _clearly_ahead(ahead: Floats, way: Floats) -> Floats:
+    """Return `ahead` (n,) [m] without what it gains where it gains too little of `way` (n,) [m] to be a turn."""
+    later = np.minimum(np.searchsorted(way, way + STUCK_WAY_M), len(way) - 1)
+    turning = np.abs(ahead[later] - ahead) >= WHEELS_OFF * (way[later] - way)
+    return np.concatenate([[0.0], np.cumsum(np.where(turning[:-1], np.diff(ahead), 0.0))])
+
+
+def _known_intervals(wheels: WheelSamples) -> Floats:
+    """Return the seconds between wheel samples (n - 1,), none through a gap."""
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    return np.where(interval < LONGEST_INTERVAL_S, interval, 0.0)
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
@@ -273,6 +295,13 @@ def _name_turned_over(rest: str, windows: int) -> str:
     )
 
 
+def _name_scatter(scatter: float) -> str:
+    return (
+        f"the heading scatters by {math.degrees(scatter):.0f}° about the course, over whole windows: "
+        "its noise is raised accordingly"
+    )
+
+
 def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, float, float]:
     """Fit angle = offset + slope * curvature, robustly; return offset, its standard deviation, and the scatter [rad].
 
@@ -304,8 +333,8 @@ def measure_course(log: RobotLog) -> Course:
         return none
     noise, white = _fix_noise_m(gnss)
     length = max(SHORTEST_WINDOW_M, WINDOW_IN_GNSS_STD * noise)
-    interval = np.diff(wheels.stamp_ns) / 1e9
-    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * np.where(interval < 1.0, interval, 0.0)
+    interval = _known_intervals(wheels)
+    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * interval
     psi_at = np.interp(
         wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
     )
@@ -325,7 +354,7 @@ def measure_course(log: RobotLog) -> Course:
     went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
     moved = went & led
     # spins on the spot wind the way up whatever the heading; of a drive the sides go ahead of each other but little
-    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * np.where(interval < 1.0, interval, 0.0)
+    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * interval
     spun = between(np.concatenate([[0.0], np.cumsum(apart)])) > SPIN_RATIO * way
     told, mirror = real + 1j * imaginary, real - 1j * imaginary
     return Course(
