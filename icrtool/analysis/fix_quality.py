@@ -117,7 +117,8 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
         )
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     told = _told(gnss.told_class, stated)
-    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX)
+    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
+    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
     kinds = np.where(sold, FLOAT_FIX, told).astype(np.uint8)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
     fixed = kinds == FIXED_FIX

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
+from icrtool.analysis.fix_quality import judge_fixes
+from icrtool.analysis.heading_check import check_heading
 from icrtool.analysis.outages import real_outages
 from icrtool.analysis.simulate import Drive, Sensors
 from icrtool.analysis.simulate_record import simulate
@@ -17,12 +19,26 @@ from icrtool.config import load_config
 from icrtool.core.ekf import GATED
 from icrtool.logio import read_log
 from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
-from icrtool.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bools, Datum, RobotLog
+from icrtool.tables import (
+    FIXED_FIX,
+    FLOAT_FIX,
+    NOT_TOLD,
+    OTHER_FIX,
+    RTK_FIX,
+    Bools,
+    Datum,
+    HeadingSamples,
+    PositionFixes,
+    RobotLog,
+    WheelSamples,
+)
 
 sys.path.insert(0, str(Path(__file__).parent))
+from drives import EPOCH_NS as START_NS
 from drives import ICRS, make_log
 
 WIDTH = "robot.track_width_m=0.8"
+CONFIG = load_config(sets=[WIDTH])
 LOSSES_S = ((40.0, 60.0), (75.0, 85.0), (100.0, 118.0))
 FLOAT_STD_M = 0.02
 ICR_TOLERANCE_M = 0.02
@@ -168,3 +184,48 @@ def test_what_a_log_file_says_of_its_fixes_reaches_the_filter(tmp_path: Path) ->
     run = fit(read_log(path, config), config)
     assert run.summary["gnss"]["classes"]["other"]["down_weighted"] == int(np.count_nonzero(plain))
     assert len(run.summary["rtk_losses_ns"]) == 1
+
+
+def park_then_drive(told: int, jitter_s: float = 0.03) -> RobotLog:
+    """Park for five minutes, then drive curves for two; fixed fixes at 10 Hz, whose stamps jitter."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 420.0, 0.02)
+    on = np.clip((t - 300.0) / 2.0, 0.0, 1.0)
+    v_left, v_right = (1.5 * on * (1 + 0.3 * np.sin(rate * t + begin)) for rate, begin in ((0.5, 0.0), (0.31, 1.0)))
+    psi = 0.3 + np.cumsum((v_left - v_right) / 1.1) * 0.02
+    speed = (0.5 * v_left + 0.6 * v_right) / 1.1
+    place = np.cumsum(speed * np.exp(1j * psi)) * 0.02
+    stamps, fix = START_NS + np.round(t * 1e9).astype(np.int64), slice(0, None, 5)
+    count = len(t[fix])
+    seen = np.interp(t[fix] + rng.normal(0, jitter_s, count), t, place)
+    seen += 0.004 * (rng.normal(size=count) + 1j * rng.normal(size=count))
+    known = np.full(count, 1e-4)
+    return replace(
+        clean(),
+        wheels=WheelSamples(stamps, v_left, v_right),
+        gnss=PositionFixes(
+            stamps[fix], seen.real, seen.imag, known, known, np.zeros(count), np.full(count, told, np.uint8)
+        ),
+        heading=HeadingSamples(stamps, np.angle(np.exp(1j * psi)), np.full(len(t), 3e-4)),
+    )
+
+
+@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_TOLD])
+def test_stamps_that_jitter_are_no_float_where_a_robot_parks_and_then_drives(told: int) -> None:
+    log = park_then_drive(told)
+    run = fit(log, load_config(sets=[WIDTH]))
+    assert not run.fix_quality.sold.any()
+    assert not len(run.outages_ns)
+
+
+def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
+    log, rng = clean(), np.random.default_rng(1)
+    t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    noise = np.where((t > 60) & (t < 80), 0.04, 0.0) * rng.normal(size=(2, len(t)))
+    noisy = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + noise[0], east_m=log.gnss.east_m + noise[1]))
+    sold = {
+        told: judge_fixes(confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, check_heading(noisy, CONFIG)).sold
+        for told in ("flags", "not")
+    }
+    assert not sold["flags"].any()
+    assert sold["not"].any()
+    assert not (sold["not"] & ((t < 58) | (t > 82))).any()
