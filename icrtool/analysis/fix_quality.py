@@ -124,8 +124,9 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
     fixed = kinds == FIXED_FIX
     norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
     variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
+    raised: list[str] = []
     if changes:
-        variance = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
+        variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     better = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
@@ -140,7 +141,8 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
         losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
         warnings=(),
     )
-    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in _notes(quality, stated, changes=changes)))
+    notes = _notes(quality, stated, raised, changes=changes)
+    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
 
 
 def _told(told: Bytes | None, stated: Floats) -> Bytes:
@@ -152,9 +154,14 @@ def _told(told: Bytes | None, stated: Floats) -> Bytes:
     return kinds
 
 
-def _at_least_white(variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float) -> Floats:
-    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated."""
-    raised = variance.copy()
+def _at_least_white(
+    variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float
+) -> tuple[Floats, list[str]]:
+    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated.
+
+    Returns the variances, and the names of the classes that were raised.
+    """
+    raised, names = variance.copy(), []
     for code, name in CLASSES.items():
         rows, std = kinds == code, white.get(name, math.nan)
         if not rows.any() or not math.isfinite(std):
@@ -162,7 +169,8 @@ def _at_least_white(variance: Floats, kinds: Bytes, white: dict[str, float], sil
         stated = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_std_m**2)
         if std**2 > NOISIER**2 * float(np.median(stated)):
             raised[rows] = np.maximum(stated, std**2)
-    return raised
+            names.append(name)
+    return raised, names
 
 
 def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
@@ -191,17 +199,38 @@ def _spans(pairs: list[tuple[int, int]]) -> Ints:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _notes(quality: FixQuality, stated: Floats, *, changes: bool) -> list[str]:
-    """Say what the fixes do not say of themselves."""
-    notes, sold = [], int(np.count_nonzero(quality.sold))
-    if sold:
-        share = 100 * sold / len(quality.sold)
+def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
+    """Say what the fixes do not say of themselves, and what was done to their noise."""
+    notes, sold, rows = [], quality.sold, quality.fix_class
+    if sold.any():
         notes.append(
-            f"{sold:,} fixes ({share:.0f} %) claim ±{np.median(stated[quality.sold]):.2g} m but scatter or jump like "
+            f"{_counted(sold)} claim {_accuracy(stated[sold], 'to be fixed')} but scatter or jump like "
             f"RTK float{': taken as float' if changes else ''}"
         )
-    claims = quality.fix_class == FIXED_FIX
-    raised = quality.step_std_m.get("fixed", math.nan)
-    if changes and claims.any() and raised > NOISIER * max(float(np.median(stated[claims])), 1e-3):
-        notes.append(f"the fixes state ±{np.median(stated[claims]):.2g} m and scatter by {raised:.2g} m: that is used")
+    down = quality.down_weighted & ~sold
+    if down.any():
+        gnss = quality.log.gnss
+        given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
+        notes.append(
+            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: given ±{np.median(given):.2g} m, "
+            "as they err alike"
+        )
+    for code, name in CLASSES.items():
+        if name in raised and not quality.down_weighted[rows == code].all():
+            kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
+            notes.append(
+                f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
+                f"{quality.step_std_m[name]:.2g} m: that is used"
+            )
     return notes
+
+
+def _counted(rows: Bools) -> str:
+    count = int(np.count_nonzero(rows))
+    return f"{count:,} fixes ({100 * count / len(rows):.0f} %)"
+
+
+def _accuracy(stated: Floats, silent: str) -> str:
+    """Return the median accuracy stated (m,) [m] in words, `silent` where none is."""
+    known = stated[np.isfinite(stated) & (stated > 0)]
+    return f"±{np.median(known):.2g} m" if len(known) else silent

@@ -127,7 +127,7 @@ def test_fixed_that_is_no_float_is_left_alone() -> None:
     assert not run.fix_quality.down_weighted.any()
     assert not len(run.fix_quality.jump_m)
     assert not len(run.outages_ns)
-    assert run.warnings == ()
+    assert run.fix_quality.warnings == ()
 
 
 def test_outliers_are_no_jumps_and_no_float() -> None:
@@ -229,3 +229,46 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
     assert not sold["flags"].any()
     assert sold["not"].any()
     assert not (sold["not"] & ((t < 58) | (t > 82))).any()
+
+
+@pytest.mark.parametrize(
+    ("told", "stated_m", "real_m", "words"),
+    [
+        (FIXED_FIX, np.nan, 0.3, "the fixes state no accuracy and scatter by 0.3 m: that is used"),
+        (FIXED_FIX, 0.0, 0.3, "the fixes state no accuracy and scatter by 0.3 m: that is used"),
+        (OTHER_FIX, 0.2, 0.5, "the other fixes state ±0.2 m and scatter by 0.5 m: that is used"),
+        (FLOAT_FIX, 0.2, 0.5, "the float fixes state ±0.2 m and scatter by 0.5 m: that is used"),
+    ],
+)
+def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float, real_m: float, words: str) -> None:
+    log = replace(make_log(3, seconds=60.0, gnss_std=real_m), datum=clean().datum)
+    count = len(log.gnss.stamp_ns)
+    said, told_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, told_class=told_class))
+    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    assert quality.warnings == (f"made: {words}",)
+    assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
+
+
+def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
+    lossy, float_ = lose_rtk(clean())
+    log = confess(lossy, float_, "flags")
+    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    count = int(np.count_nonzero(float_))
+    # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
+    (warning,) = quality.warnings
+    assert warning == (
+        f"made: {count:,} fixes ({100 * count / len(float_):.0f} %) are no RTK fixed solution in a log where that is "
+        f"usual: given ±{0.4 * np.sqrt(2 * 10 * 25):.2g} m, as they err alike"
+    )
+
+
+def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> None:
+    log, float_ = lose_rtk(clean(), at_once=True)
+    count = len(float_)
+    unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, told_class=told))
+    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    assert quality.sold.any()
+    assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
+    assert not any("nan" in warning for warning in quality.warnings)
