@@ -313,6 +313,8 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     longest = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
     edges = np.flatnonzero(interval > longest)
     spans = [(int(used[i]), int(used[i + 1])) for i in edges]
+    if used[0] - table.stamp_ns[0] > longest and lost[gnss.stamp_ns < used[0]].any():
+        spans.insert(0, (int(table.stamp_ns[0]), int(used[0])))
     if table.stamp_ns[-1] - used[-1] > longest:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)

@@ -185,11 +185,16 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
 
 
 def _losses(stamps: Ints, fixed: Bools) -> Ints:
-    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough."""
+    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough.
+
+    Others before the first and after the last fixed one make a span with the log's end.
+    """
     rows = np.flatnonzero(fixed)
     begin, end = rows[:-1], rows[1:]
     lost = (end - begin > 1) & (stamps[end] - stamps[begin] > SHORTEST_LOSS_S * 1e9)
     spans = [(int(stamps[i]), int(stamps[k])) for i, k in zip(begin[lost], end[lost], strict=True)]
+    if len(rows) and stamps[rows[0]] - stamps[0] > SHORTEST_LOSS_S * 1e9:
+        spans.insert(0, (int(stamps[0]), int(stamps[rows[0]])))
     if len(rows) and rows[-1] + 1 < len(stamps) and stamps[-1] - stamps[rows[-1]] > SHORTEST_LOSS_S * 1e9:
         spans.append((int(stamps[rows[-1]]), int(stamps[-1]) + 1))
     return _spans(spans)
@@ -212,8 +217,8 @@ def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: b
         gnss = quality.log.gnss
         given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
         notes.append(
-            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: given ±{np.median(given):.2g} m, "
-            "as they err alike"
+            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: "
+            f"given ±{np.median(given):.2g} m, as they err alike"
         )
     for code, name in CLASSES.items():
         if name in raised and not quality.down_weighted[rows == code].all():

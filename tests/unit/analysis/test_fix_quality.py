@@ -272,3 +272,23 @@ def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> 
     assert quality.sold.any()
     assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)
+
+
+@pytest.mark.parametrize("heading_from_s", [0.0, 10.0])
+@pytest.mark.parametrize("span", [(0.0, 40.0), (100.0, 200.0)])
+def test_rtk_that_is_missing_at_either_end_of_a_drive_is_an_outage_without_a_miss(
+    span: tuple[float, float], heading_from_s: float
+) -> None:
+    log = clean()
+    t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    float_ = (t >= span[0]) & (t < span[1])
+    log = confess(replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + 0.8 * float_)), float_, "flags")
+    later = log.heading.stamp_ns >= log.heading.stamp_ns[0] + heading_from_s * 1e9
+    heading = HeadingSamples(*(getattr(log.heading, name)[later] for name in HeadingSamples.__slots__))
+    run = fit(replace(log, heading=heading), CONFIG)
+    expected = [[max(span[0], heading_from_s), min(span[1], t[-1])]]
+    assert (run.outages_ns - log.gnss.stamp_ns[0]) / 1e9 == pytest.approx(np.array(expected), abs=0.05)
+    assert (np.array(run.summary["rtk_losses_ns"]) - log.gnss.stamp_ns[0]) / 1e9 == pytest.approx(
+        np.array([[span[0], min(span[1], t[-1])]]), abs=0.05
+    )
+    assert real_outages(run) == ()
