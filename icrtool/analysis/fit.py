@@ -165,7 +165,7 @@ def fit(
         terrain = _find_changes(done, terrain)
         if len(terrain.changes) > len(done.terrain.changes):
             done = _run(fixes, config, check, warm_start, terrain)
-    adapted, table, gnss, heading, in_gap, outages, _ = done
+    adapted, fixes, table, gnss, heading, in_gap, outages, _ = done
     log, output, position_noise = adapted.log, adapted.output, adapted.process_position_mps
     terrain, beyond = terrain.within(float(table.t_s[-1]))
     convergence = converge(table, min(terrain.times_s, default=None))
@@ -238,6 +238,7 @@ class _Done(NamedTuple):
     """A pass of the filter over a log, in the words of `FilterRun`."""
 
     adapted: AdaptedRun
+    fixes: FixQuality
     table: States
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
@@ -251,6 +252,7 @@ def _run(
 ) -> _Done:
     adapted = run_adaptively(fixes.log, config, check, warm_start, terrain.times_s)
     log, setup, output = adapted.log, adapted.setup, adapted.output
+    fixes = fixes.earlier(adapted.reference_delay_s)
     table = _states(log, output)
     gnss = _outcome(
         log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
@@ -260,7 +262,7 @@ def _run(
         output.heading_innovation,
     )  # fmt: skip
     in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
-    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
+    return _Done(adapted, fixes, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
 
 
 def _find_changes(done: _Done, terrain: TerrainTest) -> TerrainTest:

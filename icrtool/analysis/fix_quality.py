@@ -16,6 +16,7 @@ from icrtool.analysis.filter_setup import LARGEST_SANE_GNSS_STD_M
 from icrtool.analysis.fix_sold import find_sold
 from icrtool.analysis.fix_steps import measure_steps
 from icrtool.analysis.heading_check import HeadingCheck
+from icrtool.analysis.reference_delay import delayed
 from icrtool.config import Config
 from icrtool.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bools, Bytes, Floats, Ints, RobotLog
 
@@ -96,6 +97,16 @@ class FixQuality:
                 for stamp, size in list(zip(self.jump_stamp_ns, self.jump_m, strict=True))[:MOST_LISTED]
             ],
         }
+
+    def earlier(self, delay_s: float) -> FixQuality:
+        """Return the same of fixes that are taken `delay_s` earlier."""
+        shift = round(delay_s * 1e9)
+        return replace(
+            self,
+            log=delayed(self.log, delay_s),
+            jump_stamp_ns=self.jump_stamp_ns - shift,
+            losses_ns=self.losses_ns - shift,
+        )
 
 
 def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQuality:

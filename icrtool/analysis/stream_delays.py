@@ -106,15 +106,17 @@ def measure_delays(log: RobotLog, config: Config, check: HeadingCheck) -> Stream
     heading, gnss = heading_delay(part), UNKNOWN if together else gnss_delay(part, check)
     free = field and not together
     late = heading.value_s if free and given_heading == "auto" and heading.is_clear else 0.0
+    late_gnss = gnss.value_s if free and given_gnss == "auto" and gnss.is_clear else 0.0
     if field and given_heading != "auto":
         late = given_heading
-    late_gnss = gnss.value_s if free and given_gnss == "auto" and gnss.is_clear else 0.0
+    if field and given_gnss != "auto":
+        late_gnss = given_gnss
     notes = [
         f"{log.name}: {what} {delay.value_s:.2f} ± {delay.std_s:.2f} s late against the wheels: "
         f"taken out; {key} sets it"
         for what, delay, applied, key in (
             ("the heading is", heading, given_heading == "auto" and late, "frames.heading_delay_s"),
-            ("the fixes are", gnss, late_gnss, "frames.reference_delay_s"),
+            ("the fixes are", gnss, given_gnss == "auto" and late_gnss, "frames.reference_delay_s"),
         )
         if applied
     ]

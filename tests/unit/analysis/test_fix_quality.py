@@ -30,6 +30,7 @@ from icrtool.tables import (
     HeadingSamples,
     PositionFixes,
     RobotLog,
+    StreamChoice,
     WheelSamples,
 )
 
@@ -292,3 +293,30 @@ def test_rtk_that_is_missing_at_either_end_of_a_drive_is_an_outage_without_a_mis
         np.array([[span[0], min(span[1], t[-1])]]), abs=0.05
     )
     assert real_outages(run) == ()
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_losses_outages_and_jumps_are_in_the_clock_that_the_run_ended_with(given: bool) -> None:
+    """Position and heading of one topic, both 0.3 s late, at 3 m/s: told, or found by running the filter."""
+    fast = replace(make_log(3, seconds=140.0, faster=6.0), datum=clean().datum)
+    lossy, float_ = lose_rtk(fast, at_once=True)
+    log = confess(lossy, float_, "flags")
+    streams = tuple(StreamChoice(role, "/pose", "x/Y", 1, 1.0, "header", 0.0, "") for role in ("gnss", "heading"))
+    late = 300_000_000
+    log = replace(
+        log,
+        streams=streams,
+        gnss=replace(log.gnss, stamp_ns=log.gnss.stamp_ns + late),
+        heading=replace(log.heading, stamp_ns=log.heading.stamp_ns + late),
+    )
+    run = fit(log, load_config(sets=[WIDTH, f"frames.reference_delay_s={'0.3' if given else 'auto'}"]))
+    delay_s = run.summary["filter"]["reference_delay_s"]
+    assert delay_s == pytest.approx(0.3, abs=0.05)
+    stamps = run.log.gnss.stamp_ns
+    assert stamps[0] == log.gnss.stamp_ns[0] - round(delay_s * 1e9)
+    for spans in (run.outages_ns, np.array(run.summary["rtk_losses_ns"])):
+        inside = sum(((stamps > begin) & (stamps < end)) for begin, end in spans)
+        assert np.array_equal(inside, float_)
+    jumped = [jump["stamp_ns"] for jump in run.summary["gnss"]["jump_list"]]
+    assert len(jumped) > len(LOSSES_S)
+    assert set(jumped) <= set(stamps[1:][np.diff(float_.astype(int)) != 0].tolist())
