@@ -14,7 +14,7 @@ import numpy as np
 
 from icrtool.analysis.filter_setup import LARGEST_SANE_GNSS_STD_M
 from icrtool.analysis.fix_sold import find_sold
-from icrtool.analysis.fix_steps import measure_steps
+from icrtool.analysis.fix_steps import FixSteps, measure_steps
 from icrtool.analysis.heading_check import HeadingCheck
 from icrtool.analysis.reference_delay import delayed
 from icrtool.config import Config
@@ -117,20 +117,10 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
     other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
     """
-    gnss, none = log.gnss, np.zeros(len(log.gnss.stamp_ns), np.bool_)
+    gnss, changes = log.gnss, config.filter.preset != "paper"
     steps = measure_steps(log, mirrored=check.applied_mirror, offset_rad=check.applied_offset_rad)
-    changes = config.filter.preset != "paper"
-    if log.datum is None:
-        reference = np.full(len(gnss.stamp_ns), REFERENCE, np.uint8)
-        white = {CLASSES[REFERENCE]: steps.white_std_m(~none)}
-        return FixQuality(
-            log, reference, none, none, white, gnss.stamp_ns[steps.jump_row], steps.jump_m, _spans([]), ()
-        )
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    told = _told(gnss.told_class, stated)
-    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
-    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
-    kinds = np.where(sold, FLOAT_FIX, told).astype(np.uint8)
+    kinds, sold = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
     fixed = kinds == FIXED_FIX
     norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
@@ -140,9 +130,10 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
         variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
-    better = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
+    if raised or down.any():
+        gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
     quality = FixQuality(
-        log=replace(log, gnss=better),
+        log=replace(log, gnss=gnss),
         fix_class=kinds,
         sold=sold,
         down_weighted=down,
@@ -154,6 +145,17 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
     )
     notes = _notes(quality, stated, raised, changes=changes)
     return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
+
+
+def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
+    """Return the class of each fix (m,), and which claim to be fixed and are not (m,)."""
+    gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
+    if log.datum is None:
+        return np.full(len(stated), REFERENCE, np.uint8), none
+    told = _told(gnss.told_class, stated)
+    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
+    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
+    return np.where(sold, FLOAT_FIX, told).astype(np.uint8), sold
 
 
 def _told(told: Bytes | None, stated: Floats) -> Bytes:

@@ -320,3 +320,17 @@ def test_losses_outages_and_jumps_are_in_the_clock_that_the_run_ended_with(given
     jumped = [jump["stamp_ns"] for jump in run.summary["gnss"]["jump_list"]]
     assert len(jumped) > len(LOSSES_S)
     assert set(jumped) <= set(stamps[1:][np.diff(float_.astype(int)) != 0].tolist())
+
+
+@pytest.mark.parametrize(("stated_m", "real_m"), [(0.01, 0.1), (np.nan, 0.1), (0.02, 0.05)])
+def test_poses_that_are_noisier_than_they_state_neither_lose_their_fixes_nor_spoil_the_wheels(
+    stated_m: float, real_m: float
+) -> None:
+    log = make_log(3, seconds=140.0, gnss_std=real_m)
+    said = np.full(len(log.gnss.stamp_ns), stated_m**2)
+    run = fit(replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said)), CONFIG)
+    assert np.count_nonzero(run.gnss.code == GATED) < 0.01 * len(said)
+    assert run.process_position_mps == 0.3
+    assert list(run.summary["gnss"]["classes"]) == ["reference"]
+    assert any("the poses state" in warning and "scatter by" in warning for warning in run.warnings)
+    assert icrs(run) == pytest.approx(ICRS, abs=0.02)
