@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.core.window_fit import Complexes
-from icrtool.tables import Bools, Floats, Ints, RobotLog
+from icrtool.tables import Bools, Floats, Ints, PositionFixes, RobotLog
 
 FEWEST_STEPS = 40
 """Fewer steps tell no noise; a stretch is judged by as many."""
+
+FEWEST_FIXES = 30
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""... over its scale."""
 
 CLIP_SIGMAS = 6.0
 JUMP_SIGMAS = 8.0
@@ -124,6 +129,19 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     return FixSteps(step, product, moves, rows, jumps)
 
 
+def bend_std_m(gnss: PositionFixes) -> float:
+    """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
+
+    NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the
+    robot does between two fixes adds little where they are frequent, and much where they are not:
+    `FixSteps.white_std_m` is the one that leaves it out.
+    """
+    if len(gnss.stamp_ns) < FEWEST_FIXES:
+        return float("nan")
+    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
+
+
 def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[complex, complex]:
     """Return the factors of `laid` and `swing` (m,) that explain most of `seen` (m,), wild steps left out."""
     along, arm = 1.0 + 0.0j, 0.0 + 0.0j
@@ -144,7 +162,7 @@ def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[comple
 def _scale(step: Complexes) -> float:
     """Return the robust standard deviation of steps, an axis [m]."""
     size = np.abs(step[np.isfinite(step)])
-    return max(float(np.median(size)) / 1.1774, 1e-6) if len(size) else 1e-6
+    return max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
 
 
 def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.fix_steps import bend_std_m
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -24,7 +25,7 @@ SPIN_RATIO = 3.0
 """A window is a spin where the sides part by so many times its way."""
 
 FEWEST_WINDOWS = 8
-UNSTATED_STD_M, NOISIER, FEWEST_FIXES = 0.01, 1.5, 30
+UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
 
 SIGNIFICANT_SIGMAS = 4.0
@@ -150,16 +151,11 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     free = given == "auto" and not paper
     if free:
         _refuse_stuck(log)
-    if free and course.scattered >= FEWEST_WINDOWS and course.scattered > len(course.angle):
-        raise _no_heading(
-            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
-        )
+        _refuse_unexplained(log, course)
     if len(course.angle) < FEWEST_WINDOWS:
         nan = math.nan
         return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
     agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
-    if free and max(agreement, mirrored) < EXPLAINED:
-        _refuse_unexplained(log, course, agreement, mirrored)
     turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
@@ -167,9 +163,8 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     sigma *= max(1.0, course.white_rad / max(scatter, 1e-9))
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
     rest = offset + math.pi / 2 if turned_over else offset
-    name = NO_NAME
-    if _is_significant(rest, sigma):
-        name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0]))
+    named = _is_significant(rest, sigma)
+    name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0])) if named else NO_NAME
     cause = f" ({name.text})" if name.text else ""
     text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
     applied, warnings = fixed, _disagreement(agreement, mirrored)
@@ -178,10 +173,8 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         warnings = [_name_turned_over(text + cause, len(angle))]
     elif not warnings:
         applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
-    raised, alike_s = 0.0, 0.0
-    if not paper and max(agreement, mirrored if turned_over else 0.0) >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
-        # The scatter is that of window means: the heading errs alike for as long as a window lasts.
-        raised, alike_s = own_scatter, course.duration_s
+    noisy = (agreement >= EXPLAINED or turned_over) and own_scatter > NOISY_SCATTER_RAD and not paper
+    if noisy:
         warnings.append(_name_scatter(own_scatter))
     return HeadingCheck(
         windows=len(angle),
@@ -192,8 +185,9 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         mirrored_agreement=mirrored,
         applied_mirror=turned_over,
         applied_offset_rad=applied,
-        applied_std_rad=raised,
-        applied_correlation_s=alike_s,
+        # The scatter is that of window means: the heading errs alike for as long as a window lasts.
+        applied_std_rad=own_scatter if noisy else 0.0,
+        applied_correlation_s=course.duration_s if noisy else 0.0,
         name=name,
         warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
     )
@@ -213,13 +207,20 @@ def _disagreement(agreement: float, mirrored: float) -> list[str]:
     return [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"]
 
 
-def _refuse_unexplained(log: RobotLog, course: Course, agreement: float, mirrored: float) -> None:
-    """Raise where no convention and no offset makes the heading follow the course."""
-    if max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
+def _refuse_unexplained(log: RobotLog, course: Course) -> None:
+    """Raise where the heading points nowhere, or no convention and no offset makes it follow the course."""
+    windows = len(course.angle)
+    if course.scattered >= FEWEST_WINDOWS and course.scattered > windows:
+        raise _no_heading(
+            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
+        )
+    if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
         return
-    spread = math.degrees(math.sqrt(-2.0 * math.log(max(agreement, mirrored, 1e-3))))
-    tried = f"ENU, NED and every offset tried in {len(course.angle)} windows, scatter {spread:.0f}° at best"
-    raise _no_heading(log, "has nothing to do with the course", tried)
+    best = max(resultant_length(course.angle), resultant_length(course.mirrored))
+    if best < EXPLAINED:
+        spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
+        tried = f"ENU, NED and every offset tried in {windows} windows, scatter {spread:.0f}° at best"
+        raise _no_heading(log, "has nothing to do with the course", tried)
 
 
 def _refuse_stuck(log: RobotLog) -> None:
@@ -372,20 +373,15 @@ def measure_course(log: RobotLog) -> Course:
 def _fix_noise_m(gnss: PositionFixes) -> tuple[float, float]:
     """Return the noise of the fixes, an axis [m], and how much of it is seen to be white.
 
-    The noise is what they state, or what their own second differences show where that is clearly more.
-
-    Three white errors make a second difference of six times the variance; what the robot does between two fixes adds
-    little where they are frequent, and lengthens the windows where they are not.
+    The noise is what they state, or what they show by themselves where that is clearly more.
     """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance)]
     stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
-    if len(gnss.stamp_ns) < FEWEST_FIXES:
+    seen = bend_std_m(gnss)
+    if math.isnan(seen):
         return stated, 0.0
-    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
-    # The median of a Rayleigh distribution is 1.1774 of its scale.
-    seen = float(np.median(bend)) / 1.1774 / math.sqrt(6.0)
-    return (seen if seen > NOISIER * stated else stated), min(seen, stated) if seen <= NOISIER * stated else seen
+    return (seen, seen) if seen > NOISIER * stated else (stated, min(seen, stated))
 
 
 def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:
