@@ -23,7 +23,7 @@ WORTHWHILE_SHARE = 0.9
 
 
 class AdaptedRun(NamedTuple):
-    """A run, and what was done to the log for it: `log` has the reference's delay taken out."""
+    """A run, and what was done to the log for it: `log` has the reference's delay, where one was found, taken out."""
 
     log: RobotLog
     setup: FilterSetup
@@ -40,6 +40,7 @@ def run_adaptively(
     A contradiction (NIS of fixes and headings, each counted up to its gate) that falls when the reference is shifted
     comes from the clocks; one that falls as the noise grows, from the wheels (held samples, slip) or from fixes that
     err together: the larger noise is the honest one. Bad fixes stay bad whatever is done. Preset ``field`` only.
+    A delay that is configured is taken out before (`icrtool.analysis.stream_delays`), and none is looked for.
     """
 
     def run(one: RobotLog, speed: float) -> tuple[FilterSetup, FilterOutput, float, float]:
@@ -61,11 +62,9 @@ def run_adaptively(
         return setup, output, by_fixes, by_fixes + (float(capped.mean()) if len(capped) else 0.0)
 
     speed = configured_process_position_mps(config)
-    given, field = config.frames.reference_delay_s, config.filter.preset == "field"
-    delay = given if field and given != "auto" else 0.0
-    log = delayed(log, delay)
+    field, delay = config.filter.preset == "field", 0.0
     setup, output, contradiction, _ = run(log, speed)
-    if field and given == "auto" and contradiction > TOLERATED_NIS:
+    if field and config.frames.reference_delay_s == "auto" and contradiction > TOLERATED_NIS:
         delay = find_delay(log, lambda one: run(one, speed)[3])
         log = delayed(log, delay)
         setup, output, contradiction, _ = run(log, speed)

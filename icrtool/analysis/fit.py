@@ -155,7 +155,7 @@ def fit(
         terrain = _find_changes(done)
         again = len(terrain.changes) > len(done.terrain.changes)
         done = _run(fixes, config, check, warm_start, terrain) if again else done._replace(terrain=terrain)
-    adapted, table, gnss, heading, in_gap, outages, terrain = done
+    adapted, fixes, table, gnss, heading, in_gap, outages, terrain = done
     log, covariance = adapted.log, _square(adapted.output.P)
     terrain, beyond = terrain.within(float(table.t_s[-1]))
     convergence = converge(table, min(terrain.times_s, default=None))
@@ -181,6 +181,7 @@ class _Done(NamedTuple):
     """A pass of the filter over a log, in the words of `FilterRun`."""
 
     adapted: AdaptedRun
+    fixes: FixQuality
     table: States
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
@@ -194,6 +195,7 @@ def _run(
 ) -> _Done:
     adapted = run_adaptively(fixes.log, config, check, warm_start, terrain.times_s)
     log, setup, output = adapted.log, adapted.setup, adapted.output
+    fixes = fixes.earlier(adapted.reference_delay_s)
     table = _states(log, output)
     gnss = _outcome(
         log.gnss.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code, np.hypot(*output.gnss_residual.T)
@@ -203,7 +205,7 @@ def _run(
         output.heading_innovation,
     )  # fmt: skip
     in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
-    return _Done(adapted, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
+    return _Done(adapted, fixes, table, gnss, heading, in_gap, _outages(table, gnss, fixes.losses_ns), terrain)
 
 
 def _find_changes(done: _Done) -> TerrainTest:
@@ -256,6 +258,8 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     longest = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
     edges = np.flatnonzero(interval > longest)
     spans = [(int(used[i]), int(used[i + 1])) for i in edges]
+    if used[0] - table.stamp_ns[0] > longest and lost[gnss.stamp_ns < used[0]].any():
+        spans.insert(0, (int(table.stamp_ns[0]), int(used[0])))
     if table.stamp_ns[-1] - used[-1] > longest:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)

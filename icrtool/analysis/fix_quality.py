@@ -14,8 +14,9 @@ import numpy as np
 
 from icrtool.analysis.filter_setup import LARGEST_SANE_GNSS_STD_M
 from icrtool.analysis.fix_sold import find_sold
-from icrtool.analysis.fix_steps import measure_steps
+from icrtool.analysis.fix_steps import FixSteps, measure_steps
 from icrtool.analysis.heading_check import HeadingCheck
+from icrtool.analysis.reference_delay import delayed
 from icrtool.config import Config
 from icrtool.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bools, Bytes, Floats, Ints, RobotLog
 
@@ -97,6 +98,16 @@ class FixQuality:
             ],
         }
 
+    def earlier(self, delay_s: float) -> FixQuality:
+        """Return the same of fixes that are taken `delay_s` earlier."""
+        shift = round(delay_s * 1e9)
+        return replace(
+            self,
+            log=delayed(self.log, delay_s),
+            jump_stamp_ns=self.jump_stamp_ns - shift,
+            losses_ns=self.losses_ns - shift,
+        )
+
 
 def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQuality:
     """Tell the classes of the fixes apart, and give each the noise it deserves.
@@ -106,30 +117,23 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
     other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
     """
-    gnss, none = log.gnss, np.zeros(len(log.gnss.stamp_ns), np.bool_)
+    gnss, changes = log.gnss, config.filter.preset != "paper"
     steps = measure_steps(log, mirrored=check.applied_mirror, offset_rad=check.applied_offset_rad)
-    changes = config.filter.preset != "paper"
-    if log.datum is None:
-        reference = np.full(len(gnss.stamp_ns), REFERENCE, np.uint8)
-        white = {CLASSES[REFERENCE]: steps.white_std_m(~none)}
-        return FixQuality(
-            log, reference, none, none, white, gnss.stamp_ns[steps.jump_row], steps.jump_m, _spans([]), ()
-        )
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    told = _told(gnss.told_class, stated)
-    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX)
-    kinds = np.where(sold, FLOAT_FIX, told).astype(np.uint8)
+    kinds, sold = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
     fixed = kinds == FIXED_FIX
     norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
     variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
+    raised: list[str] = []
     if changes:
-        variance = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
+        variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
-    better = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
+    if raised or down.any():
+        gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
     quality = FixQuality(
-        log=replace(log, gnss=better),
+        log=replace(log, gnss=gnss),
         fix_class=kinds,
         sold=sold,
         down_weighted=down,
@@ -139,7 +143,19 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
         losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
         warnings=(),
     )
-    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in _notes(quality, stated, changes=changes)))
+    notes = _notes(quality, stated, raised, changes=changes)
+    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
+
+
+def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
+    """Return the class of each fix (m,), and which claim to be fixed and are not (m,)."""
+    gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
+    if log.datum is None:
+        return np.full(len(stated), REFERENCE, np.uint8), none
+    told = _told(gnss.told_class, stated)
+    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
+    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
+    return np.where(sold, FLOAT_FIX, told).astype(np.uint8), sold
 
 
 def _told(told: Bytes | None, stated: Floats) -> Bytes:
@@ -151,9 +167,14 @@ def _told(told: Bytes | None, stated: Floats) -> Bytes:
     return kinds
 
 
-def _at_least_white(variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float) -> Floats:
-    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated."""
-    raised = variance.copy()
+def _at_least_white(
+    variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float
+) -> tuple[Floats, list[str]]:
+    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated.
+
+    Returns the variances, and the names of the classes that were raised.
+    """
+    raised, names = variance.copy(), []
     for code, name in CLASSES.items():
         rows, std = kinds == code, white.get(name, math.nan)
         if not rows.any() or not math.isfinite(std):
@@ -161,7 +182,8 @@ def _at_least_white(variance: Floats, kinds: Bytes, white: dict[str, float], sil
         stated = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_std_m**2)
         if std**2 > NOISIER**2 * float(np.median(stated)):
             raised[rows] = np.maximum(stated, std**2)
-    return raised
+            names.append(name)
+    return raised, names
 
 
 def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
@@ -176,11 +198,16 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
 
 
 def _losses(stamps: Ints, fixed: Bools) -> Ints:
-    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough."""
+    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough.
+
+    Others before the first and after the last fixed one make a span with the log's end.
+    """
     rows = np.flatnonzero(fixed)
     begin, end = rows[:-1], rows[1:]
     lost = (end - begin > 1) & (stamps[end] - stamps[begin] > SHORTEST_LOSS_S * 1e9)
     spans = [(int(stamps[i]), int(stamps[k])) for i, k in zip(begin[lost], end[lost], strict=True)]
+    if len(rows) and stamps[rows[0]] - stamps[0] > SHORTEST_LOSS_S * 1e9:
+        spans.insert(0, (int(stamps[0]), int(stamps[rows[0]])))
     if len(rows) and rows[-1] + 1 < len(stamps) and stamps[-1] - stamps[rows[-1]] > SHORTEST_LOSS_S * 1e9:
         spans.append((int(stamps[rows[-1]]), int(stamps[-1]) + 1))
     return _spans(spans)
@@ -190,17 +217,38 @@ def _spans(pairs: list[tuple[int, int]]) -> Ints:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _notes(quality: FixQuality, stated: Floats, *, changes: bool) -> list[str]:
-    """Say what the fixes do not say of themselves."""
-    notes, sold = [], int(np.count_nonzero(quality.sold))
-    if sold:
-        share = 100 * sold / len(quality.sold)
+def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
+    """Say what the fixes do not say of themselves, and what was done to their noise."""
+    notes, sold, rows = [], quality.sold, quality.fix_class
+    if sold.any():
         notes.append(
-            f"{sold:,} fixes ({share:.0f} %) claim ±{np.median(stated[quality.sold]):.2g} m but scatter or jump like "
+            f"{_counted(sold)} claim {_accuracy(stated[sold], 'to be fixed')} but scatter or jump like "
             f"RTK float{': taken as float' if changes else ''}"
         )
-    claims = quality.fix_class == FIXED_FIX
-    raised = quality.step_std_m.get("fixed", math.nan)
-    if changes and claims.any() and raised > NOISIER * max(float(np.median(stated[claims])), 1e-3):
-        notes.append(f"the fixes state ±{np.median(stated[claims]):.2g} m and scatter by {raised:.2g} m: that is used")
+    down = quality.down_weighted & ~sold
+    if down.any():
+        gnss = quality.log.gnss
+        given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
+        notes.append(
+            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: "
+            f"given ±{np.median(given):.2g} m, as they err alike"
+        )
+    for code, name in CLASSES.items():
+        if name in raised and not quality.down_weighted[rows == code].all():
+            kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
+            notes.append(
+                f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
+                f"{quality.step_std_m[name]:.2g} m: that is used"
+            )
     return notes
+
+
+def _counted(rows: Bools) -> str:
+    count = int(np.count_nonzero(rows))
+    return f"{count:,} fixes ({100 * count / len(rows):.0f} %)"
+
+
+def _accuracy(stated: Floats, silent: str) -> str:
+    """Return the median accuracy stated (m,) [m] in words, `silent` where none is."""
+    known = stated[np.isfinite(stated) & (stated > 0)]
+    return f"±{np.median(known):.2g} m" if len(known) else silent

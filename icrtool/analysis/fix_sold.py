@@ -13,7 +13,9 @@ USUAL_M2 = 2 * 0.005**2
 """Stretches are not compared below this variance, both axes."""
 
 STRETCH_VARIANCE = 9.0
-"""A stretch whose white noise has this many times the usual variance is float by itself."""
+"""A stretch whose white noise has this many times the usual variance is float by itself, unless it says that it is
+fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where it parks.
+"""
 
 BESIDE_JUMP = 5
 SIDES_VARIANCE = 1.7
@@ -27,23 +29,28 @@ MOST_JUMPS = 500
 """With more of them the position reference is something else than RTK that is lost now and then."""
 
 
-def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools) -> Bools:
+def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools, said: Bools) -> Bools:
     """Return the fixes (m,) among the `claimed` ones that move like RTK float.
+
+    Parameters
+    ----------
+    claimed : bool (m,), taken for fixed; said : bool (m,), by a flag of the message itself and not by its variance
 
     A jump alone does not say which of its sides is wrong: noise does, or a return. What neither tells stays as it is.
     """
     sold = np.zeros(len(stamps), np.bool_)
-    level = steps.stretch_levels(claimed)
-    known = level[np.isfinite(level)]
+    level, moves = steps.stretch_levels(claimed), steps.stretch_moves()
+    known, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
     if len(known) < 2:
         return sold
-    usual = max(float(np.median(known)), USUAL_M2)
+    usual = max(float(np.median(moving if len(moving) >= 2 else known)), USUAL_M2)
     with np.errstate(invalid="ignore"):
         noisy = level > STRETCH_VARIANCE * usual
+    noisy &= ~said[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
     undecided, beside, nearby = [], _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
     for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
-        decided, stretches = _noisy_side(beside, nearby, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
+        decided, stretches = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
         noisy[stretches] = True
         if not decided:
             undecided.append(jump)
@@ -67,11 +74,14 @@ def _moving_mean(level: Floats, width: int) -> Floats:
     return mean
 
 
-def _noisy_side(beside: Floats, nearby: Floats, at: int) -> tuple[bool, slice]:
+def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> tuple[bool, slice]:
     """Return whether noise tells the sides of a jump in stretch `at` apart, and the stretches that are float then."""
     before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
     if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
         return False, slice(0, 0)
+    half = BESIDE_JUMP // 2
+    if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
+        return False, slice(0, 0)  # where the robot parks the fixes are quieter, whatever they are
     left, right = max(float(beside[before]), USUAL_M2), max(float(beside[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return False, slice(0, 0)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.core.window_fit import Complexes
-from icrtool.tables import Bools, Floats, Ints, RobotLog
+from icrtool.tables import Bools, Floats, Ints, PositionFixes, RobotLog
 
 FEWEST_STEPS = 40
 """Fewer steps tell no noise; a stretch is judged by as many."""
+
+FEWEST_FIXES = 30
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""... over its scale."""
 
 CLIP_SIGMAS = 6.0
 JUMP_SIGMAS = 8.0
@@ -19,6 +24,9 @@ SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
 """A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
+
+MOVES_MPS = 0.05
+"""Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
 
 MOST_TO_FIT = 10_000
 GAP_IN_INTERVALS = 5.0
@@ -33,11 +41,13 @@ class FixSteps:
     step : complex (m - 1,) [m], NaN across a gap
     product : (m - 2,) minus the product of neighbouring steps [m^2], NaN at gaps and wild steps: white noise of
         variance s^2 an axis makes it 2 s^2 on average; what the wheels get wrong for longer makes it less
+    moves : bool (m - 1,), whether the wheels went on
     jump_row : (j,) rows of the first fix after a jump; jump : complex (j,) [m]
     """
 
     step: Complexes
     product: Floats
+    moves: Bools
     jump_row: Ints
     jump: Complexes
 
@@ -64,6 +74,12 @@ class FixSteps:
         np.divide(values.sum(axis=1), count, out=level, where=count > FEWEST_STEPS // 2)
         return level
 
+    def stretch_moves(self) -> Bools:
+        """Return whether the robot moved for most of each of the same stretches."""
+        stretches = len(self.product) // FEWEST_STEPS
+        share = self.moves[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).mean(axis=1)
+        return np.asarray(share > 0.5)
+
 
 def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 0.0) -> FixSteps:
     """Compare each step between fixes with the way of the wheels along the heading.
@@ -81,7 +97,8 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     if min(len(gnss.stamp_ns), len(wheels.stamp_ns), len(heading.stamp_ns)) < 3:
         count, none = len(gnss.stamp_ns), np.empty(0, np.complex128)
         unknown = np.full(max(count - 2, 0), np.nan)
-        return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, np.empty(0, np.int64), none)
+        still = np.zeros(max(count - 1, 0), np.bool_)
+        return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, still, np.empty(0, np.int64), none)
     interval = np.diff(wheels.stamp_ns) / 1e9
     speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
     travelled = np.concatenate([[0.0], np.cumsum(speed * np.where(interval < 1.0, interval, 0.0))])
@@ -102,12 +119,27 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     along, arm = _explain(laid[some], swing[some], seen[some])
     step = seen - along * laid - arm * swing
     step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
-    scale = _scale(step)
+    moves = np.abs(way) > MOVES_MPS * dt
+    moving = step[moves & np.isfinite(step)]
+    scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
     rows, jumps = _jumps(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
-    return FixSteps(step, product, rows, jumps)
+    return FixSteps(step, product, moves, rows, jumps)
+
+
+def bend_std_m(gnss: PositionFixes) -> float:
+    """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
+
+    NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the
+    robot does between two fixes adds little where they are frequent, and much where they are not:
+    `FixSteps.white_std_m` is the one that leaves it out.
+    """
+    if len(gnss.stamp_ns) < FEWEST_FIXES:
+        return float("nan")
+    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
 
 
 def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[complex, complex]:
@@ -130,7 +162,7 @@ def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[comple
 def _scale(step: Complexes) -> float:
     """Return the robust standard deviation of steps, an axis [m]."""
     size = np.abs(step[np.isfinite(step)])
-    return max(float(np.median(size)) / 1.1774, 1e-6) if len(size) else 1e-6
+    return max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
 
 
 def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:

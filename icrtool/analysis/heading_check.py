@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.fix_steps import bend_std_m
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.tables import Floats, Ints, PositionFixes, RobotLog
+from icrtool.tables import Floats, Ints, PositionFixes, RobotLog, WheelSamples
 
 SHORTEST_WINDOW_M = 1.0
 WINDOW_IN_GNSS_STD = 12.0
@@ -24,7 +25,7 @@ SPIN_RATIO = 3.0
 """A window is a spin where the sides part by so many times its way."""
 
 FEWEST_WINDOWS = 8
-UNSTATED_STD_M, NOISIER, FEWEST_FIXES = 0.01, 1.5, 30
+UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
 
 SIGNIFICANT_SIGMAS = 4.0
@@ -41,6 +42,13 @@ outliers among the fixes spoil some windows, not most."""
 STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
 """A heading that stays the very same for so long, while one side goes so far ahead of the other, over so much of the
 way, is stuck."""
+
+STUCK_WAY_M, WHEELS_OFF = 1.0, 0.1
+"""A side that goes ahead by less than this part of the way, over so much of it, does not show a turn: wheels of unequal
+size do so on a straight row."""
+
+LONGEST_INTERVAL_S = 1.0
+"""Between wheel samples further apart the way is not known."""
 
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course, beyond what the fixes explain, above which the heading's noise is raised to it."""
@@ -143,17 +151,11 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     free = given == "auto" and not paper
     if free:
         _refuse_stuck(log)
-    if free and course.scattered >= FEWEST_WINDOWS and course.scattered > len(course.angle):
-        raise _no_heading(
-            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
-        )
+        _refuse_unexplained(log, course)
     if len(course.angle) < FEWEST_WINDOWS:
         nan = math.nan
         return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
-    agreement = float(abs(np.exp(1j * course.angle).mean()))
-    mirrored = float(abs(np.exp(1j * course.mirrored).mean()))
-    if free and max(agreement, mirrored) < EXPLAINED:
-        _refuse_unexplained(log, course, agreement, mirrored)
+    agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
     turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
@@ -161,33 +163,19 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     sigma *= max(1.0, course.white_rad / max(scatter, 1e-9))
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
     rest = offset + math.pi / 2 if turned_over else offset
-    name = NO_NAME
-    if _is_significant(rest, sigma):
-        name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0]))
-    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
+    named = _is_significant(rest, sigma)
+    name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0])) if named else NO_NAME
     cause = f" ({name.text})" if name.text else ""
-    applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
+    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
+    applied, warnings = fixed, _disagreement(agreement, mirrored)
     if turned_over:
         applied = offset if given == "auto" else fixed
         warnings = [_name_turned_over(text + cause, len(angle))]
-    elif agreement < EXPLAINED and mirrored >= EXPLAINED:
-        applied, warnings = (
-            fixed,
-            ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"],
-        )
-    elif agreement < EXPLAINED:
-        applied, warnings = (
-            fixed,
-            [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"],
-        )
-    raised, alike_s = 0.0, 0.0
-    if not paper and max(agreement, mirrored if turned_over else 0.0) >= EXPLAINED and own_scatter > NOISY_SCATTER_RAD:
-        # The scatter is that of window means: the heading errs alike for as long as a window lasts.
-        raised, alike_s = own_scatter, course.duration_s
-        warnings.append(
-            f"the heading scatters by {math.degrees(own_scatter):.0f}° about the course, over whole windows: "
-            "its noise is raised accordingly"
-        )
+    elif not warnings:
+        applied, warnings = _choose_offset(text, offset, sigma, fixed, cause, free=free)
+    noisy = (agreement >= EXPLAINED or turned_over) and own_scatter > NOISY_SCATTER_RAD and not paper
+    if noisy:
+        warnings.append(_name_scatter(own_scatter))
     return HeadingCheck(
         windows=len(angle),
         offset_rad=offset,
@@ -197,20 +185,42 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
         mirrored_agreement=mirrored,
         applied_mirror=turned_over,
         applied_offset_rad=applied,
-        applied_std_rad=raised,
-        applied_correlation_s=alike_s,
+        # The scatter is that of window means: the heading errs alike for as long as a window lasts.
+        applied_std_rad=own_scatter if noisy else 0.0,
+        applied_correlation_s=course.duration_s if noisy else 0.0,
         name=name,
         warnings=tuple(f"{log.name}: {warning}" for warning in warnings),
     )
 
 
-def _refuse_unexplained(log: RobotLog, course: Course, agreement: float, mirrored: float) -> None:
-    """Raise where no convention and no offset makes the heading follow the course."""
-    if max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
+def resultant_length(angle: Floats) -> float:
+    """Return the mean resultant length of angles (n,): 1 where all are the same, about 0 where they are anything."""
+    return float(abs(np.exp(1j * angle).mean()))
+
+
+def _disagreement(agreement: float, mirrored: float) -> list[str]:
+    """Say that a heading does not follow the course as it is given, where it does not."""
+    if agreement >= EXPLAINED:
+        return []
+    if mirrored >= EXPLAINED:
+        return ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"]
+    return [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"]
+
+
+def _refuse_unexplained(log: RobotLog, course: Course) -> None:
+    """Raise where the heading points nowhere, or no convention and no offset makes it follow the course."""
+    windows = len(course.angle)
+    if course.scattered >= FEWEST_WINDOWS and course.scattered > windows:
+        raise _no_heading(
+            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
+        )
+    if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
         return
-    spread = math.degrees(math.sqrt(-2.0 * math.log(max(agreement, mirrored, 1e-3))))
-    tried = f"ENU, NED and every offset tried in {len(course.angle)} windows, scatter {spread:.0f}° at best"
-    raise _no_heading(log, "has nothing to do with the course", tried)
+    best = max(resultant_length(course.angle), resultant_length(course.mirrored))
+    if best < EXPLAINED:
+        spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
+        tried = f"ENU, NED and every offset tried in {windows} windows, scatter {spread:.0f}° at best"
+        raise _no_heading(log, "has nothing to do with the course", tried)
 
 
 def _refuse_stuck(log: RobotLog) -> None:
@@ -223,10 +233,10 @@ def _refuse_stuck(log: RobotLog) -> None:
     long = end - begin > STUCK_S * 1e9
     if not long.any():
         return
-    interval = np.diff(wheels.stamp_ns) / 1e9
+    interval = _known_intervals(wheels)
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
-    ahead, way = (np.concatenate([[0.0], np.cumsum(step)]) for step in (left - right, np.abs(left) + np.abs(right)))
-
+    way = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
+    ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), way)
     rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin[long], end[long]]))
     turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
     last_row = len(way) - 1
@@ -235,6 +245,19 @@ def _refuse_stuck(log: RobotLog) -> None:
     if share > STUCK_SHARE:
         seconds = float((end - begin)[long][turning].sum()) / 1e9
         raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")
+
+
+def _clearly_ahead(ahead: Floats, way: Floats) -> Floats:
+    """Return `ahead` (n,) [m] without what it gains where it gains too little of `way` (n,) [m] to be a turn."""
+    later = np.minimum(np.searchsorted(way, way + STUCK_WAY_M), len(way) - 1)
+    turning = np.abs(ahead[later] - ahead) >= WHEELS_OFF * (way[later] - way)
+    return np.concatenate([[0.0], np.cumsum(np.where(turning[:-1], np.diff(ahead), 0.0))])
+
+
+def _known_intervals(wheels: WheelSamples) -> Floats:
+    """Return the seconds between wheel samples (n - 1,), none through a gap."""
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    return np.where(interval < LONGEST_INTERVAL_S, interval, 0.0)
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
@@ -273,6 +296,13 @@ def _name_turned_over(rest: str, windows: int) -> str:
     )
 
 
+def _name_scatter(scatter: float) -> str:
+    return (
+        f"the heading scatters by {math.degrees(scatter):.0f}° about the course, over whole windows: "
+        "its noise is raised accordingly"
+    )
+
+
 def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, float, float]:
     """Fit angle = offset + slope * curvature, robustly; return offset, its standard deviation, and the scatter [rad].
 
@@ -304,8 +334,8 @@ def measure_course(log: RobotLog) -> Course:
         return none
     noise, white = _fix_noise_m(gnss)
     length = max(SHORTEST_WINDOW_M, WINDOW_IN_GNSS_STD * noise)
-    interval = np.diff(wheels.stamp_ns) / 1e9
-    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * np.where(interval < 1.0, interval, 0.0)
+    interval = _known_intervals(wheels)
+    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * interval
     psi_at = np.interp(
         wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
     )
@@ -325,7 +355,7 @@ def measure_course(log: RobotLog) -> Course:
     went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
     moved = went & led
     # spins on the spot wind the way up whatever the heading; of a drive the sides go ahead of each other but little
-    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * np.where(interval < 1.0, interval, 0.0)
+    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * interval
     spun = between(np.concatenate([[0.0], np.cumsum(apart)])) > SPIN_RATIO * way
     told, mirror = real + 1j * imaginary, real - 1j * imaginary
     return Course(
@@ -343,20 +373,15 @@ def measure_course(log: RobotLog) -> Course:
 def _fix_noise_m(gnss: PositionFixes) -> tuple[float, float]:
     """Return the noise of the fixes, an axis [m], and how much of it is seen to be white.
 
-    The noise is what they state, or what their own second differences show where that is clearly more.
-
-    Three white errors make a second difference of six times the variance; what the robot does between two fixes adds
-    little where they are frequent, and lengthens the windows where they are not.
+    The noise is what they state, or what they show by themselves where that is clearly more.
     """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance)]
     stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
-    if len(gnss.stamp_ns) < FEWEST_FIXES:
+    seen = bend_std_m(gnss)
+    if math.isnan(seen):
         return stated, 0.0
-    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
-    # The median of a Rayleigh distribution is 1.1774 of its scale.
-    seen = float(np.median(bend)) / 1.1774 / math.sqrt(6.0)
-    return (seen if seen > NOISIER * stated else stated), min(seen, stated) if seen <= NOISIER * stated else seen
+    return (seen, seen) if seen > NOISIER * stated else (stated, min(seen, stated))
 
 
 def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:

@@ -134,14 +134,15 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
 def real_outages(run: DrivenRun) -> tuple[Outage, ...]:
     """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix, missed at the next one.
 
-    One that never ends, and one with a gap in the wheel data, has no miss and is left out.
+    One that never ends, and one with a gap in the wheel data, has no miss and is left out; so has one that the drive
+    begins with: neither place nor ICRs were known before it.
     """
     drive, table = drive_of(run), run.table
     origin = int(table.stamp_ns[0])
     outages = []
     for begin, end in run.outages_ns:
         first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))
-        if last >= len(table) or last <= first or run.in_gap[first:last].any():
+        if first == 0 or last >= len(table) or last <= first or run.in_gap[first:last].any():
             continue
         right, left, x = (float(column[first]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
         path = open_loop_path(drive, right, left, x, first, last)

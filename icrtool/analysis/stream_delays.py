@@ -106,15 +106,17 @@ def measure_delays(log: RobotLog, config: Config, check: HeadingCheck) -> Stream
     heading, gnss = heading_delay(part), UNKNOWN if together else gnss_delay(part, check)
     free = field and not together
     late = heading.value_s if free and given_heading == "auto" and heading.is_clear else 0.0
+    late_gnss = gnss.value_s if free and given_gnss == "auto" and gnss.is_clear else 0.0
     if field and given_heading != "auto":
         late = given_heading
-    late_gnss = gnss.value_s if free and given_gnss == "auto" and gnss.is_clear else 0.0
+    if field and given_gnss != "auto":
+        late_gnss = given_gnss
     notes = [
         f"{log.name}: {what} {delay.value_s:.2f} ± {delay.std_s:.2f} s late against the wheels: "
         f"taken out; {key} sets it"
         for what, delay, applied, key in (
             ("the heading is", heading, given_heading == "auto" and late, "frames.heading_delay_s"),
-            ("the fixes are", gnss, late_gnss, "frames.reference_delay_s"),
+            ("the fixes are", gnss, given_gnss == "auto" and late_gnss, "frames.reference_delay_s"),
         )
         if applied
     ]
@@ -133,18 +135,20 @@ def heading_delay(log: RobotLog) -> Delay:
         return UNKNOWN
     t, stamped = _seconds(log)
     begin, end = max(t[0], stamped[0]) + LARGEST_DELAY_S, min(t[-1], stamped[-1]) - LARGEST_DELAY_S
-    edges = begin + HEADING_WINDOW_S * np.arange(max(0, math.floor((end - begin) / HEADING_WINDOW_S)))
-    if len(edges) < FEWEST_WINDOWS:
+    first, last = _windows(t, begin, end)
+    kept = _without_gap(t, first, last) & _without_gap(stamped, first, last)
+    first, last = first[kept], last[kept]
+    if len(first) < FEWEST_WINDOWS:
         return UNKNOWN
-    ahead = _sum(wheels.v_left_mps - wheels.v_right_mps, t)
-    kept = _without_gap(t, edges[:-1], edges[1:]) & _without_gap(stamped, edges[:-1], edges[1:])
-    turned = np.diff(np.interp(edges, stamped, np.unwrap(heading.heading_rad)))[kept]
+    ahead, psi = _sum(wheels.v_left_mps - wheels.v_right_mps, t), np.unwrap(heading.heading_rad)
+    turned = np.interp(last, stamped, psi) - np.interp(first, stamped, psi)
     ones = np.full(len(turned), HEADING_WINDOW_S)
-    if len(turned) < FEWEST_WINDOWS:
-        return UNKNOWN
 
     def explain(delay: float) -> tuple[Floats, Floats, Callable[[Floats], float]]:
-        now, after, before = (np.diff(np.interp(edges - delay + s, t, ahead))[kept] for s in (0.0, STEP_S, -STEP_S))
+        now, after, before = (
+            np.interp(last - delay + s, t, ahead) - np.interp(first - delay + s, t, ahead)
+            for s in (0.0, STEP_S, -STEP_S)
+        )
         return np.column_stack([now, (before - after) / (2 * STEP_S), ones]), turned, lambda p: float(p[0])
 
     return _search(explain)
@@ -199,6 +203,18 @@ def gnss_delay(log: RobotLog, check: HeadingCheck) -> Delay:
 def _seconds(log: RobotLog) -> tuple[Floats, Floats]:
     origin = log.wheels.stamp_ns[0]
     return (log.wheels.stamp_ns - origin) / 1e9, (log.heading.stamp_ns - origin) / 1e9
+
+
+def _windows(t: Floats, begin: float, end: float) -> tuple[Floats, Floats]:
+    """Return begins and ends of `HEADING_WINDOW_S` (w,), side by side, in which or beside which there are samples t.
+
+    Made from the samples, not from the time between first and last: a stray stamp may be decades away.
+    """
+    at = np.floor((t - begin) / HEADING_WINDOW_S).astype(np.int64)
+    places = np.unique((at[:, None] + np.array([-1, 0, 1])).ravel())
+    last = math.floor((end - begin) / HEADING_WINDOW_S) - 1
+    places = places[(places >= 0) & (places < last)]
+    return begin + HEADING_WINDOW_S * places, begin + HEADING_WINDOW_S * (places + 1)
 
 
 def _without_gap(t: Floats, begin: Floats, end: Floats) -> Bools:

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
+from icrtool.analysis.heading_check import check_heading
 from icrtool.config import load_config
+from icrtool.core.ekf_plain import step_state
 from icrtool.errors import DataError
-from icrtool.tables import Datum, Floats, RobotLog
+from icrtool.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 
 sys.path.insert(0, str(Path(__file__).parent))
-from drives import make_log
+from drives import ICRS, make_log
 
 WIDTH = "robot.track_width_m=0.8"
 ICR_TOLERANCE_M = 0.02
@@ -101,6 +103,44 @@ def test_a_heading_that_nothing_explains_is_refused_once_and_clearly(
     insisting = fit(spoilt, load_config(sets=[WIDTH, "frames.heading_offset_deg=0.0"]))
     assert insisting.heading_check.applied_offset_rad == 0.0
     fit(spoilt, load_config(sets=[WIDTH, "filter.preset=paper"]))
+
+
+def rows(straight_m: float = 40.0, speed: float = 1.0) -> RobotLog:
+    """Four straight rows at 50 Hz, half a turn between them; the exact heading in whole degrees."""
+    turn_s, rate = math.pi * (ICRS[0] - ICRS[1]) / 0.8, 50.0
+    row, turn = np.zeros(int(straight_m / speed * rate)), np.full(int(turn_s * rate), 0.4)
+    ahead = np.concatenate([row, turn, row, -turn, row, turn, row])
+    v_left, v_right = speed + ahead, speed - ahead
+    x = np.zeros((len(ahead), 6))
+    x[0] = [0.0, 0.0, 0.3, *ICRS]
+    for k in range(len(x) - 1):
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1 / rate, 0.5)
+    stamps = clean().wheels.stamp_ns[0] + np.round(np.arange(len(x)) / rate * 1e9).astype(np.int64)
+    fix = slice(0, None, 5)
+    place = x[fix, :2] + np.random.default_rng(1).normal(0, 0.01, (len(x[fix]), 2))
+    known = np.full(len(place), 1e-4)
+    return replace(
+        clean(),
+        wheels=WheelSamples(stamps, v_left, v_right),
+        gnss=PositionFixes(stamps[fix], *place.T, known, known, np.zeros(len(place))),
+        heading=HeadingSamples(stamps, np.radians(np.round(np.degrees(x[:, 2]))), np.full(len(x), 3e-4)),
+    )
+
+
+@pytest.mark.parametrize("left_scale", [0.98, 1.0, 1.02])
+def test_a_heading_in_whole_degrees_on_straight_rows_is_not_stuck(left_scale: float) -> None:
+    log = rows()
+    wheels = replace(log.wheels, v_left_mps=left_scale * log.wheels.v_left_mps)
+    check = check_heading(replace(log, wheels=wheels), load_config(sets=[WIDTH]))
+    assert check.warnings == ()
+    assert check.agreement > 0.99
+
+
+def test_a_heading_stuck_from_the_first_turn_on_is_refused_on_straight_rows() -> None:
+    log = rows()
+    stuck = np.where(np.arange(len(log.heading.heading_rad)) > 2000, log.heading.heading_rad[0], 0.3)
+    with pytest.raises(DataError, match="stays the same while the wheels turn the robot"):
+        check_heading(told(log, stuck), load_config(sets=[WIDTH]))
 
 
 def test_a_noisy_heading_is_not_an_unexplained_one() -> None:

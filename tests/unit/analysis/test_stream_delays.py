@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
+from icrtool.analysis.stream_delays import heading_delay
 from icrtool.config import load_config
 from icrtool.core.ekf_plain import step_state
 from icrtool.tables import Datum, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
@@ -115,3 +117,22 @@ def test_a_constant_speed_tells_no_delay_of_the_fixes() -> None:
     summary = fit(circle, load_config(sets=[WIDTH])).summary
     assert summary["gnss"]["delay_s"] is None
     assert summary["heading"]["delay_s"] is None
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row: int) -> None:
+    log = stop_and_go(heading_late_s=0.3)
+    stray = [stream.stamp_ns.copy() for stream in (log.wheels, log.heading)]
+    for stamps in stray:
+        stamps[row] += -START_NS if row == 0 else START_NS
+    wheels, heading = replace(log.wheels, stamp_ns=stray[0]), replace(log.heading, stamp_ns=stray[1])
+    tracemalloc.start()
+    try:
+        found = heading_delay(replace(log, wheels=wheels, heading=heading))
+        most = tracemalloc.get_traced_memory()[1]
+    except MemoryError:
+        pytest.fail("an array over the time between first and last stamp")
+    finally:
+        tracemalloc.stop()
+    assert found.value_s == pytest.approx(0.3, abs=DELAY_TOLERANCE_S)
+    assert most < 50e6
