@@ -48,7 +48,9 @@ def value_text(finding: Finding) -> str:
 
 def _setting_lines(calibration: Calibration) -> list[str]:
     if not calibration.settings:
-        return ["nothing to configure: what the drive showed is what the configuration already says"]
+        if any(finding.verdict == "shown" for finding in calibration.findings):
+            return ["nothing to configure: what the drive showed is what the configuration already says"]
+        return ["nothing to configure: the drive showed nothing well enough"]
     lines = ["to configure, as options:"]
     lines.append("  " + " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings))
     lines.append("or in a file for --config:")
