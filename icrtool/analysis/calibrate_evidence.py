@@ -130,9 +130,11 @@ def _way_of_a_value(log: RobotLog, dt: Floats) -> float:
 
 def summarise_drive(evidence: Evidence) -> DriveFacts:
     """Summarise the drive from wheels and heading."""
-    turns = np.diff(
-        np.interp(np.arange(evidence.heading_t[0], evidence.heading_t[-1], 1.0), evidence.heading_t, evidence.heading)
-    )
+    # The whole seconds that have samples, not all between first and last: a stray stamp may be decades away.
+    t, heading = evidence.heading_t, evidence.heading
+    begins = t[0] + np.unique(np.floor(t - t[0]))
+    begins = begins[begins + 1.0 <= t[-1]]
+    turns = np.interp(begins + 1.0, t, heading) - np.interp(begins, t, heading)
     mean = (evidence.v_left + evidence.v_right) / 2
     moving = (np.abs(evidence.v_left) + np.abs(evidence.v_right)) > 0.05
     turning = np.abs(turns)[np.abs(turns) > math.radians(2)]

@@ -183,6 +183,17 @@ def test_a_late_heading_is_proposed_as_a_setting_and_one_on_time_is_not() -> Non
     assert settings["frames.heading_delay_s"].why == "heading late against the wheels"
 
 
+def test_a_stray_stamp_decades_away_costs_no_memory() -> None:
+    log = simulate()
+    stray = log.heading.stamp_ns.copy()
+    stray[0] -= 50 * 365 * 86_400 * 1_000_000_000
+    plain, found = (
+        calibrate(replace(log, heading=replace(log.heading, stamp_ns=stamps)), CONFIG)
+        for stamps in (log.heading.stamp_ns, stray)
+    )
+    assert found.facts.turned_right_rad == pytest.approx(plain.facts.turned_right_rad, abs=0.1)
+
+
 def test_too_short_a_drive_is_refused() -> None:
     with pytest.raises(DataError, match=r"windows of 1\.0 m of way"):
         calibrate(simulate(0, seconds=8.0), CONFIG)
