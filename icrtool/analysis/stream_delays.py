@@ -36,6 +36,9 @@ ROUNDS, REWEIGHTS, SETTLED_S = 4, 5, 1e-3
 SMALLEST_CHANGE_MPS = 0.015
 """Changes of speed beyond what the other columns explain, root mean square: with less, as on a circle, slip decides."""
 
+LEAST_EXPLAINED = 0.5
+"""Share of the changes seen that the wheels explain; with less, as on a circle, a delay fits noise to noise."""
+
 LARGEST_STEP_S, LARGEST_DELAY_S = 0.2, 1.0
 
 SIGNIFICANT_SIGMAS = 5.0
@@ -248,12 +251,15 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
     Huber's weights (Huber 1964); the covariance takes `BLOCK` windows for one sample (sandwich, White 1982).
     """
     delay, std = 0.0, math.nan
+    weight: Floats
+    left: Floats
+    seen: Floats
     for first in (True, *(False,) * (ROUNDS - 1)):
         design, seen, scale_of = explain(delay)
         weight = np.ones(len(seen))
         ridge = 1e-9 * np.diag((design**2).sum(axis=0) + 1e-12)
         solution: Floats = np.zeros(design.shape[1])
-        left: Floats = seen
+        left = seen
         inverse: Floats = ridge
         for _ in range(REWEIGHTS):
             weighted = design * weight[:, None]
@@ -274,4 +280,8 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
             return UNKNOWN
         if abs(step) < SETTLED_S:
             break
+    moved = seen - seen.mean()
+    explains = float((weight * left**2).sum()) <= (1.0 - LEAST_EXPLAINED) * float((weight * moved**2).sum())
+    if not explains:
+        return UNKNOWN
     return Delay(delay, std)

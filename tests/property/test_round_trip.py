@@ -118,6 +118,15 @@ def test_the_truth_stands_beside_the_states_of_the_fit(tmp_path: Path) -> None:
     assert np.abs(both.v_left_mps - both.v_left_mps_true).median() < 0.01
 
 
+def test_a_steady_circle_with_rough_sensors_shows_no_delay(tmp_path: Path) -> None:
+    """At a constant turn rate any delay fits: noise of the wheels must not be matched with noise of the heading."""
+    sensors = ("--gnss", "waas", "--input-noise", 0.03, "--seed", 10)
+    path = ("--path", "circle", "--radius", 3.0, "--speed", 0.8, "--duration", 90)
+    run, truth = round_trip(tmp_path, *sensors, *path, robot="warthog")
+    assert run.summary["heading"]["applied_delay_s"] == 0.0
+    assert max(map(abs, off_by(run, truth).values())) < SIGMAS
+
+
 @pytest.mark.stress
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("path", [path for path in PATHS if path != "straight"])
