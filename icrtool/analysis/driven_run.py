@@ -51,6 +51,11 @@ def drive_of(run: DrivenRun) -> Drive:
     for begin, end in run.outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
         in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
+    return drive_through(table, run.in_gap, in_outage)
+
+
+def drive_through(table: States, in_gap: Bools, in_outage: Bools) -> Drive:
+    """Return states as the kernels want them."""
     return Drive(
         dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
         v_left=table.v_left_mps,
@@ -59,6 +64,6 @@ def drive_of(run: DrivenRun) -> Drive:
         east=table.east_m,
         heading=table.heading_rad,
         distance=table.distance_m,
-        gap=run.in_gap,
+        gap=in_gap,
         in_outage=in_outage,
     )

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from icrtool.core.window_fit import Complexes
-from icrtool.tables import Bools, Floats, Ints, PositionFixes, RobotLog
+from icrtool.tables import Bools, Complexes, Floats, Ints, PositionFixes, RobotLog
 
 FEWEST_STEPS = 40
 """Fewer steps tell no noise; a stretch is judged by as many."""
@@ -30,6 +29,9 @@ MOVES_MPS = 0.05
 
 MOST_TO_FIT = 10_000
 GAP_IN_INTERVALS = 5.0
+
+LONGEST_INTERVAL_S = 1.0
+"""Between wheel samples further apart the way is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +101,8 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
         unknown = np.full(max(count - 2, 0), np.nan)
         still = np.zeros(max(count - 1, 0), np.bool_)
         return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, still, np.empty(0, np.int64), none)
-    interval = np.diff(wheels.stamp_ns) / 1e9
     speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
-    travelled = np.concatenate([[0.0], np.cumsum(speed * np.where(interval < 1.0, interval, 0.0))])
+    travelled = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
     way = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
 
     def nose(stamps: Ints) -> Complexes:
@@ -182,3 +183,8 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
     stays = np.abs(shift - step[found]) < PERSISTS_SHARE * np.abs(step[found])
     rows: Ints = (found[stays] + 1).astype(np.int64)
     return rows, step[found[stays]]
+
+
+def unbroken(interval_s: Floats) -> Floats:
+    """Return intervals between wheel samples [s], zero for those that are too long to say what happened in them."""
+    return np.where(interval_s < LONGEST_INTERVAL_S, interval_s, 0.0)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.fix_steps import bend_std_m
+from icrtool.analysis.fix_steps import bend_std_m, unbroken
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -47,8 +47,6 @@ STUCK_WAY_M, WHEELS_OFF = 1.0, 0.1
 """A side that goes ahead by less than this part of the way, over so much of it, does not show a turn: wheels of unequal
 size do so on a straight row."""
 
-LONGEST_INTERVAL_S = 1.0
-"""Between wheel samples further apart the way is not known."""
 
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course, beyond what the fixes explain, above which the heading's noise is raised to it."""
@@ -256,8 +254,7 @@ def _clearly_ahead(ahead: Floats, way: Floats) -> Floats:
 
 def _known_intervals(wheels: WheelSamples) -> Floats:
     """Return the seconds between wheel samples (n - 1,), none through a gap."""
-    interval = np.diff(wheels.stamp_ns) / 1e9
-    return np.where(interval < LONGEST_INTERVAL_S, interval, 0.0)
+    return unbroken(np.diff(wheels.stamp_ns) / 1e9)
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:

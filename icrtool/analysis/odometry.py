@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icrtool.core.open_loop import Drive, open_loop_path
+from icrtool.analysis.driven_run import drive_through
+from icrtool.core.open_loop import open_loop_path
 from icrtool.tables import Bools, Floats, States
 
 if TYPE_CHECKING:
@@ -55,17 +56,7 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
     Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
-    drive = Drive(
-        dt_s=np.append(np.diff(table.t_s), 0.0),
-        v_left=table.v_left_mps,
-        v_right=table.v_right_mps,
-        north=table.north_m,
-        east=table.east_m,
-        heading=table.heading_rad,
-        distance=table.distance_m,
-        gap=in_gap,
-        in_outage=np.zeros(len(table), np.bool_),
-    )
+    drive = drive_through(table, in_gap, np.zeros(len(table), np.bool_))
     north, east = np.empty(len(table)), np.empty(len(table))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0

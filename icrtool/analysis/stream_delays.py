@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.fix_steps import unbroken
 from icrtool.analysis.heading_check import HeadingCheck
 from icrtool.analysis.reference_delay import busiest_part, delayed
 from icrtool.config import Config
-from icrtool.core.window_fit import Complexes
-from icrtool.tables import Bools, Floats, HeadingSamples, RobotLog
+from icrtool.tables import Bools, Complexes, Floats, HeadingSamples, RobotLog
 
 HEADING_WINDOW_S = 0.5
 WAY_WINDOW_S = 1.0
@@ -232,8 +232,7 @@ def _without_gap(t: Floats, begin: Floats, end: Floats) -> Bools:
 
 def _sum(speed: Floats | Complexes, t: Floats) -> Complexes:
     """Return the way since the first sample (n,) of speeds that hold until the next; none through a gap."""
-    interval = np.diff(t)
-    return np.concatenate([[0.0], np.cumsum(speed[:-1] * np.where(interval < 1.0, interval, 0.0))])
+    return np.concatenate([[0.0], np.cumsum(speed[:-1] * unbroken(np.diff(t)))])
 
 
 def _unexplained(design: Floats) -> float:

@@ -75,6 +75,16 @@ def gnss_text(text: str) -> float:
     return metres
 
 
+CHANGE = click.option(
+    "--change",
+    "changes",
+    metavar="T:YR,YL,X",
+    type=change_text,
+    multiple=True,
+    help="The ICRs become these after T seconds; repeatable.",
+)
+
+
 @click.command("simulate")
 @click.option(
     "-o",
@@ -136,14 +146,7 @@ def gnss_text(text: str) -> float:
     type=icrs_text,
     help="True ICRs [m]; default: 1.5 times half the track width to either side, x 0.",
 )
-@click.option(
-    "--change",
-    "changes",
-    metavar="T:YR,YL,X",
-    type=change_text,
-    multiple=True,
-    help="The ICRs become these after T seconds; repeatable.",
-)
+@CHANGE
 @click.option(
     "--wheels",
     type=click.Choice(["encoder", "commanded"]),

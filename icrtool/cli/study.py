@@ -12,10 +12,10 @@ import click
 from icrtool.cli import options
 from icrtool.cli.fit import RUNS, plot_formats
 from icrtool.cli.simulate import (
+    CHANGE,
     NOT_NEGATIVE,
     PATHS,
     POSITIVE,
-    change_text,
     default_icrs,
     encoder_counts,
     gnss_text,
@@ -78,14 +78,7 @@ def values_text(text: str) -> tuple[float, ...]:
     type=icrs_text,
     help="True ICRs [m]; default the paper's 0.5,-0.75,-0.25, or by the robot's width.",
 )
-@click.option(
-    "--change",
-    "changes",
-    metavar="T:YR,YL,X",
-    type=change_text,
-    multiple=True,
-    help="The ICRs become these after T seconds; repeatable.",
-)
+@CHANGE
 @click.option("--path", "kind", type=click.Choice(PATHS), help="What is driven; in study convergence, this alone.")
 @click.option("--duration", metavar="S", type=POSITIVE, help="Length of a run [s].")
 @click.option("--speed", metavar="MPS", type=POSITIVE, help="Speed of the body; of the faster track on the spot.")

@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
-from icrtool.cli import main
 from icrtool.config import load_config
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
 ROBOT = ("--robot", "segway-rmp400")
-
-
-@pytest.fixture
-def icrtool(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as left:
-            return int(left.code or 0), *capfd.readouterr()
-        return 0, *capfd.readouterr()
-
-    return run
 
 
 def test_a_log_is_calibrated_printed_and_written(icrtool, tmp_path: Path) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.cli import main
 from icrtool.cli.export import TARGETS
 from icrtool.report import export
 
@@ -29,18 +27,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def icrtool(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], runs: Path):
-    monkeypatch.chdir(runs)
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as left:
-            return int(left.code or 0), *capfd.readouterr()
-        return 0, *capfd.readouterr()
-
-    return run
+def run_place(runs: Path) -> Path:
+    return runs
 
 
 @pytest.mark.parametrize("target", TARGETS)

@@ -1,0 +1,31 @@
+"""Commands run in the process of the tests, as a user calls them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from icrtool.cli import main
+
+
+@pytest.fixture
+def run_place(tmp_path: Path) -> Path:
+    """The folder commands run in."""
+    return tmp_path
+
+
+@pytest.fixture
+def icrtool(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], run_place: Path):
+    monkeypatch.chdir(run_place)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as left:
+            return int(left.code or 0), *capfd.readouterr()
+        return 0, *capfd.readouterr()
+
+    return run
