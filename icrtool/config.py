@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+import msgspec
 
 from icrtool.errors import ConfigError
 
-Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Probability = Annotated[float, Field(strict=True, gt=0, lt=1)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
+Longitude = Annotated[float, msgspec.Meta(ge=-180, le=360)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RobotConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
     """The robot: `track_width_m` is b of Eqs. 38-39, the distance between the centre lines of the tracks."""
 
     name: str | None = None
@@ -31,7 +32,8 @@ class RobotConfig(_Section):
     encoder_counts_per_rev: Positive | None = None
 
 
-class TopicsConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class TopicsConfig:
     """Topics by role. What is left out is found by type and content."""
 
     wheels: str | None = None
@@ -40,16 +42,15 @@ class TopicsConfig(_Section):
     gnss: str | None = None
     heading: str | None = None
 
-    @model_validator(mode="after")
-    def _one_way_to_name_the_wheels(self) -> TopicsConfig:
+    def __post_init__(self) -> None:
         if (self.wheel_left is None) != (self.wheel_right is None):
             raise ValueError("wheel_left and wheel_right come together")
         if self.wheels is not None and self.wheel_left is not None:
             raise ValueError("give wheels, or wheel_left and wheel_right, not both")
-        return self
 
 
-class WheelsConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class WheelsConfig:
     """How wheel messages become speeds.
 
     Scales multiply the travel of a side (1.02: the wheel is 2 % larger); ``auto`` is 1, or what the position reference
@@ -59,17 +60,16 @@ class WheelsConfig(_Section):
     left_joints: tuple[str, ...] = ()
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
-    left_scale: Literal["auto"] | Finite = "auto"
-    right_scale: Literal["auto"] | Finite = "auto"
+    left_scale: Literal["auto"] | float = "auto"
+    right_scale: Literal["auto"] | float = "auto"
 
-    @model_validator(mode="after")
-    def _possible(self) -> WheelsConfig:
+    def __post_init__(self) -> None:
         if self.left_scale == 0 or self.right_scale == 0:
             raise ValueError("a scale of 0 would stop a side")
-        return self
 
 
-class FramesConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class FramesConfig:
     """Where sensors sit and what their yaw means.
 
     `antenna_*`: the antenna from the body origin; ``auto`` is what the log's own ``/tf_static`` says, else 0.
@@ -78,15 +78,16 @@ class FramesConfig(_Section):
     """
 
     heading: Literal["auto", "enu", "ned"] = "auto"
-    heading_offset_deg: Literal["auto"] | Finite = "auto"
-    reference_delay_s: Literal["auto"] | Finite = "auto"
-    heading_delay_s: Literal["auto"] | Finite = "auto"
-    antenna_forward_m: Literal["auto"] | Finite = "auto"
-    antenna_right_m: Literal["auto"] | Finite = "auto"
-    datum: tuple[Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=360)]] | None = None
+    heading_offset_deg: Literal["auto"] | float = "auto"
+    reference_delay_s: Literal["auto"] | float = "auto"
+    heading_delay_s: Literal["auto"] | float = "auto"
+    antenna_forward_m: Literal["auto"] | float = "auto"
+    antenna_right_m: Literal["auto"] | float = "auto"
+    datum: tuple[Latitude, Longitude] | None = None
 
 
-class FilterConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class FilterConfig:
     """The EKF of Section 3. A value left out is the preset's.
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
@@ -99,9 +100,9 @@ class FilterConfig(_Section):
     """
 
     preset: Literal["field", "paper"] = "field"
-    initial_y_icr_right_m: Finite | None = None
-    initial_y_icr_left_m: Finite | None = None
-    initial_x_icr_m: Finite | None = None
+    initial_y_icr_right_m: float | None = None
+    initial_y_icr_left_m: float | None = None
+    initial_x_icr_m: float | None = None
     initial_icr_std_m: Positive | None = None
     process_position_mps: Literal["auto"] | NotNegative = "auto"
     process_heading_degps: NotNegative | None = None
@@ -116,23 +117,28 @@ class FilterConfig(_Section):
     wheel_gap_s: Positive = 0.5
 
 
-class DropoutConfig(_Section):
+@dataclass(frozen=True, slots=True)
+class DropoutConfig:
     """The analysis of Section 6.4."""
 
     horizons_m: tuple[Positive, ...] = tuple(float(d) for d in range(1, 21))
     forced_outage_s: tuple[Positive, ...] = ()
 
-    @model_validator(mode="after")
-    def _at_least_one(self) -> DropoutConfig:
+    def __post_init__(self) -> None:
         if not self.horizons_m:
             raise ValueError("horizons_m is empty")
         if len(set(self.horizons_m)) != len(self.horizons_m):
             raise ValueError("horizons_m names a distance twice")
-        return self
 
 
-class Config(_Section):
-    """Everything a scientist would change. Frozen; `effective` is what run.json records."""
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Everything a scientist would change. Frozen; `effective` is what run.json records.
+
+    Attributes
+    ----------
+    given : the keys that were set, by robot, file or ``--set``, as ``section.key``; the rest has its default
+    """
 
     robot: RobotConfig = RobotConfig()
     topics: TopicsConfig = TopicsConfig()
@@ -140,10 +146,50 @@ class Config(_Section):
     frames: FramesConfig = FramesConfig()
     filter: FilterConfig = FilterConfig()
     dropout: DropoutConfig = DropoutConfig()
+    given: frozenset[str] = field(default=frozenset(), compare=False)
 
     def effective(self) -> dict[str, Any]:
         """Return the configuration as plain JSON data, section by section."""
-        return self.model_dump(mode="json")
+        document: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(self))
+        return {section: document[section] for section in SECTIONS}
+
+    def with_filter(self, **changes: float | str) -> Config:
+        """Return it with other values in ``[filter]``."""
+        return replace(self, filter=replace(self.filter, **changes))  # type: ignore[arg-type]  # as the caller names them
+
+    @property
+    def given_sections(self) -> frozenset[str]:
+        """The sections in which a key was set."""
+        return frozenset(key.partition(".")[0] for key in self.given)
+
+
+SECTIONS: dict[str, type] = {part.name: type(part.default) for part in fields(Config) if part.name != "given"}
+"""The sections of a configuration file, and what each holds."""
+
+
+def parse_config(document: Mapping[str, Any]) -> Config:
+    """Return a configuration from plain data, section by section.
+
+    Raises
+    ------
+    ConfigError
+        Unknown key, wrong type or impossible value; the key is named.
+    """
+    sections, given = {}, []
+    for name, values in document.items():
+        if name not in SECTIONS:
+            raise ConfigError(name, "unknown configuration key", f"the sections are {', '.join(SECTIONS)}")
+        if not isinstance(values, Mapping):
+            raise ConfigError(name, "this is a section of the configuration", f"found {values!r}")
+        known = [key.name for key in fields(SECTIONS[name])]
+        for key, value in values.items():
+            if key not in known:
+                raise ConfigError(f"{name}.{key}", "unknown configuration key", f"[{name}] knows {', '.join(known)}")
+            if not _is_finite(value):
+                raise ConfigError(f"{name}.{key}", "not a finite number", f"found {value!r}")
+        sections[name] = _parse_section(name, values)
+        given += [f"{name}.{key}" for key in values]
+    return Config(**sections, given=frozenset(given))
 
 
 def builtin_robots() -> dict[str, dict[str, Any]]:
@@ -178,10 +224,7 @@ def load_config(path: str | Path | None = None, robot: str | None = None, sets: 
                 merged[section] = {**merged.get(section, {}), **values}
             else:
                 merged[section] = values
-    try:
-        return Config.model_validate(merged)
-    except ValidationError as err:
-        raise _first_problem(err) from err
+    return parse_config(merged)
 
 
 def _builtin_robot(name: str) -> dict[str, Any]:
@@ -218,22 +261,37 @@ def _parse_set(text: str) -> dict[str, Any]:
     return {section: {name: parsed}}
 
 
-def _first_problem(err: ValidationError) -> ConfigError:
-    problem = err.errors(include_url=False)[0]
-    location = [str(part) for part in problem["loc"]]
-    key = ".".join(part for part in location[:2]) or "configuration"
-    if problem["type"] == "extra_forbidden":
-        return ConfigError(key, "unknown configuration key", _known_keys(location))
-    message = problem["msg"].removeprefix("Value error, ")
-    given = problem["input"]
-    found = f"found {given!r}" if isinstance(given, str | int | float | bool | list) else "see the configuration page"
-    return ConfigError(key, message[:1].lower() + message[1:], found)
+def _is_finite(value: object) -> bool:
+    if isinstance(value, list | tuple):
+        return all(_is_finite(item) for item in value)
+    return not isinstance(value, float) or math.isfinite(value)
 
 
-def _known_keys(location: list[str]) -> str:
-    sections = Config.model_fields
-    if len(location) > 1 and location[0] in sections:
-        model = sections[location[0]].annotation
-        fields = model.model_fields if model is not None else {}
-        return f"[{location[0]}] knows {', '.join(fields)}"
-    return f"the sections are {', '.join(sections)}"
+def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - the section's own type
+    try:
+        return msgspec.convert(dict(values), SECTIONS[name])
+    except msgspec.ValidationError as err:
+        # the words of a __post_init__, or "… - at `$.key[0]`"
+        message, _, place = str(err).partition(" - at `$.")
+        key = place.rstrip("`").partition("[")[0]
+        if not key:
+            raise ConfigError(name, message, "see the configuration page") from err
+        expected = _described(get_type_hints(SECTIONS[name], include_extras=True)[key])
+        raise ConfigError(f"{name}.{key}", f"expected {expected}", f"found {values[key]!r}") from err
+
+
+def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it
+    """Return a key's type in the words of TOML."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        bounds = ((">", parts[1].gt), ("≥", parts[1].ge), ("<", parts[1].lt), ("≤", parts[1].le))
+        words = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+        return f"{_described(parts[0])} {words}"
+    if origin is Literal:
+        return " or ".join(f'"{word}"' for word in parts)
+    if origin is tuple:
+        each = [_described(part) for part in parts if part is not ...]
+        return f"[{', '.join(each)}{', …' if ... in parts else ''}]"
+    if parts:
+        return " or ".join(_described(part) for part in parts if part is not NoneType)
+    return "a number" if kind is float else "a text"

@@ -31,7 +31,7 @@ from icrtool.analysis.calibrate_evidence import (
     gather,
     summarise_drive,
 )
-from icrtool.analysis.filter_setup import half_width_m
+from icrtool.analysis.driven_run import half_width_m
 from icrtool.config import Config
 from icrtool.tables import Complexes, Floats, RobotLog
 
@@ -120,7 +120,7 @@ def estimate(log: RobotLog, config: Config | None = None) -> Estimate:
     """
     config = config if config is not None else Config()
     evidence = gather(log, config)
-    width = 2.0 * half_width_m(config)
+    width = 2.0 * half_width_m(config.robot.track_width_m)
     values = np.array([0.0, 0.0, _first_offset(evidence), 0.0, 0.0, 0.0, 1.0, 1.0, 1.4 * width])
     spread = PRIOR_STD.copy()
     topics = {stream.role: stream.topic for stream in log.streams}

@@ -9,6 +9,12 @@ import numpy as np
 from icrtool.core.open_loop import Drive
 from icrtool.tables import Bools, Ints, States
 
+RUN_SCHEMA = "icrtool/run/1"
+"""Version of what the summary of a run holds."""
+
+DEFAULT_HALF_WIDTH_M = 0.3
+"""Half of a small field robot, where the width is not known."""
+
 
 class DrivenRun(Protocol):
     """A filter run, just made or read back: what the analysis needs of it."""
@@ -42,6 +48,11 @@ class DrivenRun(Protocol):
     def summary(self) -> dict[str, Any]:
         """What run.json holds, the effective configuration among it."""
         ...
+
+
+def half_width_m(track_width_m: float | None) -> float:
+    """Return b/2, or what stands for it when the width is not known."""
+    return track_width_m / 2 if track_width_m is not None else DEFAULT_HALF_WIDTH_M
 
 
 def drive_of(run: DrivenRun) -> Drive:

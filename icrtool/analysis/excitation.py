@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.analysis.driven_run import DrivenRun, drive_of
-from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
+from icrtool.analysis.driven_run import DrivenRun, drive_of, half_width_m
 from icrtool.core.window_fit import NEUTRAL, displace, move
 from icrtool.tables import Floats
 
@@ -136,7 +135,7 @@ def _nominal(run: DrivenRun) -> Floats:
     """Return parameters (7,) near which to ask: the run's final ICRs where they can be, else those of the width."""
     table = run.table
     right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    half = run.track_width_m / 2 if run.track_width_m is not None else DEFAULT_HALF_WIDTH_M
+    half = half_width_m(run.track_width_m)
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
     return np.array([right, left, x, *NEUTRAL[3:]])

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.driven_run import half_width_m
 from icrtool.analysis.usable_streams import check_streams
 from icrtool.config import Config, FilterConfig
 from icrtool.core.ekf import FilterParameters, Measurements
@@ -29,9 +30,6 @@ truth on rigid-body simulated robots, with these 90 % and more."""
 PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
 PAPER_INITIAL_ICR_STD_M = 1.0
 """Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
-
-DEFAULT_HALF_WIDTH_M = 0.3
-"""Start of the ICRs when the robot's width is not known: half of a small field robot."""
 
 LARGEST_SANE_GNSS_STD_M = 100.0
 LARGEST_SANE_HEADING_STD_RAD = math.radians(60.0)
@@ -144,12 +142,6 @@ def set_up_filter(
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
 
-def half_width_m(config: Config) -> float:
-    """Return b/2, or what stands for it when the width is not known."""
-    width = config.robot.track_width_m
-    return width / 2 if width is not None else DEFAULT_HALF_WIDTH_M
-
-
 def chi2_gate(probability: float, degrees: int) -> float:
     """Return the quantile of the chi-squared distribution with 1 or 2 degrees of freedom."""
     if degrees == 2:
@@ -225,7 +217,7 @@ def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
-    settings, half = config.filter, half_width_m(config)
+    settings, half = config.filter, half_width_m(config.robot.track_width_m)
     paper = settings.preset == "paper"
     preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
@@ -241,7 +233,9 @@ def _terrain_icr_std_m(config: Config) -> float:
     given = config.filter.terrain_icr_std_m
     if given is not None:
         return given
-    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config)
+    return (
+        PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config.robot.track_width_m)
+    )
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
@@ -308,5 +302,5 @@ def _parameters(
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config),
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config.robot.track_width_m),
     )

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.tables import Floats, Ints
+
+if TYPE_CHECKING:
+    from icrtool.analysis.fit import FilterRun
 
 LONGEST_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""

@@ -181,8 +181,7 @@ KINDS: dict[StudyName, StudyKind] = {
 def default_request(name: StudyName, config: Config) -> StudyRequest:  # noqa: PLR0911 - one a study
     """Return a study with the paper's parameters, and the configuration's robot for the start of preset ``field``."""
     if config.robot.track_width_m is None:
-        robot = config.robot.model_copy(update={"track_width_m": PAPER_TRACK_WIDTH_M})
-        config = config.model_copy(update={"robot": robot})
+        config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
     plan, sensors = Drive(step_s=STUDY_STEP_S), Sensors(wheels="ideal", heading_resolution_rad=0.0)
     both: tuple[Preset, ...] = ("paper", "field")
     base = StudyRequest(name, plan, sensors, config, both, runs=40)

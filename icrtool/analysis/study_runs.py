@@ -83,7 +83,7 @@ def with_start(config: Config, icrs_m: Icrs, std_m: float | None = None) -> Conf
     change: dict[str, float] = dict(zip(names, icrs_m, strict=True))
     if std_m is not None:
         change["initial_icr_std_m"] = std_m
-    return config.model_copy(update={"filter": config.filter.model_copy(update=change)})
+    return config.with_filter(**change)
 
 
 def run_scenarios(

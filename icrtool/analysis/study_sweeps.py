@@ -36,7 +36,7 @@ class Level:
 
 def with_preset(config: Config, preset: str) -> Config:
     """Return the configuration with a filter preset."""
-    return config.model_copy(update={"filter": config.filter.model_copy(update={"preset": preset})})
+    return config.with_filter(preset=preset)
 
 
 def base_scenario(request: StudyRequest, preset: str) -> Scenario:

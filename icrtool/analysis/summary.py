@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool import __version__
+from icrtool.analysis.driven_run import RUN_SCHEMA
 from icrtool.core.ekf import GATED, RECOVERED, UNSEEN
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.tables import Floats, Ints, RobotLog, States
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from icrtool.analysis.stream_delays import StreamDelays
     from icrtool.analysis.wheel_check import WheelCheck
 
-RUN_SCHEMA = "icrtool/run/1"
 
 ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 

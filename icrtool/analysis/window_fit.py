@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.driven_run import DrivenRun, drive_of
-from icrtool.analysis.filter_setup import DEFAULT_HALF_WIDTH_M
+from icrtool.analysis.driven_run import DrivenRun, drive_of, half_width_m
 from icrtool.analysis.window_models import CONSTANT, WindowModel, base_parameters, basis_of, usual_terms
 from icrtool.core.open_loop import trial_ends
 from icrtool.core.window_fit import move, window_misses
@@ -163,7 +162,7 @@ def cut_windows(run: DrivenRun, lengths_m: Iterable[float] = WINDOWS_M, every_m:
         end_m=table.distance_m[end],
         length_m=length_m,
         reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
-        width_m=run.track_width_m if run.track_width_m is not None else 2.0 * DEFAULT_HALF_WIDTH_M,
+        width_m=2.0 * half_width_m(run.track_width_m),
         lag=np.zeros(len(table)),
     )
 

@@ -79,8 +79,8 @@ def _read(source: Path, config: Config, *, quiet: bool) -> tuple[RobotLog, Confi
         from icrtool.errors import ConfigError
         from icrtool.report.dropout_source import log_of, read_source, stored_config
 
-        if config.model_fields_set:
-            section = min(config.model_fields_set)
+        if config.given_sections:
+            section = min(config.given_sections)
             raise ConfigError(
                 f"[{section}]", "a finished run keeps the configuration it was made with", "name its log instead"
             )

@@ -149,7 +149,7 @@ def plan_sources(
     sources = sources or (newest_run(RUNS),)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
     check_configuration(config, runs_only=not logs, output=output)
-    return sources, dict(zip(logs, run_directories(logs, output), strict=True))
+    return sources, dict(zip(logs, run_directories(logs, output), strict=True)) if logs else {}
 
 
 def report_all(
@@ -192,7 +192,7 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
     """Refuse options that would change nothing: a finished run keeps its configuration and its place."""
     from icrtool.errors import ConfigError
 
-    given = sorted(config.model_fields_set - {"dropout"})
+    given = sorted(config.given_sections - {"dropout"})
     advice = "fit the log again with it, or name the log in place of its run"
     if runs_only and given:
         raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
@@ -310,8 +310,8 @@ def _horizons(run: DrivenRun, request: Request) -> list[float]:
     """Return the horizons asked for: by option, else configured; and those that gates name."""
     from icrtool.analysis.dropout import configured_horizons_m
 
-    dropout = request.config.dropout
-    configured = dropout.horizons_m if "horizons_m" in dropout.model_fields_set else configured_horizons_m(run)
+    config = request.config
+    configured = config.dropout.horizons_m if "dropout.horizons_m" in config.given else configured_horizons_m(run)
     horizons = list(request.horizons_m or configured)
     for gate in request.gates:
         if not any(math.isclose(gate.horizon_m, horizon, rel_tol=1e-9) for horizon in horizons):
@@ -321,17 +321,17 @@ def _horizons(run: DrivenRun, request: Request) -> list[float]:
 
 def _forced_outages(run: StoredRun | FilterRun, request: Request) -> tuple[Outage, ...]:
     """Force the outages asked for, by option or configuration; a stored run's log is read again for them."""
-    from icrtool.analysis.outages import force_outages, plan_outages
-    from icrtool.report.run_directory import StoredRun
-
-    dropout = request.config.dropout
+    config = request.config
     stored = tuple(run.summary["config"]["dropout"]["forced_outage_s"])
-    configured = dropout.forced_outage_s if "forced_outage_s" in dropout.model_fields_set else stored
+    configured = config.dropout.forced_outage_s if "dropout.forced_outage_s" in config.given else stored
     lengths = request.outage_s or configured
     if request.outage_at_s and not lengths:
         raise click.UsageError("--outage-at says when, and needs --outage to say how long")
     if not lengths:
         return ()
+    from icrtool.analysis.forced_outages import force_outages, plan_outages
+    from icrtool.report.run_directory import StoredRun
+
     filtered = _fit_again(run, quiet=request.quiet) if isinstance(run, StoredRun) else run
     plans = [plan_outages(filtered, length, request.outage_at_s) for length in lengths]
     return tuple(outage for plan in plans for outage in force_outages(filtered, plan))

@@ -166,7 +166,7 @@ def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyReq
     if given["kind"] is not None and request.paths:
         changed["paths"] = (given["kind"],)
     preset = given["preset"]
-    if preset is None and "preset" in config.filter.model_fields_set:
+    if preset is None and "filter.preset" in config.given:
         preset = config.filter.preset
     if preset is None and name == "convergence" and config.robot.track_width_m is not None:
         preset = "field"

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from icrtool.analysis.driven_run import DrivenRun
-from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.ladder import Ladder, judge_ladder
 from icrtool.analysis.measured_heading import measured_headings
 from icrtool.errors import DataError
 from icrtool.report.run_directory import StoredRun, read_measured_headings
+
+if TYPE_CHECKING:
+    from icrtool.analysis.fit import FilterRun
 
 
 def ladder_of(judged: DrivenRun, run: StoredRun | FilterRun) -> tuple[Ladder | None, str]:

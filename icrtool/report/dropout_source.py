@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import ValidationError
 
 from icrtool.analysis.driven_run import DrivenRun
-from icrtool.analysis.filter_setup import WarmStart
-from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.reference import held_against
-from icrtool.config import Config
-from icrtool.errors import RunError
+from icrtool.config import Config, parse_config
+from icrtool.errors import ConfigError, RunError
 from icrtool.report.run_directory import RUN_FILE, StoredRun, is_run_directory, read_run, read_smoothed
-from icrtool.tables import RobotLog
+
+if TYPE_CHECKING:
+    from icrtool.analysis.filter_setup import WarmStart
+    from icrtool.analysis.fit import FilterRun
+    from icrtool.tables import RobotLog
 
 SAME_STATE_M = 1e-6
 """States made again on another machine may differ by rounding, not by this much."""
@@ -44,11 +46,9 @@ def stored_config(run: StoredRun) -> Config:
         It is not one that this version knows.
     """
     try:
-        return Config.model_validate(run.summary["config"])
-    except ValidationError as err:
-        problem = err.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in problem["loc"])
-        raise RunError(run.directory, f"its configuration is not ours ({key})", "run icrtool fit again") from err
+        return parse_config(run.summary["config"])
+    except ConfigError as err:
+        raise RunError(run.directory, f"its configuration is not ours ({err.what})", "run icrtool fit again") from err
 
 
 def judged_run(run: StoredRun | FilterRun, directory: Path) -> DrivenRun:
@@ -126,6 +126,8 @@ def warm_start_of(run: StoredRun) -> WarmStart | None:
     RunError
         It is not readable.
     """
+    from icrtool.analysis.filter_setup import WarmStart
+
     stored = run.summary["filter"].get("warm_start")
     if stored is None:
         return None

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import GATED, UNSEEN
 from icrtool.report.decimate import extremes, percentiles
 from icrtool.report.figure_style import BAD_FIX_COLOR, BAR_COLOR, FLOAT_COLOR, MEAN, inches, new_figure, shade_spans
@@ -16,6 +15,8 @@ from icrtool.tables import Bools, Floats
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from icrtool.analysis.fit import FilterRun
 
 WIDTH_IN, HEIGHT_IN = 7.2, 3.9
 

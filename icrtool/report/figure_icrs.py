@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.summary import ICR_COLUMNS
 from icrtool.report.decimate import extremes, percentiles
 from icrtool.report.figure_style import (
@@ -29,6 +28,8 @@ from icrtool.tables import Floats
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from icrtool.analysis.fit import FilterRun
 
 WIDTH_IN = 7.2
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
-from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.fix_quality import CLASSES, REFERENCE
 from icrtool.analysis.odometry import OdometryPath, icr_odometry, no_slip_odometry
 from icrtool.core.ekf import GATED, UNSEEN
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
+    from icrtool.analysis.fit import FilterRun
 
 WIDTH_IN = 7.2
 MARGINS_IN = {"left": 0.75, "right": 0.2, "top": 0.6, "bottom": 1.3}

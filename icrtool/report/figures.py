@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from icrtool.analysis.fit import FilterRun
 from icrtool.report.figure_gnss import draw_gnss_difference
 from icrtool.report.figure_icrs import draw_icr_clusters, draw_icr_estimates
 from icrtool.report.figure_style import save, style
@@ -14,6 +13,8 @@ from icrtool.report.figure_trajectory import draw_trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from icrtool.analysis.fit import FilterRun
 
 FIGURES: dict[str, Callable[[FilterRun], Figure]] = {
     "trajectory": draw_trajectory,

@@ -9,24 +9,26 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from icrtool.analysis.filter_setup import WarmStart
-from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.driven_run import RUN_SCHEMA
 from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.analysis.measured_heading import measured_headings
-from icrtool.analysis.summary import RUN_SCHEMA
 from icrtool.errors import RunError
 from icrtool.report.headings_file import HEADINGS_FILE, read_headings, write_headings
-from icrtool.report.states_csv import StatesFileError, StatesFormat, file_sha256, read_states, write_states
+from icrtool.report.states_csv import StatesFileError, StatesFormat, file_b2sum, read_states, write_states
 from icrtool.report.whole_directory import check_place, whole_directory
 from icrtool.tables import Bools, Ints, States
 
+if TYPE_CHECKING:
+    from icrtool.analysis.filter_setup import WarmStart
+    from icrtool.analysis.fit import FilterRun
+
 RUN_FILE = "run.json"
-CHECKSUM_FILE = "SHA256SUMS"
-"""Sums of run.json and the states, as ``sha256sum -c`` reads them: an edited run is not taken for a measured one."""
+CHECKSUM_FILE = "B2SUMS"
+"""Sums of run.json and the states, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
 
@@ -107,12 +109,12 @@ def write_run(
             sums[f"smoothed.{states}"] = write_states(smoothed, partial / f"smoothed.{states}", states)
         if headings := measured_headings(run):
             write_headings(headings, run.table.stamp_ns, partial / HEADINGS_FILE)
-            sums[HEADINGS_FILE] = file_sha256(partial / HEADINGS_FILE)
+            sums[HEADINGS_FILE] = file_b2sum(partial / HEADINGS_FILE)
         if plots:
             (partial / "plots").mkdir()
             _draw(run, partial / "plots", plots)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        sums = {RUN_FILE: file_sha256(partial / RUN_FILE), states_name: states_sum.result()} | sums
+        sums = {RUN_FILE: file_b2sum(partial / RUN_FILE), states_name: states_sum.result()} | sums
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
 
 
@@ -199,6 +201,8 @@ def read_warm_start(directory: Path) -> WarmStart:
     RunError
         As `read_run`, or a run that did not record them.
     """
+    from icrtool.analysis.filter_setup import WarmStart
+
     document = read_run(directory).summary
     try:
         final = document["icr"]["final"]
@@ -288,7 +292,7 @@ def _read_sums(directory: Path) -> dict[str, str]:
 
 def _check_sum(directory: Path, name: str, expected: str | None) -> None:
     try:
-        found = file_sha256(directory / name)
+        found = file_b2sum(directory / name)
     except OSError as err:
         raise RunError(directory, f"{name} is missing or unreadable", "run icrtool fit again") from err
     if found != expected:

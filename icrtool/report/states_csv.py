@@ -9,10 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from icrtool.tables import Floats, Ints, States
 
@@ -47,7 +48,7 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
     Returns
     -------
     str
-        SHA-256 (hex) of the file.
+        Sum of the file, as `file_b2sum`.
 
     Raises
     ------
@@ -64,8 +65,8 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
 
         with path.open("xb") as file:
             pq.write_table(_arrow(table.columns()), file, compression="zstd")
-        return file_sha256(path)
-    digest, chunks = hashlib.sha256(), _csv_chunks(table)
+        return file_b2sum(path)
+    digest, chunks = hashlib.blake2b(), _csv_chunks(table)
 
     def store(chunk: bytes) -> None:
         digest.update(chunk)
@@ -101,19 +102,26 @@ def read_states(path: Path, states: StatesFormat) -> States:
         else:
             import pyarrow.csv as pc
 
-            options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS))
+            options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
             stored = pc.read_csv(path, convert_options=options)
         if dict(zip(stored.schema.names, stored.schema.types, strict=True)) != types:
             raise StatesFileError("its columns are not those of the states")
-        return States(**{name: np.array(stored.column(name)) for name in COLUMNS})
+        return States(**{name: _array(stored.column(name)) for name in COLUMNS})
     except (pa.ArrowInvalid, pa.ArrowKeyError) as err:
         raise StatesFileError(" ".join(str(err).split())) from err
 
 
-def file_sha256(path: Path) -> str:
-    """Return the SHA-256 (hex) of a file."""
+def _array(column: pa.ChunkedArray) -> NDArray[Any]:
+    """Return a column without nulls as an array; pyarrow's own conversion would import pandas."""
+    if column.null_count:
+        raise StatesFileError("a cell is empty")
+    return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
+
+
+def file_b2sum(path: Path) -> str:
+    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines."""
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 
 def _csv_chunks(table: States) -> Iterator[bytes]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from icrtool.analysis.fit import FilterRun
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from icrtool.analysis.fit import FilterRun
 
 TABLE_WIDTH = 100
 """Letters in a line of a printed table."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
-from icrtool.config import Config
+from icrtool.config import Config, parse_config
 from icrtool.tables import (
     Datum,
     HeadingSamples,
@@ -76,7 +76,7 @@ def simulate(
 
 
 def configured(track_width_m: float | None = TRACK_WIDTH_M) -> Config:
-    return Config.model_validate({"robot": {"name": "segway-rmp400", "track_width_m": track_width_m}})
+    return parse_config({"robot": {"name": "segway-rmp400", "track_width_m": track_width_m}})
 
 
 @pytest.fixture(scope="session")

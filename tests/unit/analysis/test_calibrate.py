@@ -11,7 +11,7 @@ import pytest
 from icrtool.analysis.calibrate import NAMES, compare, estimate
 from icrtool.analysis.calibrate_evidence import gather
 from icrtool.analysis.calibrate_verdict import Calibration, calibrate
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.core.simulate import drive, poses_at
 from icrtool.errors import DataError
 from icrtool.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
@@ -19,7 +19,7 @@ from icrtool.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice
 EPOCH_NS = 1_760_000_000_000_000_000
 ICRS = (0.52, -0.44, 0.1)
 ROLES = ("wheels", "gnss", "heading")
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 
 
 def simulate(
@@ -152,9 +152,7 @@ def test_a_circle_one_way_does_not_tell_antenna_from_offset() -> None:
 
 
 def test_a_known_antenna_resolves_the_icrs() -> None:
-    config = CONFIG.model_copy(
-        update={"frames": CONFIG.frames.model_copy(update={"antenna_forward_m": 0.3, "antenna_right_m": -0.15})}
-    )
+    config = replace(CONFIG, frames=replace(CONFIG.frames, antenna_forward_m=0.3, antenna_right_m=-0.15))
     found = calibrate(simulate(3), config)
     for key, truth in zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), ICRS, strict=True):
         one = found.finding(key)

@@ -11,7 +11,8 @@ import pytest
 
 from icrtool.analysis.filter_setup import WarmStart
 from icrtool.analysis.fit import STATE_COLUMNS, FilterRun, fit
-from icrtool.analysis.outages import force_outages, plan_outages, real_outages
+from icrtool.analysis.forced_outages import force_outages, plan_outages
+from icrtool.analysis.outages import real_outages
 from icrtool.core.ekf_plain import step_state
 from icrtool.errors import ConfigError, DataError
 

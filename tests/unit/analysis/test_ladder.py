@@ -15,7 +15,7 @@ from icrtool.analysis.ladder_fits import clear_of
 from icrtool.analysis.ladder_trials import Along, MeasuredHeading, cut_trials, predict
 from icrtool.analysis.measured_heading import measured_headings
 from icrtool.analysis.window_fit import cut_windows
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.core.open_loop import FrozenIcrs
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.errors import DataError
@@ -23,7 +23,7 @@ from icrtool.errors import DataError
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import make_log
 
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 ROUNDING_M = 1e-9
 CHORD_M = 1e-5
 """The lever's way is its arc along a measured heading, the chord of each turn in steps: over 5 m at 20 Hz, 3 um."""

@@ -13,14 +13,14 @@ from icrtool.analysis.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.reference import held_against
 from icrtool.analysis.smooth import smooth
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.core.ekf_plain import step_state
 from icrtool.tables import States
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import ICRS, make_log
 
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 NOISY_M = 0.3
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.smooth import smooth
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.tables import States
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import ICRS, make_log
 
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 
 
 @pytest.fixture(scope="module")

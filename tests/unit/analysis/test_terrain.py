@@ -15,12 +15,12 @@ from icrtool.analysis.simulate import Drive, Icrs, Sensors, move, sense
 from icrtool.analysis.study_runs import readings_log
 from icrtool.analysis.summary import ICR_COLUMNS
 from icrtool.analysis.terrain import FALSE_ALARMS_PER_HOUR, find_terrain_changes
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.report.figure_icrs import draw_icr_estimates
 from icrtool.report.run_table import format_run
 from icrtool.tables import RobotLog
 
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 ICRS: Icrs = (0.5, -0.75, -0.25)
 WIDER: Icrs = (0.6, -0.9, -0.35)
 WIDTH_M = ICRS[0] - ICRS[1]

@@ -13,13 +13,13 @@ from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.window_fit import cut_windows, fit_windows, thin_windows
 from icrtool.analysis.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.analysis.window_solve import drop_windows, fit_of, solve_windows
-from icrtool.config import Config
+from icrtool.config import parse_config
 from icrtool.errors import DataError
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import ICRS, make_log
 
-CONFIG = Config.model_validate({"robot": {"track_width_m": 0.6}})
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 SEEDS = range(4)
 LARGEST_MISS_M = 0.01
 """The fit may not hide behind its doubt: constants known to a centimetre after 100 m."""
@@ -59,7 +59,7 @@ def test_scales_are_recovered() -> None:
 
     log = make_log(2, 200.0)
     log = replace(log, wheels=replace(log.wheels, v_left_mps=log.wheels.v_left_mps / 1.02))
-    config = Config.model_validate({"robot": {"track_width_m": 0.6}, "wheels": {"left_scale": 1.0}})
+    config = parse_config({"robot": {"track_width_m": 0.6}, "wheels": {"left_scale": 1.0}})
     found = fit_windows(cut_windows(fit(log, config)), EXTENDED[0])
     assert found.parameters[3] / found.parameters[4] == pytest.approx(1.02, abs=0.004)
 

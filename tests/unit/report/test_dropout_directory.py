@@ -15,8 +15,9 @@ import pytest
 from icrtool.analysis.blind_paths import example_drives, worst_drives
 from icrtool.analysis.dropout import dropout
 from icrtool.analysis.fit import FilterRun
+from icrtool.analysis.forced_outages import force_outages, plan_outages
 from icrtool.analysis.gates import budget_distances, judge_gate, parse_gate
-from icrtool.analysis.outages import force_outages, plan_outages, real_outages
+from icrtool.analysis.outages import real_outages
 from icrtool.errors import OutputError
 from icrtool.report.dropout_content import DropoutContent, title_of
 from icrtool.report.dropout_directory import dropout_directory, is_dropout_directory, report_document, write_content

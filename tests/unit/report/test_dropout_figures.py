@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from icrtool.analysis.blind_paths import example_drives, worst_drives
 from icrtool.analysis.dropout import DropoutReport, dropout, models_of
 from icrtool.analysis.fit import FilterRun
-from icrtool.analysis.outages import Outage, force_outages, plan_outages, real_outages
+from icrtool.analysis.forced_outages import force_outages, plan_outages
+from icrtool.analysis.outages import Outage, real_outages
 from icrtool.report.dropout_drawing import HISTOGRAM_MODELS, DrawingProcess, draw_histograms, draw_paths
 from icrtool.report.dropout_drawing import draw_summary as order_summary
 from icrtool.report.figure_dropout import draw_histogram, draw_summary

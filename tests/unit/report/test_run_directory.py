@@ -31,9 +31,7 @@ def names_in(directory: Path) -> list[str]:
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: FilterRun) -> None:
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
     plots = [f"plots/{name}.{form}" for name in figures.FIGURES for form in ("png", "svg")]
-    assert names_in(tmp_path / "runs" / "barn") == sorted(
-        ["SHA256SUMS", "headings.npz", "run.json", "states.csv", *plots]
-    )
+    assert names_in(tmp_path / "runs" / "barn") == sorted(["B2SUMS", "headings.npz", "run.json", "states.csv", *plots])
     assert {"trajectory", "icr_estimates", "icr_clusters", "gnss_difference"} == set(figures.FIGURES)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["barn"]
@@ -99,7 +97,7 @@ def test_a_run_comes_back_as_it_was(written: Path, run: FilterRun) -> None:
 
 def test_states_may_be_parquet(tmp_path: Path, run: FilterRun) -> None:
     write_run(run, tmp_path / "barn", states="parquet", plots=())
-    assert names_in(tmp_path / "barn") == ["SHA256SUMS", "headings.npz", "run.json", "states.parquet"]
+    assert names_in(tmp_path / "barn") == ["B2SUMS", "headings.npz", "run.json", "states.parquet"]
     assert read_run(tmp_path / "barn").table.north_m.tobytes() == run.table.north_m.tobytes()
 
 
@@ -111,9 +109,9 @@ def test_a_run_without_gap_or_outage_or_width_comes_back(tmp_path: Path, make_ru
     assert stored.track_width_m is None
 
 
-@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
-def test_the_sums_are_those_of_sha256sum(written: Path) -> None:
-    subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=written, check=True)
+@pytest.mark.skipif(shutil.which("b2sum") is None, reason="needs b2sum")
+def test_the_sums_are_those_of_b2sum(written: Path) -> None:
+    subprocess.run(["b2sum", "--check", "--strict", "--quiet", "B2SUMS"], cwd=written, check=True)
 
 
 def test_the_same_run_makes_the_same_bytes(tmp_path: Path, run: FilterRun) -> None:
@@ -127,7 +125,7 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Fi
     (written / "dropout").mkdir()
     (written / "dropout" / "summary.csv").write_text("of the old states")
     write_run(run, written, states="parquet", plots=())
-    assert names_in(written) == ["SHA256SUMS", "headings.npz", "run.json", "states.parquet"]
+    assert names_in(written) == ["B2SUMS", "headings.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
 
@@ -154,11 +152,11 @@ def test_a_full_disk_is_said_and_leaves_the_old_run(
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    before = (written / "SHA256SUMS").read_bytes()
+    before = (written / "B2SUMS").read_bytes()
     monkeypatch.setattr(run_directory, where, full)
     with pytest.raises(OutputError, match="barn: cannot be written; No space left on device"):
         write_run(run, written)
-    assert (written / "SHA256SUMS").read_bytes() == before
+    assert (written / "B2SUMS").read_bytes() == before
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
 
@@ -205,8 +203,8 @@ def cut(name: str) -> Callable[[Path], None]:
         (remove("states.csv"), "states.csv is missing"),
         (cut("states.csv"), "states.csv was edited or cut short"),
         (change("states.csv", b"0.", b"1."), "states.csv was edited or cut short"),
-        (remove("SHA256SUMS"), "no readable SHA256SUMS"),
-        (change("SHA256SUMS", b"states.csv", b"other.csv"), "SHA256SUMS names no states"),
+        (remove("B2SUMS"), "no readable B2SUMS"),
+        (change("B2SUMS", b"states.csv", b"other.csv"), "B2SUMS names no states"),
     ],
 )
 def test_a_spoilt_run_is_refused_in_one_line(written: Path, spoil: Callable[[Path], None], sentence: str) -> None:
@@ -240,7 +238,7 @@ def test_sums_of_a_run_that_lacks_keys_do_not_make_it_one(written: Path) -> None
     document = json.loads((written / "run.json").read_text())
     del document["outages_ns"]
     (written / "run.json").write_bytes(json_bytes(document))
-    sums = {name: run_directory.file_sha256(written / name) for name in ("run.json", "states.csv")}
-    (written / "SHA256SUMS").write_text("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()))
+    sums = {name: run_directory.file_b2sum(written / name) for name in ("run.json", "states.csv")}
+    (written / "B2SUMS").write_text("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()))
     with pytest.raises(RunError, match="cannot be read"):
         read_run(written)
