@@ -65,6 +65,13 @@ def drive_of(run: DrivenRun) -> Drive:
     return drive_through(table, run.in_gap, in_outage)
 
 
+def toy_drive() -> Drive:
+    """Return a drive of a dozen states straight on, to load compiled kernels with."""
+    way = np.arange(12.0)
+    no = np.zeros(len(way), np.bool_)
+    return Drive(np.ones_like(way), np.ones_like(way), np.ones_like(way), way, 0 * way, 0 * way, way, no, no.copy())
+
+
 def drive_through(table: States, in_gap: Bools, in_outage: Bools) -> Drive:
     """Return states as the kernels want them."""
     return Drive(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.driven_run import DrivenRun, drive_of, toy_drive
 from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
@@ -226,9 +226,8 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 
 def load_kernels() -> None:
     """Have the compiled kernels ready: a toy drive, to be called while a run is still being read."""
-    way = np.arange(12.0)
-    no = np.zeros(len(way), np.bool_)
-    drive = Drive(np.ones_like(way), np.ones_like(way), np.ones_like(way), way, 0 * way, 0 * way, way, no, no.copy())
+    drive = toy_drive()
+    way = drive.distance
     icrs, horizon = FrozenIcrs.constant(1.0, -1.0, 0.0), np.array([1.0])
     errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
     bootstrap_intervals(errors, way, horizon, DEFAULT_SEED)

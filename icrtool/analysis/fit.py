@@ -147,7 +147,7 @@ def fit(
     check_streams(log)
     wheels = check_wheels(log, config)
     log = wheels.log
-    check = check_heading(log, config)
+    check = check_heading(log, config, wheels.course)
     delays = measure_delays(log, config, check)
     fixes = judge_fixes(delays.log, config, check)
     done = _run(fixes, config, check, warm_start, given_changes(changes_s))

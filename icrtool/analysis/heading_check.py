@@ -125,11 +125,15 @@ class Course(NamedTuple):
     duration_s: float
 
 
-def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
+def check_heading(log: RobotLog, config: Config, course: Course | None = None) -> HeadingCheck:
     """Compare the heading of a log with the way its fixes tell.
 
     The offset is applied where ``frames.heading_offset_deg`` is ``auto``, the preset is not ``paper`` and the offset is
     significant; a number there is applied as it is.
+
+    Parameters
+    ----------
+    course : `measure_course` of the log, where it is at hand
 
     Raises
     ------
@@ -145,7 +149,7 @@ def check_heading(log: RobotLog, config: Config) -> HeadingCheck:
     given = config.frames.heading_offset_deg
     paper = config.filter.preset == "paper"
     fixed = 0.0 if paper or given == "auto" else math.radians(given)
-    course = measure_course(log)
+    course = course if course is not None else measure_course(log)
     free = given == "auto" and not paper
     if free:
         _refuse_stuck(log)
@@ -337,7 +341,7 @@ def measure_course(log: RobotLog) -> Course:
         wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
     )
     travelled = np.concatenate([[0.0], np.cumsum(np.abs(step))])
-    laid = np.concatenate([[0.0], np.cumsum(step * np.exp(1j * psi_at))])
+    north, east = (np.concatenate([[0.0], np.cumsum(step * part(psi_at))]) for part in (np.cos, np.sin))
     begin, end = _windows(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled), gnss.stamp_ns, length)
     if not len(begin):
         return none
@@ -347,7 +351,7 @@ def measure_course(log: RobotLog) -> Course:
         return last - first
 
     seen = (gnss.north_m[end] - gnss.north_m[begin]) + 1j * (gnss.east_m[end] - gnss.east_m[begin])
-    real, imaginary, way = between(laid.real), between(laid.imag), between(travelled)
+    real, imaginary, way = between(north), between(east), between(travelled)
     turned = between(np.append(psi_at, psi_at[-1]))
     went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
     moved = went & led

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icrtool.analysis.driven_run import drive_through
+from icrtool.analysis.driven_run import drive_through, toy_drive
 from icrtool.core.open_loop import open_loop_path
 from icrtool.tables import Bools, Floats, States
 
@@ -46,6 +46,11 @@ def no_slip_odometry(run: FilterRun) -> OdometryPath | None:
     """Return the path of the no-slip model (Eqs. 38-39); None where the track width is not known."""
     width = run.config.robot.track_width_m
     return _path(run.table, run.in_gap, width / 2, -width / 2, 0.0) if width is not None else None
+
+
+def load_kernels() -> None:
+    """Have the compiled kernel ready, before there is a run."""
+    open_loop_path(toy_drive(), 1.0, -1.0, 0.0, 0, 1)
 
 
 def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:

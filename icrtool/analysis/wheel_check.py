@@ -58,6 +58,7 @@ class WheelCheck:
     applied_scale: float
     held_share: float
     warnings: tuple[str, ...]
+    course: Course | None
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers for run.json."""
@@ -110,7 +111,7 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     if held > HELD_SHARE:
         rate = (1.0 - held) * 1e9 / float(np.median(np.diff(log.wheels.stamp_ns)))
         notes.append(f"{log.name}: wheel values are held: they change {rate:.1f} times a second while moving")
-    return WheelCheck(log, scale, sigma, applied, held, tuple(notes))
+    return WheelCheck(log, scale, sigma, applied, held, tuple(notes), course if applied == 1.0 else None)
 
 
 def _scale(course: Course) -> tuple[float, float, float]:

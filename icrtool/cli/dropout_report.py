@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from icrtool.analysis.gates import Gate
     from icrtool.analysis.outages import Outage
     from icrtool.config import Config
+    from icrtool.report.drawing_process import DrawingProcess
     from icrtool.report.dropout_content import DropoutContent
-    from icrtool.report.dropout_drawing import DrawingProcess
     from icrtool.report.dropout_exports import Outcome
     from icrtool.report.run_directory import StoredRun
     from icrtool.tables import Ints
@@ -106,7 +106,7 @@ def command(
     config = options.load(config_file, robot, sets)
     from icrtool.analysis.dropout import DEFAULT_SEED
     from icrtool.analysis.gates import parse_gate
-    from icrtool.report.dropout_drawing import DrawingProcess
+    from icrtool.report.drawing_process import DrawingProcess
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
@@ -210,7 +210,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
         run: StoredRun | FilterRun = _read(source)
         directory = source
     else:
-        run, directory = _fit(source, place, request), place
+        run, directory = _fit(source, place, request, drawer), place
     content = _analyse(run, directory, request, drawer)
     if not request.quiet:
         click.echo(format_dropout(content))
@@ -235,7 +235,7 @@ def _read(directory: Path) -> StoredRun:
         return reading.result()
 
 
-def _fit(log: Path, directory: Path, request: Request) -> FilterRun:
+def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> FilterRun:
     """Fit a log and write its run directory, as `icrtool fit` does."""
     from icrtool.report.run_directory import check_target, write_run
 
@@ -248,7 +248,7 @@ def _fit(log: Path, directory: Path, request: Request) -> FilterRun:
     from icrtool.analysis.smooth import smooth
 
     run = fit(measured, request.config)
-    write_run(run, directory, plots=request.formats, smoothed=smooth(run) if request.smoothed else None)
+    write_run(run, directory, smoothed=smooth(run) if request.smoothed else None, drawer=drawer)
     options.warn(run.warnings, quiet=request.quiet)
     if request.verbose:
         for stream in measured.streams:
@@ -267,7 +267,7 @@ def _analyse(
     from icrtool.analysis.turning import split_by_turning
     from icrtool.report.dropout_content import DropoutContent, title_of
     from icrtool.report.dropout_directory import dropout_directory, write_content
-    from icrtool.report.dropout_drawing import draw_histograms, draw_paths, draw_summary
+    from icrtool.report.dropout_drawing import draw_histograms, draw_ladder, draw_paths, draw_summary
     from icrtool.report.dropout_ladder import ladder_of
     from icrtool.report.dropout_source import judged_run
 
@@ -287,7 +287,7 @@ def _analyse(
         draw_summary(draw, title, report, outages)
         ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
         if ladder is not None:
-            draw("ladder", title, ladder)
+            draw_ladder(draw, title, ladder)
         content = DropoutContent(
             title=title,
             run_summary=run.summary,

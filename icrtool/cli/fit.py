@@ -12,6 +12,7 @@ from icrtool.cli import options
 
 if TYPE_CHECKING:
     from icrtool.config import Config
+    from icrtool.report.drawing_process import DrawingProcess
 
 RUNS = Path("icrtool-runs")
 AUTO = "auto"
@@ -80,14 +81,15 @@ def command(
     )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
-    for log, directory in zip(logs, directories, strict=True):
-        try:
-            _fit_one(log, directory, request)
-        except IcrToolError as err:
-            if len(logs) == 1:
-                raise
-            failed.append(err)
-            click.echo(f"Error: {err}", err=True)
+    with options.drawing_process(request.formats) as drawer:
+        for log, directory in zip(logs, directories, strict=True):
+            try:
+                _fit_one(log, directory, request, drawer)
+            except IcrToolError as err:
+                if len(logs) == 1:
+                    raise
+                failed.append(err)
+                click.echo(f"Error: {err}", err=True)
     if failed:
         raise IcrToolError(f"{len(failed)} of {len(logs)} logs", "could not be used", "the others were written")
 
@@ -141,12 +143,7 @@ def _beside(request: FitRequest) -> str:
     return f" ({', '.join(done)})" if done else ""
 
 
-def _reports(request: FitRequest) -> tuple[str, ...]:
-    """Return the modules that write what is asked for."""
-    return "icrtool.report.run_directory", *(("icrtool.report.figures",) if request.formats else ())
-
-
-def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
+def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> None:
     from icrtool.report.run_directory import check_target, log_of_run, read_warm_start, write_run
 
     check_target(directory)
@@ -155,7 +152,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logio import read_log
 
-        options.load_ahead("pymap3d", "icrtool.analysis.fit", *_reports(request))
+        options.load_ahead("pymap3d", "icrtool.analysis.fit")
         measured = read_log(log, request.config, progress)
     from icrtool.analysis.fit import fit
 
@@ -171,7 +168,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest) -> None:
         from icrtool.analysis.smooth import smooth
 
         smoothed = smooth(run)
-    write_run(run, directory, states=request.states, plots=request.formats, smoothed=smoothed)
+    write_run(run, directory, states=request.states, smoothed=smoothed, drawer=drawer)
     replaced = before is not None and before != run.summary["inputs"][0]["path"]
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
     options.warn((*run.warnings, *note), quiet=request.quiet)

@@ -14,6 +14,7 @@ import click
 
 if TYPE_CHECKING:
     from icrtool.config import Config
+    from icrtool.report.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -54,6 +55,19 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
     if not quiet:
         for warning in warnings:
             click.echo(f"Warning: {warning}", err=True)
+
+
+def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
+    """Return a process for the figures of logs to be fitted; where it is forked, it has what is loaded here first."""
+    from icrtool.report.drawing_process import DrawingProcess
+
+    if not formats:
+        return DrawingProcess(())
+    importlib.import_module("icrtool.analysis.fit")
+    importlib.import_module("icrtool.logio.read_log")
+    from icrtool.report.run_directory import load_figures
+
+    return DrawingProcess(formats, load_figures)
 
 
 @contextmanager

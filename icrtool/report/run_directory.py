@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from icrtool.analysis.driven_run import RUN_SCHEMA
 from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.analysis.measured_heading import measured_headings
 from icrtool.errors import RunError
+from icrtool.report.drawing_process import Drawer, DrawingHere
 from icrtool.report.headings_file import HEADINGS_FILE, read_headings, write_headings
 from icrtool.report.states_csv import StatesFileError, StatesFormat, file_b2sum, read_states, write_states
 from icrtool.report.whole_directory import check_place, whole_directory
@@ -80,6 +80,7 @@ def write_run(
     states: StatesFormat = "csv",
     plots: tuple[str, ...] = ("png",),
     smoothed: States | None = None,
+    drawer: Drawer | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -90,6 +91,7 @@ def write_run(
     states : format of the states
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     smoothed : the smoother's states, written as ``smoothed`` in the same format
+    drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
 
     Raises
     ------
@@ -100,19 +102,18 @@ def write_run(
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
     with (
         whole_directory(directory, is_run_directory, kind="run directory") as partial,
+        (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
+        draw(_write_figures, run)
         sums: dict[str, str] = {}
         if smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(smoothed, partial / f"smoothed.{states}", states)
         if headings := measured_headings(run):
             write_headings(headings, run.table.stamp_ns, partial / HEADINGS_FILE)
             sums[HEADINGS_FILE] = file_b2sum(partial / HEADINGS_FILE)
-        if plots:
-            (partial / "plots").mkdir()
-            _draw(run, partial / "plots", plots)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
         sums = {RUN_FILE: file_b2sum(partial / RUN_FILE), states_name: states_sum.result()} | sums
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
@@ -239,17 +240,18 @@ def json_bytes(document: Mapping[str, Any]) -> bytes:
     return (text + "\n").encode("utf-8", errors="backslashreplace")
 
 
-def _draw(run: FilterRun, directory: Path, formats: tuple[str, ...]) -> None:
-    """Draw the figures; what matplotlib says of a home directory it cannot write is not our user's trouble."""
-    logger = logging.getLogger("matplotlib")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        from icrtool.report.figures import draw_figures
+def load_figures() -> None:
+    """Load what the figures of a run need, in the process that will draw them."""
+    from icrtool.analysis.odometry import load_kernels
+    from icrtool.report import figures  # noqa: F401 - for its own sake
 
-        draw_figures(run, directory, formats)
-    finally:
-        logger.setLevel(level)
+    load_kernels()
+
+
+def _write_figures(directory: Path, formats: tuple[str, ...], run: FilterRun) -> None:
+    from icrtool.report.figures import draw_figures
+
+    draw_figures(run, directory, formats)
 
 
 def _plain(value: object) -> object:

@@ -28,8 +28,11 @@ INTEGER_COLUMNS = frozenset({"stamp_ns"})
 CHUNK_ROWS = 1024
 """Rows formatted at a time: they stay in the processor's cache, and memory does not grow with the log."""
 
-CHUNKS_AHEAD = 8
-"""Chunks of text that wait to be written at most."""
+CHUNKS_A_PIECE = 16
+"""Chunks written at a time: a thread that asks for the interpreter again waits longer than it takes to write one."""
+
+PIECES_AHEAD = 4
+"""Pieces of text that wait to be written at most."""
 
 
 class StatesFileError(ValueError):
@@ -66,18 +69,18 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
         with path.open("xb") as file:
             pq.write_table(_arrow(table.columns()), file, compression="zstd")
         return file_b2sum(path)
-    digest, chunks = hashlib.blake2b(), _csv_chunks(table)
+    digest, pieces = hashlib.blake2b(), _csv_pieces(table)
 
-    def store(chunk: bytes) -> None:
-        digest.update(chunk)
-        file.write(chunk)
+    def store(piece: bytes) -> None:
+        digest.update(piece)
+        file.write(piece)
 
     with path.open("xb") as file, ThreadPoolExecutor(1) as pool:
         # Hashing and writing free the interpreter for the formatting of what comes next.
-        waiting = deque(pool.submit(store, chunk) for chunk in islice(chunks, CHUNKS_AHEAD))
+        waiting = deque(pool.submit(store, piece) for piece in islice(pieces, PIECES_AHEAD))
         while waiting:
             waiting.popleft().result()
-            waiting.extend(pool.submit(store, chunk) for chunk in islice(chunks, 1))
+            waiting.extend(pool.submit(store, piece) for piece in islice(pieces, 1))
     return digest.hexdigest()
 
 
@@ -124,8 +127,14 @@ def file_b2sum(path: Path) -> str:
         return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 
-def _csv_chunks(table: States) -> Iterator[bytes]:
+def _csv_pieces(table: States) -> Iterator[bytes]:
     """Yield the file piece by piece."""
+    chunks = _csv_chunks(table)
+    while piece := b"".join(islice(chunks, CHUNKS_A_PIECE)):
+        yield piece
+
+
+def _csv_chunks(table: States) -> Iterator[bytes]:
     yield (",".join(COLUMNS) + "\n").encode()
     columns = table.columns()
     for begin in range(0, len(table), CHUNK_ROWS):

@@ -17,7 +17,8 @@ from icrtool.analysis.dropout import DropoutReport, dropout, models_of
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.forced_outages import force_outages, plan_outages
 from icrtool.analysis.outages import Outage, real_outages
-from icrtool.report.dropout_drawing import HISTOGRAM_MODELS, DrawingProcess, draw_histograms, draw_paths
+from icrtool.report.drawing_process import DrawingProcess
+from icrtool.report.dropout_drawing import HISTOGRAM_MODELS, draw_histograms, draw_paths
 from icrtool.report.dropout_drawing import draw_summary as order_summary
 from icrtool.report.figure_dropout import draw_histogram, draw_summary
 from icrtool.report.figure_dropout_paths import draw_examples, draw_outages, draw_worst

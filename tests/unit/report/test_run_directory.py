@@ -145,7 +145,7 @@ def test_a_run_of_a_later_version_may_be_replaced(tmp_path: Path, run: FilterRun
     assert read_run(tmp_path).name == "barn"
 
 
-@pytest.mark.parametrize("where", ["write_states", "_draw"])
+@pytest.mark.parametrize("where", ["write_states", "_write_figures"])
 def test_a_full_disk_is_said_and_leaves_the_old_run(
     written: Path, run: FilterRun, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:

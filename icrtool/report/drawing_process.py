@@ -1,0 +1,147 @@
+"""Who draws: this process, or a second one while this one computes and writes.
+
+Matplotlib takes longer to load and to draw than a log takes to filter, and holds the interpreter while it does.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager, contextmanager
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+Write = Callable[..., None]
+"""Called with a directory, formats, and what to draw; a function of a module, so that a process can be told it."""
+
+Draw = Callable[..., None]
+"""Called with a `Write` and what it draws."""
+
+
+class Drawer(Protocol):
+    """Who draws figures."""
+
+    def into(self, directory: Path) -> AbstractContextManager[Draw]:
+        """Give ``draw(write, *content)``, which has figures written into a new directory by the end of the block."""
+        ...
+
+
+class DrawingHere:
+    """Draws in this process, at once.
+
+    Parameters
+    ----------
+    formats : of ``png``, ``svg`` and ``pdf``; with none nothing is drawn
+    """
+
+    def __init__(self, formats: tuple[str, ...]) -> None:
+        self._formats = formats
+
+    @contextmanager
+    def into(self, directory: Path) -> Iterator[Draw]:
+        """Give ``draw(write, *content)``; see `Drawer`."""
+
+        def draw(write: Write, *content: object) -> None:
+            if not self._formats:
+                return
+            directory.mkdir(exist_ok=True)
+            logger = logging.getLogger("matplotlib")
+            level = logger.level
+            # What it says of a home directory it cannot write is not our user's trouble.
+            logger.setLevel(logging.ERROR)
+            try:
+                write(directory, self._formats, *content)
+            finally:
+                logger.setLevel(level)
+
+        yield draw
+
+
+class DrawingProcess:
+    """A process that draws figures; it lives as long as its ``with`` block.
+
+    On Linux it is forked: what was loaded before is there at once, but a process with threads should not be forked.
+
+    Parameters
+    ----------
+    formats : of ``png``, ``svg`` and ``pdf``; with none nothing is started and nothing drawn
+    load : called there at once, to load what drawing will need beyond matplotlib; a function of a module
+    """
+
+    def __init__(self, formats: tuple[str, ...], load: Callable[[], None] | None = None) -> None:
+        self._formats = formats
+        self._load = load
+        self._pool: ProcessPoolExecutor | None = None
+        self._workers: list[BaseProcess] = []
+
+    def __enter__(self) -> Self:
+        if self._formats:
+            method = "fork" if sys.platform == "linux" else None
+            self._pool = ProcessPoolExecutor(1, multiprocessing.get_context(method), initializer=_begin)
+            others = multiprocessing.active_children()
+            self._pool.submit(_load_matplotlib)
+            if self._load is not None:
+                self._pool.submit(self._load)
+            self._workers = [process for process in multiprocessing.active_children() if process not in others]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is None:
+            return
+        if kind is not None:
+            # Nobody waits for pictures of what failed.
+            for process in self._workers:
+                process.terminate()
+        self._pool.shutdown(cancel_futures=True)
+
+    @contextmanager
+    def into(self, directory: Path) -> Iterator[Draw]:
+        """Give ``draw(write, *content)``; wait for all figures at the end. See `Drawer`.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written.
+        """
+        pending: list[Future[None]] = []
+
+        def draw(write: Write, *content: object) -> None:
+            if self._pool is not None:
+                directory.mkdir(exist_ok=True)
+                pending.append(self._pool.submit(write, directory, self._formats, *content))
+
+        try:
+            yield draw
+            for drawn in pending:
+                drawn.result()
+        finally:
+            for drawn in pending:
+                drawn.cancel()
+            wait(pending)
+
+
+def _begin() -> None:
+    """Leave an interrupt to the parent, and what matplotlib says of an unwritable home directory unsaid."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+
+def _load_matplotlib() -> None:
+    """Load what drawing needs, and fill the font cache, while there is nothing to draw yet."""
+    from io import BytesIO
+
+    from icrtool.report.figure_style import new_figure, style
+
+    with style():
+        figure = new_figure("A", "b", width_in=1, height_in=1)
+        figure.subplots().plot([0.0, 1.0], label="c")
+        figure.legend()
+        figure.savefig(BytesIO(), format="png")
