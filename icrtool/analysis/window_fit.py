@@ -26,7 +26,7 @@ WINDOWS_M = (5.0, 10.0)
 EVERY_M = 0.5
 """A window of each length starts every so much way."""
 
-MOST_STARTS = 2000
+MOST_STARTS = 1000
 """Where many fits are made, windows of a long way start further apart: about so many of a length."""
 
 HUBER_SIGMAS = 2.0
