@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from icrtool.analysis.study import KINDS, StudyResult
 from icrtool.report.figure_style import inches, new_figure
@@ -19,6 +18,9 @@ if TYPE_CHECKING:
 
 COLORS = ("#2166ac", "#b2182b", "0.25")
 NAMES = ("y right", "y left", "x")
+MARKERS = ("o", "s", "^")
+MARKS = 9
+"""Marks on a line, so that the three are told apart without colours."""
 PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b", "0.3", "#762a83")
 PATH_DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1.2, 1.5)), (0, (1, 1)), (0, (8, 3)))
 LEAST_VIEW_M = 0.6
@@ -64,7 +66,7 @@ def draw_convergence(result: StudyResult) -> Figure:
     below.set_xlabel("All three ICRs within 10 % of the truth after [s]   (grey: 5-15 s, the paper's driven robots)")
     below.set_ylabel("Runs [%]")
     keys, labels = below.get_legend_handles_labels()
-    keys += [Patch(color=color) for color in COLORS]
+    keys += _icr_keys()
     figure.legend(
         keys, [*labels, *NAMES], loc="lower center", ncols=min(len(keys), 8), columnspacing=1.2, handlelength=2.2
     )
@@ -94,9 +96,15 @@ def draw_icr_change(result: StudyResult) -> Figure:
         row[0].set_ylabel("ICRs [m]")
     panels[-1][0].set_xlabel("Time [s]")
     panels[-1][1].set_xlabel("Time since the change [s]")
-    keys = [Line2D([], [], color=color, label=name) for color, name in zip(COLORS, NAMES, strict=True)]
-    figure.legend(handles=keys, loc="lower center", ncols=3)
+    figure.legend(handles=_icr_keys(), loc="lower center", ncols=3)
     return figure
+
+
+def _icr_keys() -> list[Line2D]:
+    return [
+        Line2D([], [], color=color, marker=marker, markersize=3.5, label=name)
+        for color, marker, name in zip(COLORS, MARKERS, NAMES, strict=True)
+    ]
 
 
 def draw_bands(axes: Axes, traces: Floats, true_icrs: Floats, changes: Floats) -> None:
@@ -106,7 +114,8 @@ def draw_bands(axes: Axes, traces: Floats, true_icrs: Floats, changes: Floats) -
     for place, color in enumerate(COLORS):
         low, middle, high = np.nanpercentile(traces[:, :, 1 + place], [5, 50, 95], axis=0)
         axes.fill_between(t, low, high, color=color, alpha=0.18, linewidth=0)
-        axes.plot(t, middle, color=color, linewidth=1.2)
+        every = (place * len(t) // (3 * MARKS), max(1, len(t) // MARKS))
+        axes.plot(t, middle, color=color, linewidth=1.2, marker=MARKERS[place], markersize=3.5, markevery=every)
         for number, value in enumerate(true_icrs[:, place]):
             axes.plot(edges[number : number + 2], [value, value], color=color, linewidth=0.9, linestyle=(0, (4, 2)))
     for change in changes:
