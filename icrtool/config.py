@@ -185,8 +185,8 @@ def parse_config(document: Mapping[str, Any]) -> Config:
         for key, value in values.items():
             if key not in known:
                 raise ConfigError(f"{name}.{key}", "unknown configuration key", f"[{name}] knows {', '.join(known)}")
-            if not _is_finite(value):
-                raise ConfigError(f"{name}.{key}", "not a finite number", f"found {value!r}")
+            if flaw := _flaw(value):
+                raise ConfigError(f"{name}.{key}", flaw, f"found {value!r}")
         sections[name] = _parse_section(name, values)
         given += [f"{name}.{key}" for key in values]
     return Config(**sections, given=frozenset(given))
@@ -243,7 +243,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+    except ValueError as err:  # no UTF-8, no TOML, or an integer longer than Python reads
         raise ConfigError(path, "not a TOML file", str(err)) from err
 
 
@@ -256,26 +256,32 @@ def _parse_set(text: str) -> dict[str, Any]:
         )
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         parsed = value.strip()
     return {section: {name: parsed}}
 
 
-def _is_finite(value: object) -> bool:
+def _flaw(value: object) -> str | None:
+    """Return what is wrong with a value, whatever the type of its key."""
     if isinstance(value, list | tuple):
-        return all(_is_finite(item) for item in value)
-    return not isinstance(value, float) or math.isfinite(value)
+        return next(filter(None, map(_flaw, value)), None)
+    if isinstance(value, float) and not math.isfinite(value):
+        return "not a finite number"
+    # An argument that is not UTF-8 comes with lone surrogates, which no JSON file takes.
+    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+        return "not text in UTF-8"
+    return None
 
 
 def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - the section's own type
     try:
         return msgspec.convert(dict(values), SECTIONS[name])
     except msgspec.ValidationError as err:
-        # the words of a __post_init__, or "… - at `$.key[0]`"
-        message, _, place = str(err).partition(" - at `$.")
+        # the words of a __post_init__, or "… - at `$.key[0]`"; the value may stand before it, whatever it holds
+        _, _, place = str(err).rpartition(" - at `$.")
         key = place.rstrip("`").partition("[")[0]
-        if not key:
-            raise ConfigError(name, message, "see the configuration page") from err
+        if key not in values:
+            raise ConfigError(name, str(err), "see the configuration page") from err
         expected = _described(get_type_hints(SECTIONS[name], include_extras=True)[key])
         raise ConfigError(f"{name}.{key}", f"expected {expected}", f"found {values[key]!r}") from err
 

@@ -35,6 +35,9 @@ SMALLEST_OFFSET_RAD = math.radians(2.0)
 EXPLAINED = 0.8
 """Mean resultant length of course minus heading above which they are one direction seen twice."""
 
+CLEARLY_BETTER, CLEARLY_AWAY = 3.0, 0.02
+"""By 1 - mean resultant length: on rows to and fro the other convention looks like an offset but for the turns."""
+
 NEAR_RAD, NEAR_SHARE = math.radians(45.0), 0.6
 """A heading without agreement is none at all when no offset brings this share of the windows this near to the course:
 outliers among the fixes spoil some windows, not most."""
@@ -155,18 +158,17 @@ def check_heading(log: RobotLog, config: Config, course: Course | None = None) -
         _refuse_stuck(log)
         _refuse_unexplained(log, course)
     if len(course.angle) < FEWEST_WINDOWS:
-        nan = math.nan
-        return HeadingCheck(len(course.angle), nan, nan, nan, nan, nan, False, fixed, 0.0, 0.0, NO_NAME, ())
+        return HeadingCheck(len(course.angle), *(math.nan,) * 5, False, fixed, 0.0, 0.0, NO_NAME, ())
     agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
-    turned_over = agreement < EXPLAINED <= mirrored and config.frames.heading == "auto" and not paper
+    turned_over = _turns_other_way(agreement, mirrored) and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
     # A handful of windows may agree by chance, better than their fixes allow.
     sigma *= max(1.0, course.white_rad / max(scatter, 1e-9))
     own_scatter = math.sqrt(max(scatter**2 - course.noise_rad**2, 0.0))
     rest = offset + math.pi / 2 if turned_over else offset
-    named = _is_significant(rest, sigma)
-    name = name_offset(rest, sigma, log.datum, int(log.wheels.stamp_ns[0])) if named else NO_NAME
+    begin = int(log.wheels.stamp_ns[0])
+    name = name_offset(rest, sigma, log.datum, begin) if _is_significant(rest, sigma) else NO_NAME
     cause = f" ({name.text})" if name.text else ""
     text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(sigma):.1f}°"
     applied, warnings = fixed, _disagreement(agreement, mirrored)
@@ -200,13 +202,18 @@ def resultant_length(angle: Floats) -> float:
     return float(abs(np.exp(1j * angle).mean()))
 
 
+def _turns_other_way(agreement: float, mirrored: float) -> bool:
+    """Say whether a heading clearly follows the course only when it is turned the other way."""
+    better = 1.0 - agreement > max(CLEARLY_AWAY, CLEARLY_BETTER * (1.0 - mirrored))
+    return mirrored >= EXPLAINED and (agreement < EXPLAINED or better)
+
+
 def _disagreement(agreement: float, mirrored: float) -> list[str]:
     """Say that a heading does not follow the course as it is given, where it does not."""
-    if agreement >= EXPLAINED:
-        return []
-    if mirrored >= EXPLAINED:
+    if _turns_other_way(agreement, mirrored):
         return ["the heading turns the other way than the course: set frames.heading to the other of enu and ned"]
-    return [f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"]
+    text = f"the heading does not follow the course (agreement {agreement:.2f} of 1): do not trust the ICRs"
+    return [] if agreement >= EXPLAINED else [text]
 
 
 def _refuse_unexplained(log: RobotLog, course: Course) -> None:
@@ -239,11 +246,10 @@ def _refuse_stuck(log: RobotLog) -> None:
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     way = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
     ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), way)
-    rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin[long], end[long]]))
+    rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin, end])[long])
     turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
-    last_row = len(way) - 1
-    gone = way[np.minimum(rows[turning, 1], last_row)] - way[np.minimum(rows[turning, 0], last_row)]
-    share = float(gone.sum()) / max(float(way[-1]), 1e-9)
+    gone = np.diff(way[np.minimum(rows[turning], len(way) - 1)]).sum()
+    share = float(gone) / max(float(way[-1]), 1e-9)
     if share > STUCK_SHARE:
         seconds = float((end - begin)[long][turning].sum()) / 1e9
         raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")

@@ -32,7 +32,9 @@ BLOCK = 16
 FEWEST_WINDOWS = 60
 HUBER_SIGMAS = 2.0
 GAP_S, GAP_IN_INTERVALS, NEAR_GAP_S = 0.25, 5.0, 0.5
-ROUNDS, REWEIGHTS, SETTLED_S = 4, 5, 1e-3
+ROUNDS, REWEIGHTS, SETTLED_S = 8, 5, 1e-3
+"""Rounds enough for the largest delay in the largest steps. A search that does not settle, to its doubt, found none."""
+
 SMALLEST_CHANGE_MPS = 0.015
 """Changes of speed beyond what the other columns explain, root mean square: with less, as on a circle, slip decides."""
 
@@ -249,7 +251,7 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
     -----
     Huber's weights (Huber 1964); the covariance takes `BLOCK` windows for one sample (sandwich, White 1982).
     """
-    delay, std = 0.0, math.nan
+    delay, std, step = 0.0, math.nan, math.inf
     weight: Floats
     left: Floats
     seen: Floats
@@ -281,6 +283,6 @@ def _search(explain: Callable[[float], tuple[Floats, Floats, Callable[[Floats], 
             break
     moved = seen - seen.mean()
     explains = float((weight * left**2).sum()) <= (1.0 - LEAST_EXPLAINED) * float((weight * moved**2).sum())
-    if not explains:
+    if not explains or abs(step) > max(SETTLED_S, std):
         return UNKNOWN
     return Delay(delay, std)

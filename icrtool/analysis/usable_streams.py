@@ -17,13 +17,19 @@ def check_streams(log: RobotLog) -> None:
     Raises
     ------
     DataError
-        Fewer than two samples of a stream, none at the same time, or a value that is not a finite number. Logs that
-        were read hold no such values (`icrtool.read_log` leaves their rows out), tables made by a program may.
+        Fewer than two samples of a stream, none at the same time, stamps that go back, or a value that is not a finite
+        number. Logs that were read hold no such rows (`icrtool.read_log` sorts, and leaves out), tables made by a
+        program may.
     """
     needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
     for what, stamps in needed.items():
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
+        back = np.diff(stamps) < 0
+        if back.any():
+            raise DataError(
+                log.name, f"the {what} stamps go back at row {int(back.argmax()) + 1}", "sort the rows by stamp"
+            )
     columns = {
         "wheel": (log.wheels.v_left_mps, log.wheels.v_right_mps),
         "position": (log.gnss.north_m, log.gnss.east_m),
@@ -37,6 +43,12 @@ def check_streams(log: RobotLog) -> None:
                 f"{np.count_nonzero(bad)} {what} samples are not finite numbers, the first at row {int(bad.argmax())}",
                 "leave those rows out",
             )
+    variances = {"position": (log.gnss.var_north_m2, log.gnss.var_east_m2), "heading": (log.heading.var_rad2,)}
+    for what, told in variances.items():
+        negative = np.logical_or.reduce([variance < 0 for variance in told])
+        if negative.any():
+            why = f"a {what} variance is negative, the first at row {int(negative.argmax())}"
+            raise DataError(log.name, why, "NaN says that it is not known")
     fastest = float(np.abs(columns["wheel"]).max())
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")

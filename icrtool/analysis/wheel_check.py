@@ -31,6 +31,9 @@ FACTOR_TWO_TOLERANCE = 0.04
 """A factor two (diameter for radius, counts on both edges) is as certain as a small error when it is this exact."""
 
 CLEAR_CORRELATION, WHOLE_CORRELATION = 0.5, 0.9
+CONVENTION_TOLD = 20.0
+"""One convention of the heading is clearly the better one from this ratio on: about twice that of log likelihoods."""
+
 SMALLEST_TURN_RAD = math.radians(20.0)
 MOSTLY_BACKWARDS = 0.8
 LONGEST_DRIVE_NS = 30 * 86_400 * 1_000_000_000
@@ -173,7 +176,7 @@ def _reversed_or_swapped(log: RobotLog, course: Course) -> tuple[WheelSamples, s
     if resultant_length(course.angle) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
     correlation = _turn_correlation(log, mirrored=_mirrored(course))
-    if correlation is not None and correlation < -CLEAR_CORRELATION:
+    if correlation is not None and correlation < -CLEAR_CORRELATION and _tells_convention(course):
         return WheelSamples(wheels.stamp_ns, right, left), "left and right wheels are swapped"
     return None
 
@@ -190,6 +193,12 @@ def _turn_correlation(log: RobotLog, *, mirrored: bool) -> float | None:
 def _mirrored(course: Course) -> bool:
     """Say whether the heading follows the course only when it is turned the other way."""
     return resultant_length(course.mirrored) > resultant_length(course.angle)
+
+
+def _tells_convention(course: Course) -> bool:
+    """Say whether the windows tell at all which way the heading turns: a nearly straight drive does not."""
+    agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
+    return len(course.angle) * abs(agreement - mirrored) > CONVENTION_TOLD * (1.0 - max(agreement, mirrored))
 
 
 def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -109,7 +112,7 @@ class DrawingProcess:
         Raises
         ------
         OSError
-            A file cannot be written.
+            A file cannot be written, or the process is gone.
         """
         pending: list[Future[None]] = []
 
@@ -122,6 +125,8 @@ class DrawingProcess:
             yield draw
             for drawn in pending:
                 drawn.result()
+        except BrokenProcessPool as err:
+            raise OSError("the process that draws was ended from outside, for want of memory perhaps") from err
         finally:
             for drawn in pending:
                 drawn.cancel()
@@ -131,7 +136,16 @@ class DrawingProcess:
 def _begin() -> None:
     """Leave an interrupt to the parent, and what matplotlib says of an unwritable home directory unsaid."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is killed: it would wait for ever, and hold the parent's output open."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _load_matplotlib() -> None:

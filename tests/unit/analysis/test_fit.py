@@ -230,6 +230,10 @@ def spoilt(log: RobotLog, stream: str, column: str, value: float) -> RobotLog:
         ("wheels", "v_right_mps", 1e160, r"a wheel speed of 1e\+160 m/s"),
         ("gnss", "east_m", math.inf, "1 position samples are not finite"),
         ("heading", "heading_rad", math.nan, "1 heading samples are not finite"),
+        ("gnss", "var_north_m2", -1.0, "a position variance is negative, the first at row 500"),
+        ("heading", "var_rad2", -1.0, "a heading variance is negative"),
+        ("wheels", "stamp_ns", 0, "the wheel stamps go back at row 500"),
+        ("heading", "stamp_ns", 0, "the heading stamps go back at row 500"),
     ],
 )
 def test_values_that_are_no_measurement_are_refused(

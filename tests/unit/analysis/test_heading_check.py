@@ -64,6 +64,39 @@ def test_each_convention_is_found_and_put_right(
     assert any("applied" in warning and words in warning for warning in run.warnings)
 
 
+def rows_to_and_fro() -> RobotLog:
+    """Drive rows of 25 m with half a turn, left and right, at their ends."""
+    log, step_s = clean(), 0.02
+    row = np.concatenate([np.zeros(2500), np.full(157, 1.0), np.zeros(2500), np.full(157, -1.0)])
+    turn = np.tile(row, 2)
+    width, x = ICRS[0] - ICRS[1], np.zeros((len(turn), 6))
+    v_left, v_right = 0.5 + turn * width / 2, 0.5 - turn * width / 2
+    x[0] = [0.0, 0.0, 0.4, *ICRS]
+    for k in range(len(turn) - 1):
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], step_s)
+    stamps = log.wheels.stamp_ns[0] + np.arange(len(turn)) * round(step_s * 1e9)
+    known, rng = np.full(len(turn), 1e-4), np.random.default_rng(3)
+    north, east = (x[:, :2] + rng.normal(0.0, 0.01, (len(turn), 2))).T
+    return replace(
+        log,
+        wheels=WheelSamples(stamps, v_left, v_right),
+        gnss=PositionFixes(stamps, north, east, known, known, 0 * known),
+        heading=HeadingSamples(stamps, np.angle(np.exp(1j * (x[:, 2] + rng.normal(0.0, 0.01, len(turn))))), known),
+    )
+
+
+def test_the_other_convention_is_told_from_an_offset_by_the_turns_between_rows() -> None:
+    log = rows_to_and_fro()
+    assert check_heading(log, load_config()).warnings == ()
+    other = check_heading(told(log, math.pi / 2 - log.heading.heading_rad), load_config())
+    assert other.agreement > 0.8
+    assert other.applied_mirror
+    assert "other convention" in other.warnings[0]
+    paper = check_heading(other_log := told(log, -log.heading.heading_rad), load_config(sets=["filter.preset=paper"]))
+    assert "set frames.heading" in paper.warnings[0]
+    assert np.abs(icrs(fit(other_log, load_config(sets=[WIDTH]))) - ICRS).max() < ICR_TOLERANCE_M
+
+
 def random(log: RobotLog) -> Floats:
     return np.random.default_rng(4).uniform(-math.pi, math.pi, len(log.heading.heading_rad))
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from icrtool.analysis import stream_delays
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.stream_delays import heading_delay
 from icrtool.config import load_config
 from icrtool.core.ekf_plain import step_state
-from icrtool.tables import Datum, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from icrtool.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
 
 START_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)
@@ -71,7 +73,7 @@ def test_streams_on_time_are_left_alone() -> None:
     assert run.summary["heading"]["applied_delay_s"] == run.summary["filter"]["reference_delay_s"] == 0.0
 
 
-@pytest.mark.parametrize("delay", [0.12, 0.3])
+@pytest.mark.parametrize("delay", [0.12, 0.3, 0.9])
 @pytest.mark.parametrize("stream", ["heading", "fixes"])
 def test_a_late_stream_is_found_and_taken_out_alone(stream: str, delay: float) -> None:
     late = {"heading_late_s": delay} if stream == "heading" else {"fixes_late_s": delay}
@@ -83,6 +85,18 @@ def test_a_late_stream_is_found_and_taken_out_alone(stream: str, delay: float) -
     assert any(f"the {stream} {'is' if stream == 'heading' else 'are'} {delay:.1f}"[:-1] in w for w in run.warnings)
     # Left in, it moves x by speed times delay, 7 cm and more.
     assert icr_error(run) < ICR_TOLERANCE_M
+
+
+def test_a_search_that_does_not_settle_finds_nothing() -> None:
+    """A robot that is parked and then drives a circle: the one change of speed says this, and then that."""
+    rng = np.random.default_rng(1)
+    design = np.column_stack([np.ones(400), rng.normal(0.0, 0.1, 400), np.ones(400)])
+
+    def explain(at: float) -> tuple[Floats, Floats, Callable[[Floats], float]]:
+        seen = design[:, 1] * (0.15 if at < 0.1 else -0.15) + rng.normal(0.0, 1e-4, 400)
+        return design, seen, lambda _: 1.0
+
+    assert np.isnan(stream_delays._search(explain).value_s)
 
 
 def test_configured_delays_are_used_as_they_are() -> None:

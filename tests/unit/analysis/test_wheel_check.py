@@ -15,7 +15,7 @@ from icrtool.analysis.simulate import Drive, Sensors, move, sense
 from icrtool.analysis.study_runs import readings_log
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import load_config
-from icrtool.tables import RobotLog
+from icrtool.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
 
 sys.path.insert(0, str(Path(__file__).parent))
 from drives import ICRS, make_log
@@ -73,6 +73,27 @@ def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  
     check = check_wheels(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
     assert any(words in warning for warning in check.warnings)
     assert check.applied_scale == 1.0
+
+
+def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
+    """Swapped wheels and a heading of the other convention look alike there, under fixes this bad."""
+    log, t, fix = make_log(seconds=1.0), np.arange(0.0, 180.0, 0.02), slice(0, None, 5)
+    psi = np.radians(4.0) * np.sin(2 * np.pi * t / 20.0)
+    ahead = np.gradient(psi, t) * (ICRS[0] - ICRS[1]) / 2
+    place = np.cumsum(0.8 * 0.02 * np.exp(1j * psi))[fix]
+    stamps = log.wheels.stamp_ns[0] + np.round(t * 1e9).astype(np.int64)
+    known = np.ones(len(place))
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        north, east = np.stack([place.real, place.imag]) + rng.normal(0.0, 1.0, (2, len(place)))
+        told = psi + rng.normal(0.0, 0.01, len(t))
+        straight = replace(
+            log,
+            wheels=WheelSamples(stamps, 0.8 + ahead, 0.8 - ahead),
+            gnss=PositionFixes(stamps[fix], north, east, known, known, 0 * known),
+            heading=HeadingSamples(stamps, told, np.full(len(t), 1e-4)),
+        )
+        assert check_wheels(straight, CONFIG).warnings == ()
 
 
 def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:

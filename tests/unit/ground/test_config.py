@@ -43,6 +43,9 @@ def test_every_built_in_robot_loads_and_names_its_source(name: str) -> None:
         ("dropout.horizons_m=[]", "dropout"),
         ("dropout.horizons_m=[1, 1]", "dropout"),
         ("frames.datum=[100, 0]", "frames.datum"),
+        ("frames.heading=north - at `$.yaw`", "frames.heading"),
+        ("robot.name=bo\udcff", "robot.name"),
+        ("robot.track_width_m=1" + 5000 * "0", "robot.track_width_m"),
     ],
 )
 def test_an_unusable_value_is_an_error_that_names_its_key(text: str, key: str) -> None:
@@ -63,7 +66,7 @@ def test_an_unknown_robot_lists_the_known_ones() -> None:
         load_config(robot="r2d2")
 
 
-@pytest.mark.parametrize("content", [b"[robot", b"\xff\xfe\x00"])
+@pytest.mark.parametrize("content", [b"[robot", b"\xff\xfe\x00", b"[robot]\ntrack_width_m = 1" + 5000 * b"0"])
 def test_a_file_that_is_no_toml_is_refused(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "bad.toml"
     file.write_bytes(content)
