@@ -16,6 +16,8 @@ import msgspec
 from icrtool.errors import ConfigError
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+Width = Annotated[float, msgspec.Meta(gt=0, le=20)]
+Radius = Annotated[float, msgspec.Meta(gt=0, le=5)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
@@ -27,8 +29,8 @@ class RobotConfig:
     """The robot: `track_width_m` is b of Eqs. 38-39, the distance between the centre lines of the tracks."""
 
     name: str | None = None
-    track_width_m: Positive | None = None
-    wheel_radius_m: Positive | None = None
+    track_width_m: Width | None = None
+    wheel_radius_m: Radius | None = None
     encoder_counts_per_rev: Positive | None = None
 
 
@@ -55,11 +57,14 @@ class WheelsConfig:
 
     Scales multiply the travel of a side (1.02: the wheel is 2 % larger); ``auto`` is 1, or what the position reference
     says of both sides where that is clear (preset ``field``).
+    `twist_width_m` is the width with which a body twist was made of the wheels' speeds: the wheel separation of the
+    controller times its multiplier. Left out: `RobotConfig.track_width_m`.
     """
 
     left_joints: tuple[str, ...] = ()
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
+    twist_width_m: Width | None = None
     left_scale: Literal["auto"] | float = "auto"
     right_scale: Literal["auto"] | float = "auto"
 

@@ -286,7 +286,9 @@ def _settings(findings: tuple[Finding, ...], config: Config) -> tuple[Setting, .
 
     add("frames.heading_offset_deg", by_key["heading_offset_deg"], neutral=0.0, least=0.3)
     for key, stream in (("frames.reference_delay_s", "gnss_delay"), ("frames.heading_delay_s", "heading_delay")):
-        add(key, by_key[KEYS[stream]], neutral=0.0, least=RESPONSE_S, why=LABELS[stream])
+        # Receivers and AHRS are late; one that looks early is a robot that answers its wheels late.
+        if by_key[KEYS[stream]].value > 0.0:
+            add(key, by_key[KEYS[stream]], neutral=0.0, least=RESPONSE_S, why=LABELS[stream])
     add("frames.antenna_forward_m", by_key["antenna_forward_m"], neutral=0.0, least=0.02)
     add("frames.antenna_right_m", by_key["antenna_right_m"], neutral=0.0, least=0.02)
     for side in ("left", "right"):

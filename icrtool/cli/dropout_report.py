@@ -183,7 +183,8 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
         raise failed[0]
     if failed:
         what = f"{len(failed)} of {len(outcomes)} runs and logs"
-        raise IcrToolError(what, "could not be used", "the others were written")
+        others = "the others were written" if len(failed) < len(outcomes) else "see above"
+        raise IcrToolError(what, "could not be used", others)
     if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
         raise SystemExit(3)
 

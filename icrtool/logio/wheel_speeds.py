@@ -21,6 +21,8 @@ FEWEST_WINDOWS = 8
 FASTEST_MPS = 100.0
 """No robot on wheels or tracks is faster: a number over it is damage, and would make a way of any length."""
 
+FOUND = "found from the position reference"
+
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
@@ -71,6 +73,7 @@ def wheel_samples(
             left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
         left[-1], right[-1] = left[-2], right[-2]
     factor, how = _metres_per_unit(motion, unit, stamps, left, right, gnss, config)
+    warnings += [f"{log_name}: {note}" for note in _assumptions(motion, how, config)]
     with np.errstate(over="ignore"):
         left = left * factor * _side_scale(config.wheels.left_scale)
         right = right * factor * _side_scale(config.wheels.right_scale)
@@ -124,7 +127,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
 def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bool]:
     """Return left, right, their unit, and whether they are positions."""
     if motion.twist is not None:
-        width = config.robot.track_width_m
+        width = _twist_width_m(config)
         if width is None:
             raise ConfigError(
                 "robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME"
@@ -143,6 +146,23 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
         raise ConfigError("wheels.quantity", f"{motion.topic} tells no velocity of both sides", "leave it on auto")
     unit: Unit = "counts" if wanted == "counts" else motion.position_unit
     return *positions, unit, True
+
+
+def _twist_width_m(config: Config) -> float | None:
+    given = config.wheels.twist_width_m
+    return given if given is not None else config.robot.track_width_m
+
+
+def _assumptions(motion: WheelMotion, how: str, config: Config) -> list[str]:
+    """Say what was taken for granted, or estimated, and where it can be set."""
+    if motion.twist is not None and config.wheels.twist_width_m is None:
+        undone = f"undone with {config.robot.track_width_m:g} m (robot.track_width_m)"
+        advice = "where its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
+        return [f"{motion.topic} tells a body twist: {undone}; {advice}, or the ICRs come out too close"]
+    if FOUND in how:
+        lacking = "wheel_radius_m" if config.robot.wheel_radius_m is None else "encoder_counts_per_rev"
+        return [f"robot.{lacking} is not given{how}"]
+    return []
 
 
 def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | None:
@@ -185,4 +205,4 @@ def _metres_per_unit(
             f"needed to read {motion.topic}, which is {'of unknown unit' if unit == 'unknown' else f'in {unit}'}",
             f"give it with --set {needed}=…; the log has no straight driving to find the scale from",
         )
-    return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
+    return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m ({FOUND}; {unit})"

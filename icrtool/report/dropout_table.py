@@ -82,7 +82,7 @@ def ratio_text(numerator: float, denominator: float) -> str:
 
 
 def _reach_text(one: BudgetDistance) -> str:
-    return f"beyond {one.distance_m:g} m" if one.beyond else f"{one.distance_m:.1f} m"
+    return f"more than {one.distance_m:g} m" if one.beyond else f"{one.distance_m:.1f} m"
 
 
 def _error_lines(report: DropoutReport) -> list[str]:
@@ -126,7 +126,7 @@ def _count_lines(report: DropoutReport) -> list[str]:
     shown, counts = shown_horizons(report), report.counts
     lines = [_row("trials", [f"{int(counts.trials[h]):,}" for h in shown])]
     for label, column in (
-        ("no trial: way too short", counts.short),
+        ("no trial: too little way", counts.short),
         ("across a wheel gap", counts.gap),
         ("ends in GNSS outage", counts.outage),
     ):
@@ -161,7 +161,7 @@ def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
 
 def _span_text(low_m: float, high_m: float) -> str:
     if not math.isfinite(low_m):
-        return "way too short"
+        return "too little way"
     return f"{metres_text(low_m).removesuffix(' m')}-{metres_text(high_m)}"
 
 

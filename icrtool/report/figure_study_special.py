@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FATES = {"converged": (0.13, 0.40, 0.67), "elsewhere": (0.80, 0.80, 0.80), "inverted": (0.70, 0.09, 0.17)}
+FATES = {"converged": (0.57, 0.77, 0.93), "elsewhere": (0.90, 0.90, 0.90), "inverted": (0.50, 0.0, 0.10)}
 """Colours, red green blue, mixed by the share of the runs."""
 
 CASE_COLORS = {"model": "#1b7837", "paper": "#2166ac", "field": "#e08214"}
+CASE_HATCHES = {"model": "", "paper": "///", "field": "..."}
 CASE_DASHES = {"model": "-", "paper": (0, (6, 2)), "field": (0, (6, 1.5, 1.2, 1.5))}
 
 
@@ -90,11 +91,13 @@ def draw_consistency(result: StudyResult) -> Figure:
     width = 0.8 / len(cases)
     for place, name in enumerate(cases):
         x = np.arange(len(states)) + (place - (len(cases) - 1) / 2) * width
-        bottom.bar(x, curves[f"coverage {name}"], width, color=CASE_COLORS[name])
+        look = {"color": CASE_COLORS[name], "edgecolor": "white", "linewidth": 0.0, "hatch": CASE_HATCHES[name]}
+        bottom.bar(x, curves[f"coverage {name}"], width, label=name, **look)
     bottom.axhspan(90, 99, color="#d9ead3", zorder=0.5)
     bottom.axhline(95.4, color="black", linewidth=0.9, linestyle=(0, (4, 2)))
     bottom.set_ylim(min(80.0, *(float(curves[f"coverage {name}"].min()) - 2 for name in cases)), 101)
     bottom.set_xticks(np.arange(len(states)), [state.replace("_", " ") for state in states])
     bottom.set_ylabel("Within 2 sigma [%]")
+    bottom.legend(loc="lower right", ncols=len(cases), frameon=True, framealpha=0.9)
     figure.legend(*top.get_legend_handles_labels(), loc="lower center", ncols=4)
     return figure

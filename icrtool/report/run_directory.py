@@ -224,6 +224,12 @@ def log_of_run(directory: Path) -> str | None:
         return None
 
 
+def track_width_of_run(directory: Path) -> float | None:
+    """Return b [m] of the robot that the run in a directory was made with; None where it was not given."""
+    width: float | None = _read_document(directory)["config"]["robot"]["track_width_m"]
+    return width
+
+
 def is_run_directory(directory: Path) -> bool:
     """Say whether a directory is a run of ours, of whatever version."""
     try:

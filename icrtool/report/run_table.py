@@ -15,6 +15,9 @@ from icrtool.report.words import TABLE_WIDTH, duration_text, length_text, positi
 LABEL = 12
 """Columns of the left margin: what a line is about."""
 
+TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
+"""A delay that receivers have, to say what it does; at lower speeds than this it does little."""
+
 WORTH_TELLING_S = 0.05
 """A delay below this is not worth a line."""
 
@@ -216,8 +219,12 @@ def _delay_lines(run: FilterRun) -> list[str]:
         delay, std = facts["delay_s"], facts["delay_std_s"]
         if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
             told.append(f"{word} {abs(delay):.2f} ± {std:.2f} s {'late' if delay > 0 else 'early'}")
-    text = f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"
-    return [_line("delays", text)] if told else []
+    lines = [f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"] if told else []
+    speed = run.summary["drive"]["speed_mean_mps"]
+    if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
+        shift = length_text(TYPICAL_DELAY_S * speed)
+        lines.append(f"of the fixes: not shown by this drive; {TYPICAL_DELAY_S:g} s late would move x by {shift}")
+    return [_line("" if number else "delays", line) for number, line in enumerate(lines)]
 
 
 def _line(label: str, text: str) -> str:

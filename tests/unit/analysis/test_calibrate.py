@@ -181,6 +181,12 @@ def test_a_late_heading_is_proposed_as_a_setting_and_one_on_time_is_not() -> Non
     assert settings["frames.heading_delay_s"].why == "heading late against the wheels"
 
 
+def test_a_heading_that_looks_early_is_no_setting_for_it_is_the_wheels_that_are_answered_late() -> None:
+    early = calibrate(simulate(0, heading_delay=-0.3), CONFIG)
+    assert early.finding("heading_delay_s").value == pytest.approx(-0.3, abs=0.02)
+    assert "frames.heading_delay_s" not in {setting.key for setting in early.settings}
+
+
 def test_a_stray_stamp_decades_away_costs_no_memory() -> None:
     log = simulate()
     stray = log.heading.stamp_ns.copy()

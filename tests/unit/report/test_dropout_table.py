@@ -68,7 +68,7 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
 def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutContent) -> None:
     text, counts = format_dropout(content), content.report.counts
     assert row_of(text, "trials")[0] == f"{counts.trials[1]:,}"
-    assert row_of(text, "no trial: way too short")[0] == f"{counts.short[1]:,}"
+    assert row_of(text, "no trial: too little way")[0] == f"{counts.short[1]:,}"
     assert row_of(text, "across a wheel gap")[0] == f"{counts.gap[1]:,}"
     assert row_of(text, "ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
 
@@ -100,7 +100,7 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
     ]
     assert budget_lines(budgets) == [
         "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m",
-        "stays within 9 m (95 %) for beyond 20 m",
+        "stays within 9 m (95 %) for more than 20 m",
     ]
 
 
@@ -142,7 +142,7 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutContent, t
     text = (tmp_path / "m.md").read_text(encoding="utf-8")
     assert text.startswith("## barn")
     assert "**A gate failed.**" in text
-    assert "- stays within 50 m (95 %) for beyond" in text
+    assert "- stays within 50 m (95 %) for more than" in text
     assert "Could not be used: runs/x: was edited" in text
     table = [line for line in text.splitlines() if line.startswith("|")]
     columns = {line.count("|") for line in table[:8]}

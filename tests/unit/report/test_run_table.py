@@ -104,3 +104,12 @@ def test_lengths_read_well() -> None:
     ]
     assert [way_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
     assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
+
+
+def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: FilterRun) -> None:
+    steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
+    speed = run.summary["drive"]["speed_mean_mps"]
+    said = f"not shown by this drive; 0.1 s late would move x by {length_text(0.1 * speed)}"
+    assert said in format_run(steady)
+    known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02}})
+    assert said not in format_run(known)
