@@ -11,7 +11,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.logio.stamps import increasing
 from icrtool.logio.wheel_sources import Unit, WheelMotion
-from icrtool.tables import Floats, Ints, PositionFixes, WheelSamples
+from icrtool.tables import Bools, Floats, Ints, PositionFixes, WheelSamples
 
 WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3
@@ -20,6 +20,9 @@ FEWEST_WINDOWS = 8
 
 FASTEST_MPS = 100.0
 """No robot on wheels or tracks is faster: a number over it is damage, and would make a way of any length."""
+
+SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
+"""A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
 
 FOUND = "found from the position reference"
 
@@ -82,11 +85,29 @@ def wheel_samples(
         count = np.count_nonzero(~possible)
         warnings.append(f"{log_name}: {motion.topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out")
         stamps, left, right = stamps[possible], left[possible], right[possible]
+    if (spikes := _spikes(left) | _spikes(right)).any():
+        warnings.append(
+            f"{log_name}: {motion.topic}: {np.count_nonzero(spikes)} wheel speeds, up to "
+            f"{max(np.abs(left).max(), np.abs(right).max()):.0f} m/s, unlike those around them left out: "
+            "were counters reset?"
+        )
+        stamps, left, right = stamps[~spikes], left[~spikes], right[~spikes]
     if len(stamps) < 2:
         raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     samples = WheelSamples(stamps, left, right)
     quantity = "position" if is_position else "speed"
     return samples, f"{quantity}{how}", warnings
+
+
+def _spikes(speed: Floats) -> Bools:
+    """Mark single samples (n,) far faster than those before and after them, and than almost all others."""
+    size = np.abs(speed)
+    if len(size) < 2:
+        return np.zeros(len(size), np.bool_)
+    around = np.maximum(np.append(size[1], size[:-1]), np.append(size[1:], size[-2]))
+    usual = float(np.quantile(size, USUAL_SHARE))
+    spikes: Bools = (size > max(SPIKE_MPS, SPIKE_RATIO * usual)) & (size > SPIKE_RATIO * around)
+    return spikes
 
 
 def _side_scale(scale: float | str) -> float:
