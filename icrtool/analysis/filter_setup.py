@@ -13,7 +13,7 @@ from icrtool.analysis.driven_run import half_width_m
 from icrtool.analysis.usable_streams import check_streams
 from icrtool.config import Config, FilterConfig
 from icrtool.core.ekf import FilterParameters, Measurements
-from icrtool.errors import DataError
+from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
 
 PAPER_PROCESS_POSITION_MPS = 0.2
@@ -84,6 +84,27 @@ class FilterSetup:
     P0: Floats
     gnss_index: Ints
     heading_index: Ints
+
+
+def check_start(config: Config) -> None:
+    """Refuse, in preset ``field``, ICRs configured to start on the other side.
+
+    Raises
+    ------
+    ConfigError
+        They are; the key is named.
+    """
+    settings = config.filter
+    if settings.preset == "paper":
+        return
+    sides = (("right", 1.0, settings.initial_y_icr_right_m), ("left", -1.0, settings.initial_y_icr_left_m))
+    for side, sign, value in sides:
+        if value is not None and value * sign <= 0:
+            raise ConfigError(
+                f"filter.initial_y_icr_{side}_m",
+                "preset field keeps the right ICR right and the left one left (right > 0 > left)",
+                f"found {value:g}; preset paper starts anywhere",
+            )
 
 
 def set_up_filter(

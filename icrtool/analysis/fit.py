@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.analysis.adaptive_run import AdaptedRun, run_adaptively
 from icrtool.analysis.doubts import adaptation_notes, antenna_doubt, doubts
 from icrtool.analysis.excitation import judge_excitation
-from icrtool.analysis.filter_setup import WarmStart, wheel_gap_s
+from icrtool.analysis.filter_setup import WarmStart, check_start, wheel_gap_s
 from icrtool.analysis.fix_quality import FixQuality, judge_fixes
 from icrtool.analysis.heading_check import HeadingCheck, check_heading
 from icrtool.analysis.stream_delays import measure_delays
@@ -137,6 +137,8 @@ def fit(
     ------
     DataError
         Streams that cannot be used together, or hold values that are not finite numbers.
+    ConfigError
+        A start that preset ``field`` does not take.
 
     Notes
     -----
@@ -144,6 +146,7 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
+    check_start(config)
     check_streams(log)
     wheels = check_wheels(log, config)
     log = wheels.log

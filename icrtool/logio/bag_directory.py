@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -15,10 +14,10 @@ from icrtool.errors import LogError
 from icrtool.logio.channel import Block, Channel, Container, Problems
 from icrtool.logio.decompress import LARGEST_CHUNK_BYTES
 from icrtool.logio.mcap_file import McapFile
+from icrtool.logio.one_recording import Span, check_spans, storage_files
 from icrtool.logio.sqlite_bag import SqliteBag
 from icrtool.tables import Ints
 
-_STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
 _LARGEST_METADATA_BYTES = 1 << 24
 _LARGEST_RATIO = 1000
 """A file that decompresses to more than so many times its size is no recording."""
@@ -38,7 +37,7 @@ class BagDirectory:
     Raises
     ------
     LogError
-        No storage file in it, or none of them can be read.
+        No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,6 +45,7 @@ class BagDirectory:
         self._problems = Problems(path.name)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._parts: list[Container] = []
+        self._by_name = False
         self.files: list[Path] = []
         metadata = self._read_metadata()
         try:
@@ -76,13 +76,29 @@ class BagDirectory:
             self._scratch.cleanup()
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the wanted channels, file by file."""
-        for part, (own, merged) in zip(self._parts, self._numbers, strict=True):
+        """Yield the messages of the wanted channels, file by file.
+
+        Raises
+        ------
+        LogError
+            At the end: the files, found by name, are recordings of different times.
+        """
+        spans = []
+        for file, part, (own, merged) in zip(self.files, self._parts, self._numbers, strict=True):
             if not len(own):
                 continue
+            begins, ends = [], []
             for block in part.blocks(frozenset(own[np.isin(merged, list(wanted))].tolist())):
+                if len(block.log_time_ns):
+                    begins.append(int(block.log_time_ns.min()))
+                    ends.append(int(block.log_time_ns.max()))
                 place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
                 yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
+            if begins:
+                spans.append(Span(min(begins), max(ends), file.name))
+        if self._by_name:
+            for odd in check_spans(self._path, spans):
+                self._problems.say(odd)
 
     def _read_metadata(self) -> _Metadata:
         """Return what metadata.yaml says; a recorder that was killed leaves none, or half of it."""
@@ -115,12 +131,8 @@ class BagDirectory:
             self._problems.say(f"metadata.yaml names files that are not there: {', '.join(missing)}")
         if len(missing) < len(named):
             return [file for file in named if file.name not in missing]
-        found = sorted(
-            (file for file in self._path.iterdir() if file.is_file() and _STORAGE.search(file.name)), key=_natural_key
-        )
-        if not found:
-            raise LogError(self._path, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
-        return found
+        self._by_name = True
+        return storage_files(self._path)
 
     def _open_part(self, file: Path, message_compression: str) -> None:
         try:
@@ -181,8 +193,3 @@ class BagDirectory:
             own = np.array(sorted(numbers), np.int64)
             self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
         return list(merged.values())
-
-
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    """Sort ``bag_10`` after ``bag_9``."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -17,6 +17,7 @@ from icrtool.logio.channel import Block, Channel, Container
 from icrtool.logio.dynamic_joints import Collector, collector_for
 from icrtool.logio.gyro import find_gyro
 from icrtool.logio.heading_sources import Convention, HeadingSource
+from icrtool.logio.joint_names import ignored_joints
 from icrtool.logio.open_log import open_log
 from icrtool.logio.position_sources import PositionSource
 from icrtool.logio.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
@@ -130,6 +131,7 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     heading, convention = _headings(source, config, clock, name)
     samples, how, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, gnss, name)
     warnings += wheel_warnings
+    warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
     if source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)

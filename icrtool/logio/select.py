@@ -11,6 +11,7 @@ from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logio.channel import Channel
 from icrtool.logio.gyro import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logio.heading_sources import HEADING_TYPES, HeadingSource, no_heading
+from icrtool.logio.joint_names import check_joints
 from icrtool.logio.position_sources import POSITION_TYPES, PositionSource, no_position
 from icrtool.logio.sides import right_twin
 from icrtool.logio.topic_table import TopicTable
@@ -220,16 +221,17 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     Raises
     ------
     ConfigError
-        A configured topic is not in the log, or cannot feed its role.
+        A configured topic is not in the log, or cannot feed its role; a configured joint is not among the wheels'.
     MissingStreamError
         No candidate for one role or more; the error names them all and lists what the log holds.
     """
     topics = config.topics
     _check_sides(topics, found, log, channels)
+    wheels = _best(found.wheels, topics.wheels or _pair_name(topics))
+    check_joints(wheels, found.wheels, config)
     _check_configured("wheels", found.wheels, topics.wheels, found.unread, log, channels)
     _check_configured("gnss", found.gnss, topics.gnss, found.unread, log, channels)
     _check_configured("heading", found.heading, topics.heading, found.unread, log, channels)
-    wheels = _best(found.wheels, topics.wheels or _pair_name(topics))
     gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
     if wheels is None or gnss is None or heading is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}

@@ -48,6 +48,7 @@ class WheelMotion:
     twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only the body's is told
     score : how well the type suits; `why` says it in words
     problem : why it cannot be used, empty when it can
+    joints : the joints that its messages list by name, where they do
     """
 
     topic: str
@@ -63,6 +64,7 @@ class WheelMotion:
     score: float = 0.0
     why: str = ""
     problem: str = ""
+    joints: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -120,9 +122,11 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
     return means[0], means[1]
 
 
-def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what: str) -> WheelMotion:
+def _joints(
+    table: TopicTable, config: Config, paths: _Paths, words: tuple[NDArray[Any], list[str]], score: float, what: str
+) -> WheelMotion:
     """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
-    codes, texts = table.words(paths[0])
+    codes, texts = words
     left, right = _wheels_among(texts, config)
     if not (left and right):
         some = ", ".join([*texts[:MOST_NAMED], *(["…"] if len(texts) > MOST_NAMED else [])])
@@ -196,7 +200,8 @@ def _told_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]
 
 def _by_name(paths: _Paths, score: float, what: str) -> Reader:
     def read(table: TopicTable, config: Config) -> WheelMotion:
-        return _joints(table, config, paths, score, what)
+        words = table.words(paths[0])
+        return replace(_joints(table, config, paths, words, score, what), joints=tuple(words[1]))
 
     return read
 

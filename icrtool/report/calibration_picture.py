@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import secrets
 from pathlib import Path
 
 from icrtool.analysis.calibrate_verdict import Calibration
 from icrtool.errors import OutputError
+from icrtool.report.drawing_process import matplotlib_unsaid
 from icrtool.report.run_directory import PLOT_FORMATS
+from icrtool.report.whole_file import whole_file
 
 
 def check_picture(file: Path) -> None:
@@ -34,17 +35,10 @@ def write_picture(calibration: Calibration, file: Path) -> None:
     OutputError
         The file cannot be written.
     """
-    from icrtool.report.figure_calibration import draw_calibration
-    from icrtool.report.figure_style import save, style
-
-    partial = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.partial")
     form = file.suffix.removeprefix(".").lower()
-    drawn = partial.with_name(f"{partial.name}.{form}")
-    try:
+    with whole_file(file) as partial, matplotlib_unsaid():
+        from icrtool.report.figure_calibration import draw_calibration
+        from icrtool.report.figure_style import save, style
+
         with style():
-            save(draw_calibration(calibration), partial, (form,))
-        drawn.replace(file)
-    except OSError as err:
-        raise OutputError(file, "cannot be written", err.strerror or str(err)) from err
-    finally:
-        drawn.unlink(missing_ok=True)
+            save(draw_calibration(calibration), partial.with_suffix(""), (form,))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import secrets
 from pathlib import Path
 
 from icrtool.analysis.calibrate_verdict import CALIBRATION_SCHEMA, Calibration, Finding
 from icrtool.errors import OutputError
 from icrtool.report.run_directory import json_bytes
+from icrtool.report.whole_file import whole_file
 
 FILE_NAME = "calibration.json"
 
@@ -79,14 +79,8 @@ def write_calibration(calibration: Calibration, place: Path) -> Path:
         Something that is not a calibration is there, or it cannot be written.
     """
     file = calibration_file(place)
-    partial = file.with_name(f".{file.name}.{secrets.token_hex(4)}.partial")
-    try:
+    with whole_file(file) as partial:
         partial.write_bytes(json_bytes(calibration.summary()))
-        partial.replace(file)
-    except OSError as err:
-        raise OutputError(file, "cannot be written", err.strerror or str(err)) from err
-    finally:
-        partial.unlink(missing_ok=True)
     return file
 
 

@@ -35,6 +35,18 @@ class Drawer(Protocol):
         ...
 
 
+@contextmanager
+def matplotlib_unsaid() -> Iterator[None]:
+    """Leave unsaid what matplotlib says of a home directory it cannot write: that is not our user's trouble."""
+    logger = logging.getLogger("matplotlib")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
 class DrawingHere:
     """Draws in this process, at once.
 
@@ -54,14 +66,8 @@ class DrawingHere:
             if not self._formats:
                 return
             directory.mkdir(exist_ok=True)
-            logger = logging.getLogger("matplotlib")
-            level = logger.level
-            # What it says of a home directory it cannot write is not our user's trouble.
-            logger.setLevel(logging.ERROR)
-            try:
+            with matplotlib_unsaid():
                 write(directory, self._formats, *content)
-            finally:
-                logger.setLevel(level)
 
         yield draw
 

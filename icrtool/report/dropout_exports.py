@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import secrets
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -11,6 +10,7 @@ from xml.etree import ElementTree as ET
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.report.dropout_content import DropoutContent, shown_horizons
 from icrtool.report.dropout_table import budget_lines, metres_text, percent_text, ratio_text
+from icrtool.report.whole_file import whole_file
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -37,7 +37,8 @@ def write_junit(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
     for total in ("tests", "failures", "errors"):
         suites.set(total, str(sum(int(suite.get(total, "0")) for suite in suites)))
     ET.indent(suites)
-    _write_whole(path, ET.tostring(suites, encoding="utf-8", xml_declaration=True) + b"\n")
+    with whole_file(path) as partial:
+        partial.write_bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
 def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
@@ -58,7 +59,8 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
             parts.append(f"## {_escaped(name)}\n\nCould not be used: {_escaped(str(outcome))}\n")
         else:
             parts.append(format_markdown(outcome))
-    _write_whole(path, "\n".join(parts).encode("utf-8", errors="backslashreplace"))
+    with whole_file(path) as partial:
+        partial.write_bytes("\n".join(parts).encode("utf-8", errors="backslashreplace"))
 
 
 def check_parent(path: Path) -> None:
@@ -143,16 +145,3 @@ def _xml_text(text: str) -> str:
 def _escaped(text: str) -> str:
     """Return text with what Markdown would take for markup escaped."""
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write a file beside its place and move it there."""
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        try:
-            partial.write_bytes(data)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as err:
-        raise OutputError(path, "cannot be written", err.strerror or str(err)) from err

@@ -215,6 +215,10 @@ def topics_with_line_breaks(folder: Path) -> list[str]:
     return [str(path)]
 
 
+def joints_of_a_twist(folder: Path) -> list[str]:
+    return [str(log(folder, wheels="twist_stamped")), "--set", 'wheels.left_joints=["l"]']
+
+
 def in_folder(folder: Path, name: str, content: bytes | None = None) -> list[str]:
     target = folder / name
     if content is None:
@@ -320,6 +324,14 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "a topic that is not there": (asked("--set", "topics.gnss=/nope"), "topics.gnss: /nope is not in"),
     "a topic of no use": (asked("--set", "topics.heading=/gps/fix"), "topics.heading: /gps/fix"),
     "half a pair of topics": (asked("--set", "topics.wheel_left=/l"), "wheel_left and wheel_right come together"),
+    "a joint that is not there": (
+        asked("--set", 'wheels.left_joints=["l"]'),
+        "wheels.left_joints: no message of /joint",
+    ),
+    "a start on the wrong side": (
+        asked("--set", "filter.initial_y_icr_right_m=-0.6"),
+        "filter.initial_y_icr_right_m: preset field keeps the right ICR right and the left one left (right > 0 > left)",
+    ),
     "an unknown key": (asked("--set", "topics.gps=/fix"), "topics.gps: unknown configuration key"),
     "an unknown section": (asked("--set", "gps.topic=/fix"), "gps: unknown configuration key"),
     "a word for a number": (asked("--set", "robot.track_width_m=wide"), "robot.track_width_m: "),
@@ -346,6 +358,7 @@ RUNS: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "zero in every header": (zero_stamps, "of the header stamps are 0; log time is used"),
     "stamps that go back": (stamps_going_back, "go back"),
     "duplicated stamps": (duplicated_stamps, "share a stamp"),
+    "joints named for a twist": (joints_of_a_twist, "drive: wheels.left_joints is not used: "),
     "a name that is no UTF-8": (
         lambda folder: [shutil.move(log(folder), os.fsdecode(bytes(folder) + b"/\xff.mcap"))],
         "",

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,6 +38,24 @@ def test_the_misses_are_drawn_before_and_after(icrtool, tmp_path: Path) -> None:
     status, _, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.txt")
     assert status == 1
     assert "no format of a picture" in err
+
+
+def test_a_picture_that_cannot_be_written_is_one_error(icrtool, monkeypatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    for name in ("write_bytes", "replace", "unlink"):
+        monkeypatch.setattr(Path, name, refuse)
+    status, _, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.png", "-q")
+    assert (status, err) == (1, "Error: misses.png: cannot be written; Read-only file system\n")
+
+
+def test_a_home_directory_that_cannot_be_written_is_no_matter(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "MPLCONFIGDIR": str(tmp_path / "file" / "below"), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-m", "icrtool", "calibrate", LOG, *ROBOT, "--plot", tmp_path / "misses.png"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
 
 
 def test_a_run_is_calibrated_with_its_configuration(icrtool, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from icrtool.analysis.simulate import Drive, Sensors, move, sense
 from icrtool.analysis.study_runs import readings_log
 from icrtool.config import load_config
 from icrtool.core.ekf import GATED
-from icrtool.errors import DataError
+from icrtool.errors import ConfigError, DataError
 from icrtool.tables import PositionFixes, RobotLog, WheelSamples
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -258,3 +258,15 @@ def test_an_empty_stream_is_refused() -> None:
 @pytest.mark.parametrize(("degrees", "quantile"), [(1, 15.1367), (2, 18.4207)])
 def test_gates_are_chi_squared_quantiles(degrees: int, quantile: float) -> None:
     assert chi2_gate(0.9999, degrees) == pytest.approx(quantile, abs=1e-4)
+
+
+@pytest.mark.parametrize(("side", "metres"), [("right", -0.6), ("left", 0.6), ("left", 0.0)])
+def test_a_start_on_the_other_side_is_refused_in_preset_field_and_taken_in_paper(side: str, metres: float) -> None:
+    key = f"filter.initial_y_icr_{side}_m"
+    log = make_log(seconds=30.0)
+    with pytest.raises(
+        ConfigError, match=rf"{key}: preset field .*\(right > 0 > left\); found {metres:g}; preset paper"
+    ):
+        fit(log, load_config(sets=[f"{key}={metres}"]))
+    run = fit(log, load_config(sets=[f"{key}={metres}", "filter.preset=paper", "filter.initial_icr_std_m=1e-6"]))
+    assert getattr(run.table, f"y_icr_{side}_m")[0] == pytest.approx(metres, abs=1e-3)

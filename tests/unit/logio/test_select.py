@@ -11,6 +11,7 @@ import pytest
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, MissingStreamError
 from icrtool.logio.channel import Channel
+from icrtool.logio.joint_names import ignored_joints
 from icrtool.logio.select import Candidates, Choice, choose_streams, common_clock, fields_to_take, find_candidates
 from icrtool.logio.topic_table import TopicTable
 
@@ -132,6 +133,39 @@ def test_a_measured_twist_goes_before_a_commanded_one() -> None:
 def test_a_pair_of_topics_goes_before_odometry() -> None:
     choice = choose([side("/right_drive/velocity"), odometry(), side("/left_drive/velocity"), fix(), imu()])
     assert choice.wheels.topic == "/left_drive/velocity + /right_drive/velocity"
+
+
+WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
+
+
+@pytest.mark.parametrize("other", [[], [odometry()]], ids=["alone", "beside odometry"])
+def test_a_configured_joint_that_no_message_lists_is_refused_by_name(other: list[TopicTable]) -> None:
+    base = [joints(names=WHEELS), *other, fix(), imu()]
+    with pytest.raises(ConfigError) as caught:
+        choose(base, 'wheels.left_joints=["front_left_wheel", "rear_lft"]')
+    expected = "wheels.left_joints: no message of /joint_states lists a joint rear_lft; its joints are "
+    assert str(caught.value) == expected + ", ".join(WHEELS)
+    with pytest.raises(ConfigError, match=r"wheels.right_joints: no message of /joint_states lists a joint r"):
+        choose(base, 'wheels.right_joints=["r"]')
+
+
+def test_configured_joints_are_looked_for_in_the_topic_that_is_used_alone() -> None:
+    base = [joints("/wheels", names=WHEELS), joints("/arm", names=("l", "r", "m")), fix(), imu()]
+    assert choose(base, 'wheels.left_joints=["l", "m"]', 'wheels.right_joints=["r"]').wheels.topic == "/arm"
+    with pytest.raises(ConfigError, match="no message of /arm lists a joint n; its joints are l, r, m"):
+        choose(base, 'wheels.left_joints=["l", "n"]', 'wheels.right_joints=["r"]')
+    with pytest.raises(ConfigError, match="no message of /wheels lists a joint l;"):
+        choose(base, 'wheels.left_joints=["l"]', 'topics.wheels="/wheels"')
+
+
+def test_configured_joints_are_of_no_use_where_messages_list_none() -> None:
+    config = load_config(sets=['wheels.left_joints=["l"]'])
+    used = choose([odometry(), fix(), imu()], 'wheels.left_joints=["l"]').wheels
+    assert ignored_joints(used, config) == [
+        "wheels.left_joints is not used: /odom (nav_msgs/Odometry) lists no joints by name"
+    ]
+    assert not ignored_joints(used, load_config())
+    assert not ignored_joints(choose([joints(names=("l", "right")), fix(), imu()]).wheels, config)
 
 
 def test_joints_of_an_arm_alone_are_no_wheels() -> None:

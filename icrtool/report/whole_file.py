@@ -1,0 +1,31 @@
+"""A file that appears whole or not at all."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from icrtool.errors import OutputError
+
+
+@contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """Give a path beside a file to write to; at the end of the block it is moved to its place.
+
+    Raises
+    ------
+    OutputError
+        For every OSError of the block (disk full, no permission); what was there before still is.
+    """
+    partial = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.partial{file.suffix.lower()}")
+    try:
+        yield partial
+        partial.replace(file)
+    except OSError as err:
+        raise OutputError(file, "cannot be written", err.strerror or str(err)) from err
+    finally:
+        # Where nothing can be written nothing can be removed either, and why has been told.
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
