@@ -30,6 +30,9 @@ _FUSED = re.compile(
 
 MOST_NAMED = 12
 
+ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
+"""Positions that stay within a turn, and step over nearly all of it this often, are told modulo a turn."""
+
 NEVER_MOVES = 60.0
 """Taken off the score of wheels that stand still all the time: another topic that moves is the robot's."""
 
@@ -122,6 +125,24 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
     return means[0], means[1]
 
 
+def _unwound(positions: Floats) -> Floats:
+    """Return joint positions [rad] (n, k); those told within one turn, as angles that go on.
+
+    Before sides are averaged: a front and a rear wheel do not begin a turn at the same time.
+    """
+    unwound = positions
+    for place, column in enumerate(positions.T):
+        if not float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf)) <= ONE_TURN_RAD:
+            continue
+        told = np.flatnonzero(np.isfinite(column))
+        steps = np.abs(np.diff(column[told]))
+        wraps = steps > np.pi
+        if np.count_nonzero(wraps) >= FEWEST_WRAPS and float(steps[wraps].min()) > LEAST_WRAP_RAD:
+            unwound = unwound.copy("K") if unwound is positions else unwound
+            unwound[told, place] = np.unwrap(column[told])
+    return unwound
+
+
 def _joints(
     table: TopicTable, config: Config, paths: _Paths, words: tuple[NDArray[Any], list[str]], score: float, what: str
 ) -> WheelMotion:
@@ -142,11 +163,9 @@ def _joints(
         return no_motion(table, "left and right wheels come in different messages")
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
+    told, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
     position, speed = (
-        _side_means(
-            _by_wheel(table.find(path), wheels, lefts + rights), [*range(lefts)], [*range(lefts, lefts + rights)]
-        )
-        for path in paths[1:]
+        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)]) for values in (_unwound(told), speeds)
     )
     why = f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}"
     return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
@@ -217,7 +236,8 @@ def _by_place(
         if min(position.shape[1], speed.shape[1]) < length:
             raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
         return motion_of(
-            table.topic, table.message_type, stamp_rows(table, stamp), _side_means(position, left, right),
+            table.topic, table.message_type, stamp_rows(table, stamp),
+            _side_means(_unwound(position.astype(np.float64)), left, right),
             _side_means(speed, left, right), score=90.0, why=why,
         )  # fmt: skip
 

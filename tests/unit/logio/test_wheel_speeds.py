@@ -7,7 +7,8 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.logio.stamps import StampedRows
-from icrtool.logio.wheel_sources import motion_of
+from icrtool.logio.topic_table import TopicTable
+from icrtool.logio.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
 from icrtool.logio.wheel_speeds import wheel_samples
 from icrtool.tables import Floats, Ints, PositionFixes
 
@@ -42,6 +43,39 @@ def test_a_counter_that_is_reset_costs_one_sample_and_is_said(travel: Floats, wh
     assert len(warnings) == 1
     assert "1 wheel speeds, up to 60 m/s" in warnings[0] or "up to 61 m/s" in warnings[0]
     assert not nothing
+
+
+def within_a_turn(positions: Floats, low: float) -> Floats:
+    return np.mod(positions - low, 2 * np.pi) + low
+
+
+@pytest.mark.parametrize("low", [-np.pi, 0.0])
+def test_joints_told_within_one_turn_are_read_like_those_that_go_on(travel: Floats, low: float) -> None:
+    positions = np.column_stack([travel, travel + 1.0, -0.7 * travel, 2.0 - 0.7 * travel])
+    whole, wrapped = (joints_motion(each) for each in (positions, within_a_turn(positions, low)))
+    for one, other in zip(
+        (whole.position_left, whole.position_right), (wrapped.position_left, wrapped.position_right), strict=True
+    ):
+        assert np.diff(other) == pytest.approx(np.diff(one), abs=1e-9)
+
+
+def test_a_gap_in_less_than_a_turn_is_no_wrap() -> None:
+    positions = np.repeat(np.array([0.0, 0.1, 5.0, 5.1, 5.2])[:, None], 4, axis=1)
+    left = joints_motion(positions).position_left
+    assert left is not None
+    assert left.tolist() == positions[:, 0].tolist()
+
+
+def joints_motion(positions: Floats) -> WheelMotion:
+    names = ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"]
+    rows = len(positions)
+    columns = {
+        "name[*]": np.broadcast_to(np.arange(4), (rows, 4)), "position[*]": positions,
+        "velocity[*]": np.full((rows, 4), np.nan),
+    }  # fmt: skip
+    times = STEP_NS * np.arange(rows, dtype=np.int64)
+    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0, "test")
+    return WHEEL_TYPES["sensor_msgs/JointState"][1](table, CONFIG)
 
 
 def test_hard_braking_and_a_short_dash_of_a_robot_that_mostly_stands_are_driving() -> None:
