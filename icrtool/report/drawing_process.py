@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -16,6 +17,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
@@ -158,8 +160,13 @@ def _load_matplotlib() -> None:
     """Load what drawing needs, and fill the font cache, while there is nothing to draw yet."""
     from io import BytesIO
 
+    configured = "MPLCONFIGDIR" in os.environ
     from icrtool.report.figure_style import new_figure, style
 
+    if not configured and (temporary := os.environ.get("MPLCONFIGDIR")) is not None:
+        # Without a home it can write matplotlib makes itself a folder, and removes it at an exit that a process of
+        # multiprocessing does not take.
+        Finalize(None, shutil.rmtree, (temporary, True), exitpriority=0)
     with style():
         figure = new_figure("A", "b", width_in=1, height_in=1)
         figure.subplots().plot([0.0, 1.0], label="c")

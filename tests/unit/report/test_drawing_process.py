@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,23 @@ def test_it_ends_with_a_parent_that_is_killed() -> None:
     # Its copies of the pipes would keep this waiting.
     done = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, timeout=20, check=False)
     assert done.returncode == -9
+
+
+LOADED = """
+from icrtool.report.drawing_process import DrawingProcess
+with DrawingProcess(("png",)):
+    pass
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a place that nobody can write to")
+def test_it_leaves_no_folder_behind_where_there_is_no_home_to_write_to(tmp_path: Path) -> None:
+    nowhere = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"), "/proc/nowhere")
+    environment = {key: value for key, value in os.environ.items() if key != "MPLCONFIGDIR"}
+    environment |= {**nowhere, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", LOADED], env=environment, capture_output=True, timeout=60, check=True)
+    assert not done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks from a process with threads, as pytest's is, only there")
