@@ -46,9 +46,9 @@ class TopicsConfig:
 
     def __post_init__(self) -> None:
         if (self.wheel_left is None) != (self.wheel_right is None):
-            raise ValueError("wheel_left and wheel_right come together")
+            raise ValueError("wheel_left: one side alone; wheel_left and wheel_right come together")
         if self.wheels is not None and self.wheel_left is not None:
-            raise ValueError("give wheels, or wheel_left and wheel_right, not both")
+            raise ValueError("wheels: the wheels are named twice; give it, or wheel_left and wheel_right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +69,9 @@ class WheelsConfig:
     right_scale: Literal["auto"] | float = "auto"
 
     def __post_init__(self) -> None:
-        if self.left_scale == 0 or self.right_scale == 0:
-            raise ValueError("a scale of 0 would stop a side")
+        for key in ("left_scale", "right_scale"):
+            if getattr(self, key) == 0:
+                raise ValueError(f"{key}: 0 would stop a side; found 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +132,9 @@ class DropoutConfig:
 
     def __post_init__(self) -> None:
         if not self.horizons_m:
-            raise ValueError("horizons_m is empty")
+            raise ValueError("horizons_m: is empty; give one distance or more")
         if len(set(self.horizons_m)) != len(self.horizons_m):
-            raise ValueError("horizons_m names a distance twice")
+            raise ValueError("horizons_m: names a distance twice; give each once")
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,13 +186,13 @@ def parse_config(document: Mapping[str, Any]) -> Config:
         if name not in SECTIONS:
             raise ConfigError(name, "unknown configuration key", f"the sections are {', '.join(SECTIONS)}")
         if not isinstance(values, Mapping):
-            raise ConfigError(name, "this is a section of the configuration", f"found {values!r}")
+            raise ConfigError(name, "this is a section of the configuration", f"found {_as_toml(values)}")
         known = [key.name for key in fields(SECTIONS[name])]
         for key, value in values.items():
             if key not in known:
                 raise ConfigError(f"{name}.{key}", "unknown configuration key", f"[{name}] knows {', '.join(known)}")
             if flaw := _flaw(value):
-                raise ConfigError(f"{name}.{key}", flaw, f"found {value!r}")
+                raise ConfigError(f"{name}.{key}", flaw, f"found {_as_toml(value)}")
         sections[name] = _parse_section(name, values)
         given += [f"{name}.{key}" for key in values]
     return Config(**sections, given=frozenset(given))
@@ -245,7 +246,7 @@ def _builtin_robot(name: str) -> dict[str, Any]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:  # no UTF-8, no TOML, or an integer longer than Python reads
@@ -259,11 +260,20 @@ def _parse_set(text: str) -> dict[str, Any]:
         raise ConfigError(
             f"--set {text}", "not of the form section.key=value", "for example --set topics.gnss=/gps/fix"
         )
+    if not value.strip():
+        raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except ValueError:
         parsed = value.strip()
     return {section: {name: parsed}}
+
+
+def _as_toml(value: object) -> str:
+    """Return a value nearly as it was written: with TOML's words for true and false."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_as_toml, value))}]"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
 def _flaw(value: object) -> str | None:
@@ -282,13 +292,16 @@ def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
     try:
         return msgspec.convert(dict(values), SECTIONS[name])
     except msgspec.ValidationError as err:
-        # the words of a __post_init__, or "… - at `$.key[0]`"; the value may stand before it, whatever it holds
+        # The words of a __post_init__ ("key: why; advice"), or "… - at `$.key[0]`"; the value may stand before it,
+        # whatever it holds.
         _, _, place = str(err).rpartition(" - at `$.")
         key = place.rstrip("`").partition("[")[0]
         if key not in values:
-            raise ConfigError(name, str(err), "see the configuration page") from err
+            key, _, message = str(err).partition(": ")
+            why, _, advice = message.partition("; ")
+            raise ConfigError(f"{name}.{key}", why, advice) from err
         expected = _described(get_type_hints(SECTIONS[name], include_extras=True)[key])
-        raise ConfigError(f"{name}.{key}", f"expected {expected}", f"found {values[key]!r}") from err
+        raise ConfigError(f"{name}.{key}", f"expected {expected}", f"found {_as_toml(values[key])}") from err
 
 
 def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it

@@ -8,6 +8,9 @@ import sys
 
 __all__ = ["main"]
 
+INTERRUPTED = 130
+"""What a shell says of a program that Ctrl-C ended: 128 and the number of the signal."""
+
 
 def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
@@ -17,15 +20,42 @@ def main() -> None:
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)
-    from icrtool.cli.commands import icrtool
-    from icrtool.errors import IcrToolError
-
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that cannot show a degree sign gets a question mark, not a traceback.
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")
     try:
-        icrtool()
-    except IcrToolError as err:
-        sys.stderr.write(f"Error: {err}\n")
-        sys.exit(1)
+        from icrtool.cli.standard_streams import standard_streams
+
+        with standard_streams() as output:
+            status = _run()
+            if output.lost:
+                sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
+                status = status or 1
+    except KeyboardInterrupt:
+        # While modules are imported, or a last word is said.
+        status = INTERRUPTED
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run the command that was called; return the exit status."""
+    try:
+        import click
+
+        from icrtool.cli.commands import icrtool
+        from icrtool.errors import IcrToolError
+
+        try:
+            status = icrtool.main(standalone_mode=False)
+        except IcrToolError as err:
+            sys.stderr.write(f"Error: {err}\n")
+            return 1
+        except click.ClickException as err:
+            err.show()
+            return err.exit_code
+        except click.Abort as err:
+            raise KeyboardInterrupt from err
+    except SystemExit as left:
+        return left.code if isinstance(left.code, int) else 0
+    except KeyboardInterrupt:
+        sys.stderr.write("Aborted!\n")
+        return INTERRUPTED
+    # Asked for help, click returns a status; a command returns nothing.
+    return status if isinstance(status, int) else 0

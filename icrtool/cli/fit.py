@@ -97,13 +97,17 @@ def command(
 
 def change_times(given: tuple[str, ...]) -> tuple[float, ...]:
     """Return the times [s] of ``--terrain-change``; its word ``auto`` is none."""
-    try:
-        times = tuple(float(text) for text in given if text != AUTO)
-    except ValueError as err:
-        raise click.BadParameter(f"{err}; give seconds or {AUTO}", param_hint="--terrain-change") from err
+    times = []
+    for text in given:
+        if text != AUTO:
+            try:
+                times.append(float(text))
+            except ValueError as err:
+                why = f"{text!r} is neither; give seconds or {AUTO}"
+                raise click.BadParameter(why, param_hint="--terrain-change") from err
     if not all(math.isfinite(time) for time in times):
         raise click.BadParameter("give finite seconds", param_hint="--terrain-change")
-    return times
+    return tuple(times)
 
 
 def plot_formats(text: str) -> tuple[str, ...]:

@@ -324,12 +324,17 @@ def _plan(config: Config, given: dict[str, Any]) -> Drive:
 
         path = read_speeds(given["speeds"])
         duration = duration if duration is not None else float(path.t_s[-1])
+    duration = duration if duration is not None else 100.0
+    late = next((time for time, _ in given["changes"] if time >= duration), None)
+    if late is not None:
+        why = f"no change at {late:g} s: the drive lasts {duration:g} s"
+        raise click.BadParameter(why, param_hint="--change")
     rate = given["wheel_rate"] or COMMAND_RATE_HZ
     return Drive(
         icrs_m=given["icrs"] or default_icrs(config),
         changes=given["changes"],
         path=path,
-        duration_s=duration if duration is not None else 100.0,
+        duration_s=duration,
         start_heading_rad=math.radians(given["start_heading"]),
         command_rate_hz=rate if given["wheels"] == "commanded" else None,
         motor_lag_s=given["motor_lag"],

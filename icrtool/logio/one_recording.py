@@ -47,6 +47,9 @@ def storage_files(directory: Path) -> list[Path]:
         raise LogError(directory, why, "name one of them")
     if not found and (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
+    runs = sorted(entry.parent.name for entry in directory.glob("*/run.json")) if not found else []
+    if runs:
+        raise LogError(directory, f"holds runs, not a log: {_named(runs)}", "icrtool dropout-report reads one of them")
     if not found:
         raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
     return found

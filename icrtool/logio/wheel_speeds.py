@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,8 +96,9 @@ def wheel_samples(
     if len(stamps) < 2:
         raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     samples = WheelSamples(stamps, left, right)
-    quantity = "position" if is_position else "speed"
-    return samples, f"{quantity}{how}", warnings
+    if not is_position:
+        how = re.sub(r"^ in (\w+)", r" in \1/s", how)
+    return samples, f"{'position' if is_position else 'speed'}{how}", warnings
 
 
 def _spikes(speed: Floats) -> Bools:

@@ -176,3 +176,19 @@ def test_quiet_prints_nothing_and_verbose_says_more(tmp_path: Path) -> None:
     verbose = CliRunner().invoke(command, ["-o", str(tmp_path / "b.mcap"), *SHORT, "-v", "--change", "1:0.5,-0.4,0.1"])
     assert "from 1 s on +0.500, -0.400, +0.100 m" in verbose.stdout
     assert "sensors: Sensors(" in verbose.stderr
+
+
+def test_a_change_after_the_end_and_a_time_that_is_none_are_wrong_usage(icrtool) -> None:
+    status, _, err = icrtool("simulate", "-o", "a.mcap", "--duration", "20", "--change", "40:1,-1,0")
+    assert status == 2
+    assert "--change: no change at 40 s: the drive lasts 20 s" in err
+    status, _, err = icrtool("fit", "a.mcap", "--terrain-change", "soon")
+    assert status == 2
+    assert "'soon' is neither; give seconds or auto" in err
+
+
+def test_speeds_whose_unit_the_reference_tells_are_in_metres_a_second(icrtool) -> None:
+    robot = ("--robot", "husky-a200")
+    options = ("--duration", "60", "--path", "lawnmower", "--wheel-messages", "float64_pair")
+    icrtool("simulate", "-o", "a.mcap", *robot, *options, "-q")
+    assert "; speed in m/s (by the position reference)" in icrtool("info", "a.mcap", *robot)[1]

@@ -88,3 +88,25 @@ def test_the_package_face_has_the_names_it_promises() -> None:
         assert getattr(icrtool, name) is not None
     with pytest.raises(AttributeError):
         _ = icrtool.nonsense
+
+
+@pytest.mark.parametrize(
+    ("sets", "message"),
+    [
+        (["wheels.left_scale=0"], "wheels.left_scale: 0 would stop a side; found 0"),
+        (["topics.wheel_left=/l"], "topics.wheel_left: one side alone; wheel_left and wheel_right come together"),
+        (["dropout.horizons_m=[]"], "dropout.horizons_m: is empty; give one distance or more"),
+        (["dropout.horizons_m=[1, 1]"], "dropout.horizons_m: names a distance twice; give each once"),
+        (["robot.name=true"], "robot.name: expected a text; found true"),
+        (["topics.gnss="], "topics.gnss: its value is empty; leave the option out for the default"),
+    ],
+)
+def test_what_is_wrong_is_said_of_a_key_in_the_words_of_toml(sets: list[str], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(sets=sets)
+    assert str(caught.value) == message
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text("[robot]\ntrack_width_m = 0.5\n", encoding="utf-8-sig")
+    assert load_config(tmp_path / "robot.toml").robot.track_width_m == 0.5

@@ -107,3 +107,9 @@ def test_a_run_is_told_from_a_log(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(LogError, match="is a run, not a log; icrtool dropout-report reads it"):
         open_log(tmp_path)
+    runs = tmp_path / "runs"
+    for name in ("one", "two"):
+        (runs / name).mkdir(parents=True)
+        (runs / name / "run.json").write_text("{}")
+    with pytest.raises(LogError, match="holds runs, not a log: one, two; icrtool dropout-report reads one of them"):
+        open_log(runs)
