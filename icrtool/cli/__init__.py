@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
+import threading
 
 __all__ = ["main"]
 
-INTERRUPTED = 130
-"""What a shell says of a program that Ctrl-C ended: 128 and the number of the signal."""
+INTERRUPTED, TERMINATED = 130, 143
+"""What a shell says of a program that Ctrl-C or a kill ended: 128 and the number of the signal."""
 
 
 def main() -> None:
@@ -20,6 +22,9 @@ def main() -> None:
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)
+    if threading.current_thread() is threading.main_thread():
+        # Killed by a timeout or at a shutdown, a command still removes what is half written.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     try:
         from icrtool.cli.standard_streams import standard_streams
 
@@ -53,7 +58,7 @@ def _run() -> int:
         except click.Abort as err:
             raise KeyboardInterrupt from err
     except SystemExit as left:
-        return left.code if isinstance(left.code, int) else 0
+        return left.code if isinstance(left.code, int) else int(left.code is not None)
     except KeyboardInterrupt:
         sys.stderr.write("Aborted!\n")
         return INTERRUPTED

@@ -92,25 +92,37 @@ class DrawingProcess:
         self._workers: list[BaseProcess] = []
 
     def __enter__(self) -> Self:
-        if self._formats:
-            method = "fork" if sys.platform == "linux" else None
-            self._pool = ProcessPoolExecutor(1, multiprocessing.get_context(method), initializer=_begin)
-            others = multiprocessing.active_children()
-            self._pool.submit(_load_matplotlib)
-            if self._load is not None:
-                self._pool.submit(self._load)
-            self._workers = [process for process in multiprocessing.active_children() if process not in others]
+        try:
+            # An interrupt between two steps of this would leave a process that nobody ends.
+            with _interrupts_held():
+                self._start()
+        except BaseException:
+            self._stop(at_once=True)
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # Nobody waits for pictures of what failed.
+        self._stop(at_once=kind is not None)
+
+    def _start(self) -> None:
+        if not self._formats:
+            return
+        method = "fork" if sys.platform == "linux" else None
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context(method), initializer=_begin)
+        others = multiprocessing.active_children()
+        self._pool.submit(_load_matplotlib)
+        if self._load is not None:
+            self._pool.submit(self._load)
+        self._workers = [process for process in multiprocessing.active_children() if process not in others]
+
+    def _stop(self, *, at_once: bool) -> None:
         if self._pool is None:
             return
-        if kind is not None:
-            # Nobody waits for pictures of what failed.
-            for process in self._workers:
-                process.terminate()
+        for process in self._workers if at_once else ():
+            process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
     @contextmanager
@@ -141,9 +153,23 @@ class DrawingProcess:
             wait(pending)
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Have Ctrl-C wait for the end of the block, where that can be."""
+    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin() -> None:
     """Leave an interrupt to the parent, and what matplotlib says of an unwritable home directory unsaid."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -55,3 +56,16 @@ def test_ctrl_c_while_modules_are_imported_is_one_line_and_status_130(tmp_path: 
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run([*COMMAND, "info", LOG], env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr.strip()) == (130, "", "Aborted!")
+
+
+def test_a_command_that_is_killed_by_a_timeout_leaves_nothing_half_written(tmp_path: Path) -> None:
+    arguments = ("fit", LOG, "--robot", "segway-rmp400", "-o", tmp_path / "run", "-q")
+    with subprocess.Popen([*COMMAND, *map(str, arguments)], stderr=subprocess.PIPE) as process:
+        while not list(tmp_path.iterdir()):
+            assert process.poll() is None
+            time.sleep(0.005)
+        process.terminate()
+        _, said = process.communicate(timeout=20)
+    assert process.returncode == 143
+    assert not said
+    assert list(tmp_path.iterdir()) == []

@@ -27,6 +27,29 @@ def test_it_ends_with_a_parent_that_is_killed() -> None:
     assert done.returncode == -9
 
 
+INTERRUPTED = """
+import os, signal
+from icrtool.report import drawing_process
+class Pool(drawing_process.ProcessPoolExecutor):
+    def submit(self, *what):
+        os.kill(os.getpid(), signal.SIGINT)
+        return super().submit(*what)
+drawing_process.ProcessPoolExecutor = Pool
+try:
+    with drawing_process.DrawingProcess(("png",)):
+        print("drawn")
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="signals")
+def test_an_interrupt_while_it_starts_leaves_no_process() -> None:
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, timeout=20, check=True)
+    assert done.stdout == b"interrupted\n"
+    assert not done.stderr
+
+
 LOADED = """
 from icrtool.report.drawing_process import DrawingProcess
 with DrawingProcess(("png",)):
