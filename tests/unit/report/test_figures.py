@@ -125,7 +125,7 @@ def test_trajectory_far_from_the_origin_keeps_short_ticks(make_run: Callable[...
 
 
 def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., FilterRun]) -> None:
-    run = make_run(duration_s=300.0, track_width_m=30.0, troubles=False)
+    run = make_run(duration_s=300.0, track_width_m=20.0, troubles=False)
     figure = drawn("trajectory", run)
     assert any(text.endswith("(out of view)") for text in legend_texts(figure))
 
