@@ -48,6 +48,10 @@ SMALLEST_APPLIED_S = 0.08
 """A stream is taken to be late by what is this large and this certain. Receivers and AHRS are late, never early."""
 
 
+LARGEST_STD_S = 0.03
+"""A delay less certain than this is not taken out: with noisy wheels and few turns, noise is matched with noise."""
+
+
 class Delay(NamedTuple):
     """A delay against the wheels and its standard deviation [s], NaN where the drive does not tell."""
 
@@ -57,7 +61,8 @@ class Delay(NamedTuple):
     @property
     def is_clear(self) -> bool:
         """Whether it is worth taking out."""
-        return self.value_s > max(SMALLEST_APPLIED_S, SIGNIFICANT_SIGMAS * self.std_s)
+        certain = self.std_s < LARGEST_STD_S
+        return certain and self.value_s > max(SMALLEST_APPLIED_S, SIGNIFICANT_SIGMAS * self.std_s)
 
 
 UNKNOWN = Delay(math.nan, math.nan)

@@ -127,6 +127,14 @@ def test_a_steady_circle_with_rough_sensors_shows_no_delay(tmp_path: Path) -> No
     assert max(map(abs, off_by(run, truth).values())) < SIGMAS
 
 
+def test_wobbly_wheels_on_an_even_winding_way_show_no_delay(tmp_path: Path) -> None:
+    sensors = ("--gnss", "waas", "--input-noise", 0.03, "--seed", 10)
+    path = ("--path", "curved", "--radius", 1.5, "--speed", 0.4, "--duration", 90)
+    run, truth = round_trip(tmp_path, *sensors, *path, robot="segway-rmp400")
+    assert run.summary["heading"]["applied_delay_s"] == 0.0
+    assert_found(run, truth)
+
+
 @pytest.mark.stress
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("path", [path for path in PATHS if path != "straight"])
