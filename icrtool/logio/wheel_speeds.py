@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +23,6 @@ FASTEST_MPS = 100.0
 
 SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
 """A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
-
-FOUND = "found from the position reference"
 
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
@@ -76,8 +73,8 @@ def wheel_samples(
         with np.errstate(over="ignore"):
             left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
         left[-1], right[-1] = left[-2], right[-2]
-    factor, how = _metres_per_unit(motion, unit, stamps, left, right, gnss, config)
-    warnings += [f"{log_name}: {note}" for note in _assumptions(motion, how, config)]
+    factor, how, estimated = _metres_per_unit(motion, unit, stamps, left, right, gnss, config, is_position=is_position)
+    warnings += [f"{log_name}: {note}" for note in (*_assumptions(motion, config), *estimated)]
     with np.errstate(over="ignore"):
         left = left * factor * _side_scale(config.wheels.left_scale)
         right = right * factor * _side_scale(config.wheels.right_scale)
@@ -96,8 +93,6 @@ def wheel_samples(
     if len(stamps) < 2:
         raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     samples = WheelSamples(stamps, left, right)
-    if not is_position:
-        how = re.sub(r"^ in (\w+)", r" in \1/s", how)
     return samples, f"{'position' if is_position else 'speed'}{how}", warnings
 
 
@@ -176,16 +171,13 @@ def _twist_width_m(config: Config) -> float | None:
     return given if given is not None else config.robot.track_width_m
 
 
-def _assumptions(motion: WheelMotion, how: str, config: Config) -> list[str]:
-    """Say what was taken for granted, or estimated, and where it can be set."""
-    if motion.twist is not None and config.wheels.twist_width_m is None:
-        undone = f"undone with {config.robot.track_width_m:g} m (robot.track_width_m)"
-        advice = "where its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
-        return [f"{motion.topic} tells a body twist: {undone}; {advice}, or the ICRs come out too close"]
-    if FOUND in how:
-        lacking = "wheel_radius_m" if config.robot.wheel_radius_m is None else "encoder_counts_per_rev"
-        return [f"robot.{lacking} is not given{how}"]
-    return []
+def _assumptions(motion: WheelMotion, config: Config) -> list[str]:
+    """Say what was taken for granted of a body twist, and where it can be set."""
+    if motion.twist is None or config.wheels.twist_width_m is not None:
+        return []
+    undone = f"undone with {config.robot.track_width_m:g} m (robot.track_width_m)"
+    advice = "where its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
+    return [f"{motion.topic} tells a body twist: {undone}; {advice}, or the ICRs come out too close"]
 
 
 def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | None:
@@ -205,27 +197,30 @@ def _alive(positions: tuple[Floats, Floats], speeds: tuple[Floats, Floats] | Non
 
 
 def _metres_per_unit(
-    motion: WheelMotion, unit: Unit, stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes, config: Config
-) -> tuple[float, str]:
-    """Return metres per unit and, in words, how it is known."""
+    motion: WheelMotion, unit: Unit, stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes, config: Config,
+    *, is_position: bool,
+) -> tuple[float, str, list[str]]:  # fmt: skip
+    """Return metres per unit, how it is known in words, and what had to be estimated for want of a key."""
     radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
     known: dict[Unit, float] = {"m": 1.0}
     if radius is not None:
         known["rad"] = radius
         if counts is not None:
             known["counts"] = 2 * math.pi * radius / counts
+    per = "" if is_position else "/s"
     if unit in known:
-        return known[unit], "" if unit == "m" else f" in {unit}"
+        return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(stamps, left, right, gnss)
     if unit == "unknown" and scale is not None:
         name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
         if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
-            return value, f" in {name} (by the position reference)"
+            return value, f" in {name}{per} (by the position reference)", []
+    lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
     if scale is None:
-        needed = "robot.encoder_counts_per_rev" if unit == "counts" and radius is not None else "robot.wheel_radius_m"
         raise ConfigError(
-            needed,
+            lacking,
             f"needed to read {motion.topic}, which is {'of unknown unit' if unit == 'unknown' else f'in {unit}'}",
-            f"give it with --set {needed}=…; the log has no straight driving to find the scale from",
+            f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
         )
-    return scale.value, f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m ({FOUND}; {unit})"
+    how = f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
+    return scale.value, how, [f"{lacking} is not given{how}"]
