@@ -59,10 +59,14 @@ width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, 
 
 
 class WarmStart(NamedTuple):
-    """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] at the end of another run (Fig. 18)."""
+    """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] at the end of another run (Fig. 18).
+
+    `track_width_m` is b of the robot they were learned on, None where it was not given.
+    """
 
     icrs_m: Floats
     covariance_m2: Floats
+    track_width_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

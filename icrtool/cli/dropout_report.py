@@ -182,9 +182,7 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
     if len(failed) == len(outcomes) == 1:
         raise failed[0]
     if failed:
-        what = f"{len(failed)} of {len(outcomes)} runs and logs"
-        others = "the others were written" if len(failed) < len(outcomes) else "see above"
-        raise IcrToolError(what, "could not be used", others)
+        raise options.not_all_used(len(failed), len(outcomes), "runs and logs")
     if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
         raise SystemExit(3)
 

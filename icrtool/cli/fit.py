@@ -11,6 +11,7 @@ import click
 from icrtool.cli import options
 
 if TYPE_CHECKING:
+    from icrtool.analysis.filter_setup import WarmStart
     from icrtool.config import Config
     from icrtool.report.drawing_process import DrawingProcess
 
@@ -91,8 +92,7 @@ def command(
                 failed.append(err)
                 click.echo(f"Error: {err}", err=True)
     if failed:
-        others = "the others were written" if len(failed) < len(logs) else "see above"
-        raise IcrToolError(f"{len(failed)} of {len(logs)} logs", "could not be used", others)
+        raise options.not_all_used(len(failed), len(logs), "logs")
 
 
 def change_times(given: tuple[str, ...]) -> tuple[float, ...]:
@@ -141,13 +141,9 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     return [(output or RUNS) / name for name in names]
 
 
-def _other_robot(request: FitRequest) -> tuple[str, ...]:
+def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...]:
     """Say that the run to start from was made with another track width."""
-    if request.warm_start is None:
-        return ()
-    from icrtool.report.run_directory import track_width_of_run
-
-    theirs, ours = track_width_of_run(request.warm_start), request.config.robot.track_width_m
+    theirs, ours = start.track_width_m if start is not None else None, request.config.robot.track_width_m
     if theirs is None or ours is None or math.isclose(theirs, ours, rel_tol=0.01):
         return ()
     return (
@@ -190,7 +186,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     write_run(run, directory, states=request.states, smoothed=smoothed, drawer=drawer)
     replaced = before is not None and before != run.summary["inputs"][0]["path"]
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
-    options.warn((*run.warnings, *_other_robot(request), *note), quiet=request.quiet)
+    options.warn((*run.warnings, *_other_robot(request, start), *note), quiet=request.quiet)
     if not request.quiet:
         from icrtool.report.run_table import format_run
 

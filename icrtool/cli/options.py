@@ -14,6 +14,7 @@ import click
 
 if TYPE_CHECKING:
     from icrtool.config import Config
+    from icrtool.errors import IcrToolError
     from icrtool.report.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -55,6 +56,14 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
     if not quiet:
         for warning in warnings:
             click.echo(f"Warning: {warning}", err=True)
+
+
+def not_all_used(failed: int, of: int, what: str) -> IcrToolError:
+    """Return the error that sums up those of several inputs, each of which was told when it came."""
+    from icrtool.errors import IcrToolError
+
+    others = "the others were written" if failed < of else "see above"
+    return IcrToolError(f"{failed} of {of} {what}", "could not be used", others)
 
 
 def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:

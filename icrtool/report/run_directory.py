@@ -204,16 +204,16 @@ def read_warm_start(directory: Path) -> WarmStart:
     """
     from icrtool.analysis.filter_setup import WarmStart
 
-    document = read_run(directory).summary
+    run = read_run(directory)
     try:
-        final = document["icr"]["final"]
+        final = run.summary["icr"]["final"]
         icrs = np.array([final[column] for column in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")], np.float64)
-        covariance = np.array(document["icr"]["final_covariance_m2"], np.float64).reshape(3, 3)
+        covariance = np.array(run.summary["icr"]["final_covariance_m2"], np.float64).reshape(3, 3)
     except (KeyError, TypeError, ValueError) as err:
         raise RunError(
             directory, "does not say what ICRs and covariance it ended with", "run icrtool fit again"
         ) from err
-    return WarmStart(icrs, covariance)
+    return WarmStart(icrs, covariance, run.track_width_m)
 
 
 def log_of_run(directory: Path) -> str | None:
@@ -222,12 +222,6 @@ def log_of_run(directory: Path) -> str | None:
         return str(json.loads((directory / RUN_FILE).read_bytes())["inputs"][0]["path"])
     except (OSError, ValueError, LookupError, TypeError):
         return None
-
-
-def track_width_of_run(directory: Path) -> float | None:
-    """Return b [m] of the robot that the run in a directory was made with; None where it was not given."""
-    width: float | None = _read_document(directory)["config"]["robot"]["track_width_m"]
-    return width
 
 
 def is_run_directory(directory: Path) -> bool:
