@@ -16,6 +16,9 @@ Bytes = NDArray[np.uint8]
 
 MOST_PROBLEMS = 20
 
+MOST_NAMED = 12
+"""Names that a message lists before it says that there are more."""
+
 LATEST_NS = 1 << 62
 """The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
 
@@ -119,6 +122,11 @@ def with_possible_times(block: Block, problems: Problems) -> Block:
 def printable(text: str) -> str:
     """Return a text from a log fit for one line: what is no printable character becomes a replacement character."""
     return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return names in a row, the first ones of many."""
+    return ", ".join([*names[:MOST_NAMED], *(["…"] if len(names) > MOST_NAMED else [])])
 
 
 def ros_type_name(name: str) -> str:

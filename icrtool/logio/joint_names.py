@@ -7,7 +7,8 @@ from typing import Literal
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError
-from icrtool.logio.wheel_sources import MOST_NAMED, WheelMotion
+from icrtool.logio.channel import some_of
+from icrtool.logio.wheel_sources import WheelMotion
 
 _Key = Literal["left_joints", "right_joints"]
 _KEYS: tuple[_Key, _Key] = ("left_joints", "right_joints")
@@ -37,8 +38,8 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
     if closest is None or not unlisted:
         return
     key, name = unlisted[0]
-    some = ", ".join([*closest.joints[:MOST_NAMED], *(["…"] if len(closest.joints) > MOST_NAMED else [])])
-    raise ConfigError(f"wheels.{key}", f"no message of {closest.topic} lists a joint {name}", f"its joints are {some}")
+    why, advice = f"no message of {closest.topic} lists a joint {name}", f"its joints are {some_of(closest.joints)}"
+    raise ConfigError(f"wheels.{key}", why, advice)
 
 
 def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from icrtool.errors import LogError
+from icrtool.logio.channel import some_of
 
 STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
 
@@ -17,8 +18,6 @@ LONGEST_PAUSE_S = 3600.0
 
 LEAST_OVERLAP_S = 1.0
 """A recorder that fills one buffer while it writes another lets the files of a split overlap by less."""
-
-_MOST_NAMED = 12
 
 
 class Span(NamedTuple):
@@ -43,13 +42,13 @@ def storage_files(directory: Path) -> list[Path]:
     if not found and len(others) == 1:
         raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} lies in it", "name that")
     if len(kinds) > 1 or others:
-        why = f"holds more than one recording: {_named([entry.name for entry in (*found, *others)])}"
+        why = f"holds more than one recording: {some_of([entry.name for entry in (*found, *others)])}"
         raise LogError(directory, why, "name one of them")
     if not found and (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
     runs = sorted(entry.parent.name for entry in directory.glob("*/run.json")) if not found else []
     if runs:
-        raise LogError(directory, f"holds runs, not a log: {_named(runs)}", "icrtool dropout-report reads one of them")
+        raise LogError(directory, f"holds runs, not a log: {some_of(runs)}", "icrtool dropout-report reads one of them")
     if not found:
         raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
     return found
@@ -73,7 +72,7 @@ def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
         pause_s = (after.begin_ns - max(span.end_ns for span in ordered[: number + 1])) / 1e9
         if pause_s > LONGEST_PAUSE_S:
             why = f"not one recording: {pause_s / 3600:.1f} h pass between {before.file} and {after.file}"
-            raise LogError(directory, why, f"name one of {_named([span.file for span in ordered])}")
+            raise LogError(directory, why, f"name one of {some_of([span.file for span in ordered])}")
         overlap_s = (min(before.end_ns, after.end_ns) - after.begin_ns) / 1e9
         if overlap_s > LEAST_OVERLAP_S:
             odd.append(
@@ -92,10 +91,6 @@ def _is_other_log(entry: Path) -> bool:
     if entry.is_dir():
         return (entry / "metadata.yaml").is_file()
     return entry.suffix == ".bag" and entry.is_file()
-
-
-def _named(names: list[str]) -> str:
-    return ", ".join([*names[:_MOST_NAMED], *(["…"] if len(names) > _MOST_NAMED else [])])
 
 
 def _natural_key(path: Path) -> list[tuple[int, str]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
+from icrtool.logio.channel import some_of
 from icrtool.logio.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logio.position_sources import REFERENCE_WORDS
 from icrtool.logio.sides import wheel_joints
@@ -27,8 +28,6 @@ _FUSED = re.compile(
     re.IGNORECASE,
 )
 """Odometry and twists that other sensors have a part in: better than nothing."""
-
-MOST_NAMED = 12
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within a turn, and step over nearly all of it this often, are told modulo a turn."""
@@ -143,15 +142,13 @@ def _unwound(positions: Floats) -> Floats:
     return unwound
 
 
-def _joints(
-    table: TopicTable, config: Config, paths: _Paths, words: tuple[NDArray[Any], list[str]], score: float, what: str
-) -> WheelMotion:
+def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what: str) -> WheelMotion:
     """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
-    codes, texts = words
+    codes, texts = table.words(paths[0])
     left, right = _wheels_among(texts, config)
     if not (left and right):
-        some = ", ".join([*texts[:MOST_NAMED], *(["…"] if len(texts) > MOST_NAMED else [])])
-        named = f"no left and right wheel among its joints {some}; name them in wheels.{{left,right}}_joints"
+        advice = "name them in wheels.{left,right}_joints"
+        named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
         return no_motion(table, named if texts else "lists no joints")
     lefts, rights = len(left), len(right)
     # Joints by their place among the wheels, left ones first; -1 for all others.
@@ -219,8 +216,7 @@ def _told_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]
 
 def _by_name(paths: _Paths, score: float, what: str) -> Reader:
     def read(table: TopicTable, config: Config) -> WheelMotion:
-        words = table.words(paths[0])
-        return replace(_joints(table, config, paths, words, score, what), joints=tuple(words[1]))
+        return replace(_joints(table, config, paths, score, what), joints=tuple(table.words(paths[0])[1]))
 
     return read
 
