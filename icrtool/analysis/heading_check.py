@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from icrtool.analysis.fix_steps import bend_std_m, unbroken
+from icrtool.analysis.course import (
+    EXPLAINED,
+    FEWEST_WINDOWS,
+    Course,
+    known_intervals,
+    measure_course,
+    offset_at_no_curvature,
+)
 from icrtool.analysis.heading_name import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.tables import Floats, Ints, PositionFixes, RobotLog, WheelSamples
-
-SHORTEST_WINDOW_M = 1.0
-WINDOW_IN_GNSS_STD = 12.0
-"""A course is taken over this much way, so that the noise of the fixes turns it by no more than some 7 deg."""
-
-LONGEST_WINDOW_S = 30.0
-"""A window that takes longer holds an outage or a stop, and no course."""
-
-SPIN_RATIO = 3.0
-"""A window is a spin where the sides part by so many times its way."""
-
-FEWEST_WINDOWS = 8
-UNSTATED_STD_M, NOISIER = 0.01, 1.5
-"""Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
+from icrtool.tables import Floats, RobotLog
 
 SIGNIFICANT_SIGMAS = 4.0
 SMALLEST_OFFSET_RAD = math.radians(2.0)
 """An offset is believed when it is this many of its standard deviations, and at least this large."""
-
-EXPLAINED = 0.8
-"""Mean resultant length of course minus heading above which they are one direction seen twice."""
 
 CLEARLY_BETTER, CLEARLY_AWAY = 3.0, 0.02
 """By 1 - mean resultant length: on rows to and fro the other convention looks like an offset but for the turns."""
@@ -104,30 +94,6 @@ class HeadingCheck:
         }
 
 
-class Course(NamedTuple):
-    """Windows of way: what position tells against what wheels and heading tell.
-
-    Attributes
-    ----------
-    angle : (w,) heading minus course [rad], in (-pi, pi]
-    mirrored : (w,) the same for a heading that turns the other way
-    curvature : (w,) heading change over way [rad/m]
-    ratio : (w,) displacement by the fixes over displacement by wheels and heading
-    scattered : windows in which fixes and wheels went on, but the way laid along the heading led nowhere
-    noise_rad : what the fixes' noise alone turns a course by; white_rad : what their white noise does
-    duration_s : median duration of a window
-    """
-
-    angle: Floats
-    mirrored: Floats
-    curvature: Floats
-    ratio: Floats
-    scattered: int
-    noise_rad: float
-    white_rad: float
-    duration_s: float
-
-
 def check_heading(log: RobotLog, config: Config, course: Course | None = None) -> HeadingCheck:
     """Compare the heading of a log with the way its fixes tell.
 
@@ -159,7 +125,7 @@ def check_heading(log: RobotLog, config: Config, course: Course | None = None) -
         _refuse_unexplained(log, course)
     if len(course.angle) < FEWEST_WINDOWS:
         return HeadingCheck(len(course.angle), *(math.nan,) * 5, False, fixed, 0.0, 0.0, NO_NAME, ())
-    agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
+    agreement, mirrored = course.agreement, course.mirrored_agreement
     turned_over = _turns_other_way(agreement, mirrored) and config.frames.heading == "auto" and not paper
     angle, curvature = (course.mirrored, -course.curvature) if turned_over else (course.angle, course.curvature)
     offset, sigma, scatter = offset_at_no_curvature(angle, curvature)
@@ -197,11 +163,6 @@ def check_heading(log: RobotLog, config: Config, course: Course | None = None) -
     )
 
 
-def resultant_length(angle: Floats) -> float:
-    """Return the mean resultant length of angles (n,): 1 where all are the same, about 0 where they are anything."""
-    return float(abs(np.exp(1j * angle).mean()))
-
-
 def _turns_other_way(agreement: float, mirrored: float) -> bool:
     """Say whether a heading clearly follows the course only when it is turned the other way."""
     better = 1.0 - agreement > max(CLEARLY_AWAY, CLEARLY_BETTER * (1.0 - mirrored))
@@ -225,7 +186,7 @@ def _refuse_unexplained(log: RobotLog, course: Course) -> None:
         )
     if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
         return
-    best = max(resultant_length(course.angle), resultant_length(course.mirrored))
+    best = max(course.agreement, course.mirrored_agreement)
     if best < EXPLAINED:
         spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
         tried = f"ENU, NED and every offset tried in {windows} windows, scatter {spread:.0f}° at best"
@@ -242,7 +203,7 @@ def _refuse_stuck(log: RobotLog) -> None:
     long = end - begin > STUCK_S * 1e9
     if not long.any():
         return
-    interval = _known_intervals(wheels)
+    interval = known_intervals(wheels)
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     way = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
     ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), way)
@@ -260,11 +221,6 @@ def _clearly_ahead(ahead: Floats, way: Floats) -> Floats:
     later = np.minimum(np.searchsorted(way, way + STUCK_WAY_M), len(way) - 1)
     turning = np.abs(ahead[later] - ahead) >= WHEELS_OFF * (way[later] - way)
     return np.concatenate([[0.0], np.cumsum(np.where(turning[:-1], np.diff(ahead), 0.0))])
-
-
-def _known_intervals(wheels: WheelSamples) -> Floats:
-    """Return the seconds between wheel samples (n - 1,), none through a gap."""
-    return unbroken(np.diff(wheels.stamp_ns) / 1e9)
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
@@ -308,93 +264,3 @@ def _name_scatter(scatter: float) -> str:
         f"the heading scatters by {math.degrees(scatter):.0f}° about the course, over whole windows: "
         "its noise is raised accordingly"
     )
-
-
-def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, float, float]:
-    """Fit angle = offset + slope * curvature, robustly; return offset, its standard deviation, and the scatter [rad].
-
-    Notes
-    -----
-    Iteratively reweighted least squares with Huber's weights (Huber 1964) about the circular mean.
-    """
-    centre = float(np.angle(np.exp(1j * angle).mean()))
-    residual = np.angle(np.exp(1j * (angle - centre)))
-    design = np.column_stack([np.ones(len(residual)), curvature])
-    weight, scatter, information, solution = np.ones(len(residual)), 0.0, np.eye(2), np.zeros(2)
-    for _ in range(20):
-        weighted = design * weight[:, None]
-        # A circle has one curvature only: the ridge then leaves the slope at zero, and its doubt in the offset.
-        information = design.T @ weighted + np.diag([0.0, 1e-6])
-        solution = np.linalg.solve(information, weighted.T @ residual)
-        left = residual - design @ solution
-        scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        weight = np.minimum(1.0, 1.5 * scatter / np.maximum(np.abs(left), 1e-12))
-    sigma = scatter * math.sqrt(float(np.linalg.inv(information)[0, 0]))
-    return math.remainder(centre + float(solution[0]), 2 * math.pi), sigma, scatter
-
-
-def measure_course(log: RobotLog) -> Course:
-    """Cut the way into windows and compare, in each, displacement by fixes with wheels laid along the heading."""
-    gnss, wheels = log.gnss, log.wheels
-    none = Course(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 0, 0.0, 0.0, 0.0)
-    if min(len(gnss.stamp_ns), len(log.heading.stamp_ns), len(wheels.stamp_ns)) < 2:
-        return none
-    noise, white = _fix_noise_m(gnss)
-    length = max(SHORTEST_WINDOW_M, WINDOW_IN_GNSS_STD * noise)
-    interval = _known_intervals(wheels)
-    step = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2 * interval
-    psi_at = np.interp(
-        wheels.stamp_ns[:-1] + np.diff(wheels.stamp_ns) // 2, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
-    )
-    travelled = np.concatenate([[0.0], np.cumsum(np.abs(step))])
-    north, east = (np.concatenate([[0.0], np.cumsum(step * part(psi_at))]) for part in (np.cos, np.sin))
-    begin, end = _windows(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled), gnss.stamp_ns, length)
-    if not len(begin):
-        return none
-
-    def between(values: Floats) -> Floats:
-        first, last = (np.interp(gnss.stamp_ns[fix], wheels.stamp_ns, values) for fix in (begin, end))
-        return last - first
-
-    seen = (gnss.north_m[end] - gnss.north_m[begin]) + 1j * (gnss.east_m[end] - gnss.east_m[begin])
-    real, imaginary, way = between(north), between(east), between(travelled)
-    turned = between(np.append(psi_at, psi_at[-1]))
-    went, led = np.abs(seen) > length / 3, np.hypot(real, imaginary) > length / 3
-    moved = went & led
-    # spins on the spot wind the way up whatever the heading; of a drive the sides go ahead of each other but little
-    apart = np.abs(wheels.v_left_mps - wheels.v_right_mps)[:-1] * interval
-    spun = between(np.concatenate([[0.0], np.cumsum(apart)])) > SPIN_RATIO * way
-    told, mirror = real + 1j * imaginary, real - 1j * imaginary
-    return Course(
-        np.angle(told * np.conj(seen))[moved],
-        np.angle(mirror * np.conj(seen))[moved],
-        (turned / way)[moved],
-        (np.abs(seen) / np.where(moved, np.hypot(real, imaginary), 1.0))[moved],
-        int(np.count_nonzero(went & ~led & ~spun)),
-        noise * math.sqrt(2.0) / length,
-        white * math.sqrt(2.0) / length,
-        float(np.median((gnss.stamp_ns[end] - gnss.stamp_ns[begin])[moved])) / 1e9 if moved.any() else 0.0,
-    )
-
-
-def _fix_noise_m(gnss: PositionFixes) -> tuple[float, float]:
-    """Return the noise of the fixes, an axis [m], and how much of it is seen to be white.
-
-    The noise is what they state, or what they show by themselves where that is clearly more.
-    """
-    variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
-    known = variance[np.isfinite(variance)]
-    stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
-    seen = bend_std_m(gnss)
-    if math.isnan(seen):
-        return stated, 0.0
-    return (seen, seen) if seen > NOISIER * stated else (stated, min(seen, stated))
-
-
-def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints]:
-    """Return first and last fix of successive windows of at least `length` [m], without those that took too long."""
-    targets = np.arange(travelled[0], travelled[-1], length)
-    edges = np.unique(np.searchsorted(travelled, targets))
-    begin, end = edges[:-1], edges[1:]
-    quick = stamps[end] - stamps[begin] < LONGEST_WINDOW_S * 1e9
-    return begin[quick], end[quick]

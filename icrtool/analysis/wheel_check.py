@@ -8,14 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.analysis.heading_check import (
-    EXPLAINED,
-    FEWEST_WINDOWS,
-    Course,
-    measure_course,
-    offset_at_no_curvature,
-    resultant_length,
-)
+from icrtool.analysis.course import EXPLAINED, FEWEST_WINDOWS, Course, measure_course, offset_at_no_curvature
 from icrtool.config import Config
 from icrtool.tables import Floats, RobotLog, WheelSamples
 
@@ -119,7 +112,7 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
 
 def _scale(course: Course) -> tuple[float, float, float]:
     """Return way by reference over way by wheels at no curvature, its standard deviation and its scatter, or NaN."""
-    if len(course.ratio) < FEWEST_WINDOWS or resultant_length(course.angle) < EXPLAINED:
+    if len(course.ratio) < FEWEST_WINDOWS or course.agreement < EXPLAINED:
         return math.nan, math.nan, math.nan
     # log ratios are small: the angle fit's arithmetic (robust line over curvature) serves them unchanged
     offset, sigma, scatter = offset_at_no_curvature(np.log(course.ratio), course.curvature)
@@ -165,15 +158,12 @@ def _reversed_or_swapped(log: RobotLog, course: Course) -> tuple[WheelSamples, s
     """Return the wheels put right, and what was wrong with them; None when nothing clearly is."""
     wheels = log.wheels
     left, right = wheels.v_left_mps, wheels.v_right_mps
-    if (
-        len(course.angle) < FEWEST_WINDOWS
-        or max(resultant_length(course.angle), resultant_length(course.mirrored)) < EXPLAINED
-    ):
+    if not course.is_explained:
         return _one_side_reversed(log)
     sum_way = float((left + right)[left + right > 0].sum()), -float((left + right)[left + right < 0].sum())
     backwards = sum_way[1] / max(sum(sum_way), 1e-12)
     away = abs(float(np.angle(np.exp(1j * course.angle).mean())))
-    if resultant_length(course.angle) >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
+    if course.agreement >= EXPLAINED and away > math.radians(150) and backwards > MOSTLY_BACKWARDS:
         return WheelSamples(wheels.stamp_ns, -left, -right), "both wheels count backwards"
     correlation = _turn_correlation(log, mirrored=_mirrored(course))
     if correlation is not None and correlation < -CLEAR_CORRELATION and _tells_convention(course):
@@ -192,12 +182,12 @@ def _turn_correlation(log: RobotLog, *, mirrored: bool) -> float | None:
 
 def _mirrored(course: Course) -> bool:
     """Say whether the heading follows the course only when it is turned the other way."""
-    return resultant_length(course.mirrored) > resultant_length(course.angle)
+    return course.mirrored_agreement > course.agreement
 
 
 def _tells_convention(course: Course) -> bool:
     """Say whether the windows tell at all which way the heading turns: a nearly straight drive does not."""
-    agreement, mirrored = resultant_length(course.angle), resultant_length(course.mirrored)
+    agreement, mirrored = course.agreement, course.mirrored_agreement
     return len(course.angle) * abs(agreement - mirrored) > CONVENTION_TOLD * (1.0 - max(agreement, mirrored))
 
 
@@ -217,10 +207,7 @@ def _one_side_reversed(log: RobotLog) -> tuple[WheelSamples, str] | None:
     ):
         changed = replace(log, wheels=one)
         course = measure_course(changed)
-        if (
-            len(course.angle) < FEWEST_WINDOWS
-            or max(map(resultant_length, (course.angle, course.mirrored))) < EXPLAINED
-        ):
+        if not course.is_explained:
             continue
         # Either side turned over makes a way; the wrong one is driven backwards, and turns the other way.
         correlation = _turn_correlation(changed, mirrored=_mirrored(course))
