@@ -13,6 +13,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.fit import RUNS, plot_formats, run_directories
+from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
     from icrtool.analysis.driven_run import DrivenRun
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from icrtool.report.run_directory import StoredRun
     from icrtool.tables import Ints
 
-POSITIVE = click.FloatRange(min=0, min_open=True)
 EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
 
 

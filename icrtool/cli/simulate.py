@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
+from icrtool.cli.drive_options import CHANGE, PATHS, gnss_text, icrs_text, place_text, span_text
+from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
     from icrtool.analysis.simulate import Drive, Icrs, Sensors
@@ -16,73 +18,12 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.logio.write_log import WriteOptions
 
-PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 WHEEL_MESSAGES = ("joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped")
-GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
-"""Pentzer 2014, Sections 4 and 6.5."""
-
 DEFAULT_ROBOT = "pentzer-tracked"
 DEFAULT_MULTIPLIER = 1.5
 """The true ICRs where none are given: this many half track widths to either side, x 0."""
 
 ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
-POSITIVE = click.FloatRange(min=0, min_open=True)
-NOT_NEGATIVE = click.FloatRange(min=0)
-
-
-def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]:
-    """Read numbers separated by commas; `form` is what they shall look like."""
-    try:
-        found = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        found = ()
-    if len(found) != (count or len(found)) or not found or not all(map(math.isfinite, found)):
-        raise click.BadParameter(f"{text!r} is not of the form {form}")
-    return found
-
-
-def icrs_text(text: str) -> tuple[float, ...]:
-    """Read ``YR,YL,X``."""
-    return numbers(text, "YR,YL,X", 3)
-
-
-def change_text(text: str) -> tuple[float, tuple[float, ...]]:
-    """Read ``T:YR,YL,X``."""
-    time, _, icrs = text.partition(":")
-    return numbers(time, "T:YR,YL,X", 1)[0], numbers(icrs, "T:YR,YL,X", 3)
-
-
-def span_text(text: str) -> tuple[float, ...]:
-    """Read ``BEGIN:END``."""
-    span = numbers(text.replace(":", ",", 1), "BEGIN:END", 2)
-    if span[1] <= span[0]:
-        raise click.BadParameter(f"{text!r} ends before it begins")
-    return span
-
-
-def place_text(text: str) -> tuple[float, ...]:
-    """Read ``FORWARD,RIGHT``."""
-    return numbers(text, "FORWARD,RIGHT", 2)
-
-
-def gnss_text(text: str) -> float:
-    """Read ``rtk``, ``waas`` or metres."""
-    if text in GNSS_NOISE_M:
-        return GNSS_NOISE_M[text]
-    metres = numbers(text, "rtk, waas or METRES", 1)[0]
-    if metres < 0:
-        raise click.BadParameter(f"{text!r} is a negative noise")
-    return metres
-
-
-CHANGE = click.option(
-    "--change",
-    "changes",
-    metavar="T:YR,YL,X",
-    type=change_text,
-    multiple=True,
-    help="The ICRs become these after T seconds; repeatable.",
-)
 
 
 @click.command("simulate")

@@ -10,18 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from icrtool.cli import options
+from icrtool.cli.drive_options import CHANGE, PATHS, gnss_text, icrs_text, numbers
 from icrtool.cli.fit import RUNS, plot_formats
-from icrtool.cli.simulate import (
-    CHANGE,
-    NOT_NEGATIVE,
-    PATHS,
-    POSITIVE,
-    default_icrs,
-    encoder_counts,
-    gnss_text,
-    icrs_text,
-    numbers,
-)
+from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
+from icrtool.cli.simulate import default_icrs, encoder_counts
 
 if TYPE_CHECKING:
     from icrtool.analysis.simulate import Sensors

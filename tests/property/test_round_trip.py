@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.analysis.fit import FilterRun, fit
-from icrtool.cli.simulate import PATHS, WHEEL_MESSAGES, command
+from icrtool.cli.drive_options import PATHS
+from icrtool.cli.simulate import WHEEL_MESSAGES, command
 from icrtool.config import load_config
 from icrtool.logio import read_log
 

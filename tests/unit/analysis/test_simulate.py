@@ -11,7 +11,7 @@ import pytest
 from icrtool.analysis.paths import PATH_KINDS, PathPlan, plan_body, track_speeds
 from icrtool.analysis.simulate import Drive, Sensors, TrackSpeeds, check_drive, move, sample_times, sense
 from icrtool.analysis.simulate_record import DATUM, START_NS, record, simulate
-from icrtool.cli.simulate import PATHS
+from icrtool.cli.drive_options import PATHS
 from icrtool.cli.study import STUDIES, VARIES
 from icrtool.core.kinematics import body_velocity
 from icrtool.errors import ConfigError
