@@ -13,9 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from icrtool.core.open_loop import Drive, Floats, FrozenIcrs, open_loop_errors_direct, trial_ends
+from icrtool.core.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.statistics import bootstrap_intervals, summarise
+from icrtool.core.statistics import bootstrap_intervals, cut_blocks, summarise
+from icrtool.core.trials import Drive, Floats, FrozenIcrs
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)
@@ -84,7 +85,12 @@ def compare(hours: float) -> None:
         )
     errors = open_loop_errors(drive, NO_SLIP, ends)
     print(f"  percentiles of a model       {seconds(lambda: summarise(errors), 5):8.3f} s")
-    resampling = seconds(lambda: bootstrap_intervals(errors, drive.distance, HORIZONS_M, seed=0), 5)
+
+    def bootstrap() -> None:
+        blocks = [cut_blocks(column >= 0, drive.distance, h) for column, h in zip(ends.T, HORIZONS_M, strict=True)]
+        bootstrap_intervals(errors, blocks, seed=0)
+
+    resampling = seconds(bootstrap, 5)
     print(f"  bootstrap of a model         {resampling:8.3f} s")
 
 

@@ -28,7 +28,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from icrtool.analysis.dropout import DropoutReport, dropout
+    from icrtool.analysis.dropout import dropout
+    from icrtool.analysis.dropout_records import DropoutReport
     from icrtool.analysis.fit import FilterRun, fit
     from icrtool.config import Config, load_config
     from icrtool.errors import IcrToolError
@@ -52,7 +53,7 @@ __all__ = [
 
 _HOMES = {
     "Config": "icrtool.config",
-    "DropoutReport": "icrtool.analysis.dropout",
+    "DropoutReport": "icrtool.analysis.dropout_records",
     "FilterRun": "icrtool.analysis.fit",
     "IcrToolError": "icrtool.errors",
     "RobotLog": "icrtool.tables",

@@ -2,50 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.dropout import Model, models_of
-from icrtool.core.open_loop import SHORT, Drive, OpenLoopPath, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.analysis.dropout_records import BlindDrive
+from icrtool.core.open_loop import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.tables import Floats, Ints
+from icrtool.core.trials import Drive
+from icrtool.tables import Ints
 
 WORST_COUNT = 10
 WORST_HORIZON_M = 10.0
 EXAMPLE_HORIZON_M = 15.0
 ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE = 0.05
-TYPICAL_OF = 100
+TYPICAL_OF = 30
 """Trials enough to tell which error is the median one."""
 PICTURED = ("icr", "no_slip")
-
-
-@dataclass(frozen=True, slots=True)
-class BlindDrive:
-    """One trial: from state `start` to state `end`, the reference's path and each model's.
-
-    Attributes
-    ----------
-    reference_north_m, reference_east_m : (m,)
-    paths : by model name
-    errors_m : by model name, at the end
-    """
-
-    start: int
-    end: int
-    stamp_ns: int
-    t_s: float
-    north_m: float
-    east_m: float
-    horizon_m: float
-    heading_change_rad: float
-    speed_mean_mps: float
-    reference_north_m: Floats
-    reference_east_m: Floats
-    paths: dict[str, OpenLoopPath]
-    errors_m: dict[str, float]
 
 
 def worst_drives(
@@ -55,15 +29,12 @@ def worst_drives(
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
-    ends = ends[:, 0]
+    ends, starts = ends[:, 0], np.arange(len(errors))
+    left = np.nan_to_num(errors, nan=-1.0)
     chosen: list[int] = []
-    taken = np.zeros(len(errors), np.bool_)
-    for start in np.argsort(-np.nan_to_num(errors, nan=-1.0), kind="stable"):
-        if np.isnan(errors[start]) or len(chosen) == count:
-            break
-        if not (taken[start] or taken[ends[start]]):
-            chosen.append(int(start))
-            taken[start : ends[start] + 1] = True
+    while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
+        chosen.append(worst)
+        left[(starts <= ends[worst]) & (ends >= worst)] = -1.0
     return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 

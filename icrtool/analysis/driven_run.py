@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from icrtool.core.open_loop import Drive
+from icrtool.core.trials import Drive
 from icrtool.tables import Bools, Ints, States
 
 RUN_SCHEMA = "icrtool/run/1"

@@ -5,31 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of, toy_drive
-from icrtool.core.open_loop import Drive, FrozenIcrs, TrialCounts, count_trials, open_loop_path, trial_ends
+from icrtool.analysis.dropout_records import DropoutReport, ModelResult
+from icrtool.core.open_loop import count_trials, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
-    Histogram,
-    Intervals,
-    Summary,
+    Blocks,
     bootstrap_intervals,
+    cut_blocks,
     histogram_sorted,
     round_bin_width,
     sort_trials,
     summarise_sorted,
 )
+from icrtool.core.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import ConfigError, DataError
-from icrtool.tables import Floats, Ints
-
-if TYPE_CHECKING:
-    import pandas as pd
+from icrtool.tables import Floats
 
 DEFAULT_SEED = 20140311
 """Seed of the bootstrap: any number, but the same for every run and every model."""
@@ -66,80 +63,11 @@ class Model(NamedTuple):
     icrs: FrozenIcrs
 
 
-class ModelResult(NamedTuple):
-    """What one model's trials say, by horizon."""
-
-    name: str
-    label: str
-    summary: Summary
-    intervals: Intervals
-    histograms: tuple[Histogram, ...]
-
-
 ErrorSink = Callable[[str, Floats, Floats], None]
 """Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
 
-
-@dataclass(frozen=True, slots=True)
-class DropoutReport:
-    """Open-loop errors by model and horizon.
-
-    Attributes
-    ----------
-    horizons_m : (h,) ascending
-    results : one per model
-    counts : trials, and starts that were none, by horizon; the same for every model
-    states : recorded states, each a start
-    standing : of them, those at which the robot stood: their trials are near copies of one another
-    seed : of the bootstrap
-    """
-
-    name: str
-    horizons_m: Floats
-    results: tuple[ModelResult, ...]
-    counts: TrialCounts
-    states: int
-    standing: int
-    seed: int
-
-    def result(self, model: str) -> ModelResult | None:
-        """Return the result of a model, None when it was not computed."""
-        return next((result for result in self.results if result.name == model), None)
-
-    @property
-    def summary(self) -> pd.DataFrame:
-        """The rows of summary.csv as a DataFrame."""
-        import pandas as pd
-
-        return pd.DataFrame(self.summary_columns())
-
-    def summary_columns(self) -> dict[str, list[str] | Floats | Ints]:
-        """Return the columns of summary.csv: a row per model and horizon."""
-        h = self.horizons_m
-        names = [result.name for result in self.results for _ in h]
-        horizon = np.tile(h, len(self.results))
-
-        def stacked(values: Sequence[Floats]) -> Floats:
-            return np.concatenate(values) if values else np.empty(0)
-
-        summaries = [result.summary for result in self.results]
-        intervals = [result.intervals for result in self.results]
-        expected, p95 = stacked([s.expected for s in summaries]), stacked([s.p95 for s in summaries])
-        return {
-            "model": names,
-            "horizon_m": horizon,
-            "trials": np.concatenate([s.trials for s in summaries]) if summaries else np.empty(0, np.int64),
-            "expected_error_m": expected,
-            "p50_m": stacked([s.p50 for s in summaries]),
-            "p95_m": p95,
-            "max_m": stacked([s.largest for s in summaries]),
-            "expected_pct": 100.0 * expected / horizon,
-            "p95_pct": 100.0 * p95 / horizon,
-            "expected_low_m": stacked([i.expected_low for i in intervals]),
-            "expected_high_m": stacked([i.expected_high for i in intervals]),
-            "p95_low_m": stacked([i.p95_low for i in intervals]),
-            "p95_high_m": stacked([i.p95_high for i in intervals]),
-        }
+ReportWatch = Callable[[DropoutReport], None]
+"""Called with a report that holds all horizons of some of the models, those that are done."""
 
 
 def dropout(
@@ -149,6 +77,7 @@ def dropout(
     models: Sequence[Model] | None = None,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
+    watch: ReportWatch | None = None,
 ) -> DropoutReport:
     """Say how far off the robot is after driving blind, from every recorded state.
 
@@ -159,6 +88,7 @@ def dropout(
     models : what to predict with; default `models_of` of the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
+    watch : told of the report as it grows, after each model
 
     Raises
     ------
@@ -179,26 +109,34 @@ def dropout(
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
     models = models if models is not None else models_of(run)
+    groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
+
+    def done() -> DropoutReport:
+        return DropoutReport(
+            name=run.name,
+            horizons_m=horizons,
+            results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
+            counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
+            states=len(run.table),
+            standing=int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1])),
+            seed=seed,
+        )
+
     with ThreadPoolExecutor(THREADS) as pool:
-        for group in _groups(len(horizons), len(run.table)):
+        for group in groups:
             ends, count = _ends(drive, horizons[group], pool)
+            blocks = _blocks(drive, horizons[group], ends, pool)
             counts.append(count)
             for model in models:
                 errors = _errors(drive, model.icrs, ends, pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
-                parts[model.name].append(_judge(model, errors, drive, horizons[group], seed, pool))
-    return DropoutReport(
-        name=run.name,
-        horizons_m=horizons,
-        results=tuple(_joined(part) for part in parts.values()),
-        counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
-        states=len(run.table),
-        standing=int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1])),
-        seed=seed,
-    )
+                parts[model.name].append(_judge(model, errors, blocks, seed, pool))
+                if watch is not None and group is groups[-1]:
+                    watch(done())
+    return done()
 
 
 def configured_horizons_m(run: DrivenRun) -> tuple[float, ...]:
@@ -230,7 +168,7 @@ def load_kernels() -> None:
     way = drive.distance
     icrs, horizon = FrozenIcrs.constant(1.0, -1.0, 0.0), np.array([1.0])
     errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
-    bootstrap_intervals(errors, way, horizon, DEFAULT_SEED)
+    bootstrap_intervals(errors, [cut_blocks(way < way[-1], way, 0.5)], DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
     motion = move(
         way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
@@ -271,6 +209,15 @@ def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.in
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
 
 
+def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Executor) -> list[Blocks | None]:
+    """Return what the bootstrap resamples, for each horizon."""
+
+    def cut(h: int) -> Blocks | None:
+        return cut_blocks(ends[h] >= 0, drive.distance, float(horizons[h]))
+
+    return list(pool.map(cut, range(len(horizons))))
+
+
 def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states = ends.shape[1]
@@ -284,20 +231,18 @@ def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Execu
     return errors.T
 
 
-def _judge(model: Model, errors: Floats, drive: Drive, horizons: Floats, seed: int, pool: Executor) -> ModelResult:
+def _judge(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
     """Say what the errors of one model tell, horizon by horizon."""
 
     def judge(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
         summary = summarise_sorted([ordered])
-        intervals = bootstrap_intervals(
-            column, drive.distance, horizons[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL
-        )
+        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         return ModelResult(model.name, model.label, summary, intervals, (bins,))
 
-    return _joined(list(pool.map(judge, range(len(horizons)))))
+    return _joined(list(pool.map(judge, range(len(blocks)))))
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 
 from icrtool.analysis.dropout import STANDING_MPS
+from icrtool.analysis.dropout_records import Outage
 from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
-from icrtool.analysis.outages import Outage
 from icrtool.core.ekf import run_filter
 from icrtool.errors import ConfigError, DataError
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.analysis.dropout import DropoutReport
+from icrtool.analysis.dropout_records import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.tables import Floats
 

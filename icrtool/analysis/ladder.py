@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun
-from icrtool.analysis.ladder_fits import CHOICE_HORIZON_M, BlockFits, clear_of, fit_blocks
-from icrtool.analysis.ladder_trials import Along, MeasuredHeading, Trials, calibrate_gyro, cut_trials, predict
+from icrtool.analysis.dropout_records import CHOICE_HORIZON_M, Rung
+from icrtool.analysis.ladder_fits import BlockFits, clear_of, fit_blocks
+from icrtool.analysis.ladder_trials import Along, Trials, calibrate_gyro, cut_trials, predict
+from icrtool.analysis.measured_heading import MeasuredHeading
 from icrtool.analysis.window_fit import WindowFit, Windows, cut_windows, window_spacing_m
-from icrtool.core.open_loop import FrozenIcrs
 from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.statistics import Summary, summarise
+from icrtool.core.statistics import summarise
+from icrtool.core.trials import FrozenIcrs
 from icrtool.core.window_fit import NEUTRAL
 from icrtool.errors import DataError
 from icrtool.tables import Bools, Floats
@@ -42,23 +44,6 @@ FITTED_TO = {
     "no_slip": "never", "multiplier": "others", "icr": "before", "icr_final": "all", "window": "others",
     "extended": "others",
 }  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Rung:
-    """One model's errors.
-
-    Attributes
-    ----------
-    name : of `MODELS`, with ``_gyro`` or ``_heading`` where the heading is measured
-    fitted : ``never``, ``before`` (from the states up to the start), ``all`` (in sample), ``others`` (held out)
-    """
-
-    name: str
-    label: str
-    fitted: str
-    measured_heading: bool
-    summary: Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +123,7 @@ def judge_ladder(
     return Ladder(
         horizons_m=tuple(horizons_m),
         blocks=blocks,
-        starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
+        starts=len(trials.starts),
         rungs=rungs,
         chosen=fits.chosen,
         fits=fits.whole,
@@ -166,7 +151,7 @@ def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> 
         errors = open_loop_errors(trials.drive, icrs, trials.ends)
     else:
         return None
-    return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors))
+    return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors[trials.starts]))
 
 
 def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
@@ -184,7 +169,7 @@ def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: Measu
         else:
             place, icrs = plain, _icrs_of(run, name)
         if icrs is not None:
-            summary = summarise(along.errors(place, icrs))
+            summary = summarise(along.errors(place, icrs)[trials.starts])
             yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED_TO[name], True, summary)
 
 

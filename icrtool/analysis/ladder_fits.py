@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.analysis.dropout_records import CHOICE_HORIZON_M
 from icrtool.analysis.window_fit import WindowFit, Windows, thin_windows
 from icrtool.analysis.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.analysis.window_solve import Solution, drop_windows, fit_of, solve_windows
 from icrtool.tables import Bools, Floats
 
-CHOICE_HORIZON_M = 10.0
 FITS_AT_ONCE = 2
 
 WORTHWHILE = 0.95

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.window_fit import Windows, coarse_rows
 from icrtool.core.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.core.open_loop import Drive, FrozenIcrs, trial_ends
+from icrtool.core.open_loop import trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.core.trials import Drive, FrozenIcrs
 from icrtool.tables import Complexes, Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
@@ -23,21 +23,6 @@ TURNS_WITH_ROBOT = 0.1
 """A gyro whose scale, but for its sign, is further than this from one does not measure the robot's yaw."""
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredHeading:
-    """Where the robot pointed by a sensor of its own, at the states of a run.
-
-    Attributes
-    ----------
-    kind : ``heading``: an attitude, its direction is taken as told; ``gyro``: an integrated turn rate, which starts
-        from the reference heading and is given scale and bias by the way outside the block
-    angle_rad : (n,), clockwise, unwrapped
-    """
-
-    kind: Literal["heading", "gyro"]
-    angle_rad: Floats
-
-
 class Trials(NamedTuple):
     """Trials that lie within one block.
 
@@ -45,12 +30,14 @@ class Trials(NamedTuple):
     ----------
     drive : the run; t : (n,) [s]
     ends : int64 (n, h), negative where there is no trial, or one that leaves its block
+    starts : (k,) states from which there is one
     block : int64 (n,), block of each state
     """
 
     drive: Drive
     t: Floats
     ends: Ints
+    starts: Ints
     block: Ints
 
     def rows(self, block: int) -> slice:
@@ -72,7 +59,7 @@ def cut_trials(run: DrivenRun, edges_m: Floats, horizons_m: Sequence[float]) -> 
     for h, column in enumerate(found.T):
         mine = column[::every]
         ends[h, ::every] = np.where((mine >= 0) & (block[mine] == block[::every]), mine, -1)
-    return Trials(drive, table.t_s, ends.T, block)
+    return Trials(drive, table.t_s, ends.T, np.flatnonzero((ends >= 0).any(axis=0)), block)
 
 
 def predict(trials: Trials, p: Floats) -> Floats:

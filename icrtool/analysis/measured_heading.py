@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from icrtool.analysis.ladder_trials import MeasuredHeading
 from icrtool.tables import Floats, Ints
 
 if TYPE_CHECKING:
@@ -14,6 +14,21 @@ if TYPE_CHECKING:
 
 LONGEST_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredHeading:
+    """Where the robot pointed by a sensor of its own, at the states of a run.
+
+    Attributes
+    ----------
+    kind : ``heading``: an attitude, its direction is taken as told; ``gyro``: an integrated turn rate, which starts
+        from the reference heading and is given scale and bias by the way outside the block
+    angle_rad : (n,), clockwise, unwrapped
+    """
+
+    kind: Literal["heading", "gyro"]
+    angle_rad: Floats
 
 
 def measured_headings(run: FilterRun) -> tuple[MeasuredHeading, ...]:

@@ -2,38 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
+from icrtool.analysis.dropout_records import Outage
 from icrtool.core.open_loop import open_loop_path
-from icrtool.tables import Floats
-
-OutageKind = Literal["forced", "real"]
-
-
-@dataclass(frozen=True, slots=True)
-class Outage:
-    """One outage.
-
-    Attributes
-    ----------
-    begin_s, end_s : seconds since the first recorded state
-    distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: miss at re-acquisition (both the same)
-    north_m, east_m : (m,) the blind path, for a picture
-    """
-
-    kind: OutageKind
-    begin_s: float
-    end_s: float
-    distance_m: float
-    end_error_m: float
-    max_error_m: float
-    north_m: Floats
-    east_m: Floats
 
 
 def real_outages(run: DrivenRun) -> tuple[Outage, ...]:

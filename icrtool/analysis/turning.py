@@ -10,8 +10,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of
 from icrtool.analysis.dropout import models_of
-from icrtool.core.open_loop import Drive, trial_ends
+from icrtool.core.open_loop import trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.core.trials import Drive
 from icrtool.tables import Floats
 
 SPLIT_HORIZON_M = 5.0

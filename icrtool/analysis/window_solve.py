@@ -1,7 +1,7 @@
 """Many window fits to parts of one run: the same minima as `fit_windows`, each in a few evaluations.
 
 Every model is a choice of columns of one set of misses and derivatives. A Gauss-Newton step that takes scale and
-weights of the robust loss from where it stands settles within some five marches over the joined wheel samples; an
+weights of the robust loss from where it stands settles within a few marches over the joined wheel samples; an
 extended model starts where the plain one of the same part ended. No fit is told anything of the windows left out.
 """
 
@@ -28,7 +28,7 @@ SETTLED = 1e-4
 """In standard deviations of the prior: a step below this is the last one ..."""
 
 SETTLED_COST = 1e-3
-"""... and so is one that gains less than this share of what a stretch of way says: 0.03 of a standard deviation."""
+"""... and so is one to gain less than this share of what a stretch of way says: 0.03 of a standard deviation."""
 
 MOST_STEPS = 15
 MOST_HALVINGS = 6
@@ -73,6 +73,8 @@ def solve_windows(windows: Windows, model: WindowModel, kept: Bools, start: Solu
     basis, base = basis_of(model), base_parameters()
     mean, held, std = prior_of(windows, model, kept)
     rows = np.tile(kept, 2)
+    # the prior weighs as a stretch does: what its windows, alike as they are, gain together
+    alike = float((held[0] * std[0]) ** 2)
     terms: Floats
     if start is None:
         terms = mean
@@ -86,6 +88,10 @@ def solve_windows(windows: Windows, model: WindowModel, kept: Bools, start: Solu
         H = basis @ (pulled.T @ pulled) @ basis.T + np.diag(held**2)
         g = basis @ (pulled.T @ (weight * misses)) + held**2 * (terms - mean)
         step = np.asarray(-np.linalg.solve(H, g), np.float64)
+        if -float(g @ step) < SETTLED_COST * alike or np.all(np.abs(step) < SETTLED * std):
+            # too short a step to march for: misses follow it to first order
+            terms, misses = terms + step, misses + slopes @ (step @ basis)
+            break
         before = _cost(misses, weight, (terms - mean) * held)
         tried = evaluate_windows(windows, base + (terms + step) @ basis)
         for _ in range(MOST_HALVINGS):
@@ -94,10 +100,6 @@ def solve_windows(windows: Windows, model: WindowModel, kept: Bools, start: Solu
             step = step / 2.0
             tried = evaluate_windows(windows, base + (terms + step) @ basis)
         terms, (misses, slopes) = terms + step, tried
-        # the prior weighs as a stretch does: what its windows, alike as they are, gained together
-        alike = float((held[0] * std[0]) ** 2)
-        if -float(g @ step) < SETTLED_COST * alike or np.all(np.abs(step) < SETTLED * std):
-            break
     weight, scale = _weigh(misses, rows)
     return Solution(model, terms, base + terms @ basis, misses, slopes, weight, held, scale)
 

@@ -18,9 +18,9 @@ from icrtool.cli.options import POSITIVE
 if TYPE_CHECKING:
     from icrtool.analysis.driven_run import DrivenRun
     from icrtool.analysis.dropout import ErrorSink
+    from icrtool.analysis.dropout_records import Outage
     from icrtool.analysis.fit import FilterRun
     from icrtool.analysis.gates import Gate
-    from icrtool.analysis.outages import Outage
     from icrtool.config import Config
     from icrtool.report.drawing_process import DrawingProcess
     from icrtool.report.dropout_content import DropoutContent
@@ -48,7 +48,7 @@ class Request:
     budgets_m: tuple[float, ...]
     gates: tuple[Gate, ...]
     trials: bool
-    seed: int
+    seed: int | None
     formats: tuple[str, ...]
     ladder: bool
     smoothed: bool
@@ -104,20 +104,25 @@ def command(
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    from icrtool.analysis.dropout import DEFAULT_SEED
     from icrtool.analysis.gates import parse_gate
-    from icrtool.report.drawing_process import DrawingProcess
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         gates=tuple(parse_gate(text) for text in gates), trials=trials,
-        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
-        smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
+        seed=seed, formats=formats, ladder=ladder, smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, output, config, (junit, markdown))
-    with DrawingProcess(formats) as drawer:
+    with drawing_process(formats, fits=bool(places)) as drawer:
         outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
     leave(outcomes, junit=junit, markdown=markdown)
+
+
+def drawing_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
+    """Return a process for the pictures; it starts before the analysis is loaded, which drawing does not need."""
+    from icrtool.report.drawing_process import DrawingProcess
+    from icrtool.report.dropout_drawing import load_figures
+
+    return options.drawing_process(formats) if fits else DrawingProcess(formats, load_figures)
 
 
 def parse_horizons(text: str) -> tuple[float, ...]:
@@ -139,13 +144,13 @@ def plan_sources(
 
     Whatever can be refused at once is refused here, before any work.
     """
-    from icrtool.report.dropout_exports import check_parent
     from icrtool.report.dropout_source import newest_run
     from icrtool.report.run_directory import RUN_FILE
+    from icrtool.report.whole_file import check_place
 
     for export in exports:
         if export is not None:
-            check_parent(export)
+            check_place(export)
     sources = sources or (newest_run(RUNS),)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
     check_configuration(config, runs_only=not logs, output=output)
@@ -201,10 +206,6 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
 
 def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutContent:
     """Report on one source; `place` is the run directory of a log, None for a run."""
-    from icrtool.analysis.dropout import BOOTSTRAP_RESAMPLES
-    from icrtool.core.open_loop_fast import TOLERANCE_M
-    from icrtool.report.dropout_table import format_dropout
-
     if place is None:
         run: StoredRun | FilterRun = _read(source)
         directory = source
@@ -212,11 +213,16 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
         run, directory = _fit(source, place, request, drawer), place
     content = _analyse(run, directory, request, drawer)
     if not request.quiet:
+        from icrtool.report.dropout_table import format_dropout
+
         click.echo(format_dropout(content))
         click.echo(f"\nwritten to {directory / 'dropout'}")
     if request.verbose:
+        from icrtool.analysis.dropout import BOOTSTRAP_RESAMPLES
+        from icrtool.core.open_loop_fast import TOLERANCE_M
+
         blocks = "moving blocks as long as the horizon"
-        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {request.seed}", err=True)
+        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {content.report.seed}", err=True)
         click.echo(f"errors: equal to direct integration, {TOLERANCE_M:g} m left out at most", err=True)
     return content
 
@@ -225,11 +231,12 @@ def _read(directory: Path) -> StoredRun:
     """Read a run; what the analysis needs is loaded beside it."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from icrtool.analysis.dropout import load_kernels
     from icrtool.report.dropout_source import read_source
 
     with ThreadPoolExecutor(1) as pool:
         reading = pool.submit(read_source, directory)
+        from icrtool.analysis.dropout import load_kernels
+
         load_kernels()
         return reading.result()
 
@@ -260,13 +267,13 @@ def _analyse(
 ) -> DropoutContent:
     """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
     from icrtool.analysis.blind_paths import example_drives, worst_drives
-    from icrtool.analysis.dropout import dropout
+    from icrtool.analysis.dropout import DEFAULT_SEED, dropout, models_of
     from icrtool.analysis.gates import budget_distances, judge_gate
     from icrtool.analysis.outages import real_outages
     from icrtool.analysis.turning import split_by_turning
+    from icrtool.report import dropout_drawing
     from icrtool.report.dropout_content import DropoutContent, title_of
     from icrtool.report.dropout_directory import dropout_directory, write_content
-    from icrtool.report.dropout_drawing import draw_histograms, draw_ladder, draw_paths, draw_summary
     from icrtool.report.dropout_ladder import ladder_of
     from icrtool.report.dropout_source import judged_run
 
@@ -278,15 +285,18 @@ def _analyse(
         drawer.into(partial / "plots") as draw,
         _trials_sink(partial, run.table.stamp_ns, wanted=request.trials) as sink,
     ):
-        examples, worst = example_drives(run), worst_drives(run)
-        draw_paths(draw, title, run.table, (examples, worst), outages)
+        dropout_drawing.draw_examples(draw, title, examples := example_drives(run))
+        dropout_drawing.draw_worst(draw, title, worst := worst_drives(run))
+        dropout_drawing.draw_outages(draw, title, run.table, outages)
         horizons = _horizons(run, request)
-        report = dropout(run, horizons, seed=request.seed, sink=sink)
-        draw_histograms(draw, title, report)
-        draw_summary(draw, title, report, outages)
+        seed = request.seed if request.seed is not None else DEFAULT_SEED
+        models = models_of(run)
+        watch = dropout_drawing.watch_for_histograms(draw, title, [model.name for model in models])
+        report = dropout(run, horizons, models=models, seed=seed, sink=sink, watch=watch)
+        dropout_drawing.draw_summary(draw, title, report, outages)
         ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
         if ladder is not None:
-            draw_ladder(draw, title, ladder)
+            dropout_drawing.draw_ladder(draw, title, ladder)
         content = DropoutContent(
             title=title,
             run_summary=run.summary,

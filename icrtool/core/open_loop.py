@@ -8,17 +8,12 @@ trajectory and is the oracle; ``icrtool.core.open_loop_fast`` gives the same num
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.core.compiled import njit
 from icrtool.core.kinematics import body_velocity
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from icrtool.core.trials import Drive, Floats, FrozenIcrs, Ints, OpenLoopPath, TrialCounts
 
 SHORT = -1
 """No trial: less than the horizon is left of the path."""
@@ -26,65 +21,6 @@ GAP = -2
 """No trial: the way spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
-
-
-class Drive(NamedTuple):
-    """The recorded states, as open-loop propagation sees them. All of shape (n,).
-
-    Attributes
-    ----------
-    dt_s : float64, interval [s] from state k to state k + 1; the last one is never used
-    v_left, v_right : float64, track speeds [m/s] held over that interval
-    north, east, heading : float64, reference pose [m, m, rad]: where trials start and what they are judged by
-    distance : float64, path length [m], non-decreasing
-    gap : bool, the interval from k to k + 1 is a gap in the wheel data
-    in_outage : bool, state k has no reference to be judged by
-    """
-
-    dt_s: Floats
-    v_left: Floats
-    v_right: Floats
-    north: Floats
-    east: Floats
-    heading: Floats
-    distance: Floats
-    gap: Bools
-    in_outage: Bools
-
-
-class FrozenIcrs(NamedTuple):
-    """The ICRs a trial from state k drives with. Each of shape (n,), or (1,) for one triple from every start.
-
-    Attributes
-    ----------
-    y_icr_right, y_icr_left, x_icr : float64 [m], body frame
-    """
-
-    y_icr_right: Floats
-    y_icr_left: Floats
-    x_icr: Floats
-
-    @classmethod
-    def constant(cls, y_icr_right: float, y_icr_left: float, x_icr: float) -> FrozenIcrs:
-        """Return one triple [m] for every start: no-slip is ``(b/2, -b/2, 0)``."""
-        return cls(np.array([y_icr_right]), np.array([y_icr_left]), np.array([x_icr]))
-
-
-class OpenLoopPath(NamedTuple):
-    """An open-loop path from a start state to an end state, both included; float64 (m,) [m, m, rad]."""
-
-    north: Floats
-    east: Floats
-    heading: Floats
-
-
-class TrialCounts(NamedTuple):
-    """How many starts were a trial, and why the others were none; int64 (n_horizons,) each."""
-
-    trials: Ints
-    short: Ints
-    gap: Ints
-    outage: Ints
 
 
 @njit

@@ -24,7 +24,8 @@ import numpy as np
 
 from icrtool.core.compiled import njit
 from icrtool.core.kinematics import icr_separation
-from icrtool.core.open_loop import Drive, Floats, FrozenIcrs, Ints, compiled_drive, compiled_icrs, integrate_trials
+from icrtool.core.open_loop import compiled_drive, compiled_icrs, integrate_trials
+from icrtool.core.trials import Drive, Floats, FrozenIcrs, Ints
 
 TOLERANCE_M = 1e-11
 """Bound [m] on what the moments left out may add to an end position. With rounding, 1e-9 m is kept with room."""
@@ -36,6 +37,8 @@ MIN_BLOCK = 8
 """Blocks of this size are not split but integrated directly: no dearer, when each needs a window of its own."""
 BLOCK = 2048
 """Starts a block (at least as many as the states of its first trial: then the window is about twice the block)."""
+CONSTANT_BLOCK = 8192
+"""The same where one triple of ICRs serves every start: one moment does for any block, and longer ones share more."""
 MAX_BLOCK = 32768
 """Bounds the memory of a block to a few MB."""
 TILE = 128
@@ -259,11 +262,12 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.full(by_horizon.shape, np.nan)
     drive, icrs = compiled_drive(drive), compiled_icrs(icrs)
+    block = CONSTANT_BLOCK if len(icrs.x_icr) == 1 else BLOCK
     row_lo, size, starts = 0, MAX_BLOCK, len(ends)
     while row_lo < starts:
         # a robot which hardly moves has long windows: longer blocks share them
         first_window = last_end(by_horizon, row_lo, row_lo + 1) - lo - row_lo
-        row_hi = min(row_lo + min(max(BLOCK, first_window), size), starts)
+        row_hi = min(row_lo + min(max(block, first_window), size), starts)
         while True:
             last = last_end(by_horizon, row_lo, row_hi)
             plan = plan_block(drive, icrs, lo + row_lo, lo + row_hi, last)

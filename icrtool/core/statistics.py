@@ -12,12 +12,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.core.compiled import njit
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from icrtool.core.trials import Bools, Floats, Histogram, Intervals, Ints, Summary
 
 TAIL = 0.05
 """Share of trials above the 95th percentile."""
@@ -29,42 +26,6 @@ TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
 MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
-
-
-class Summary(NamedTuple):
-    """Errors of one model, per horizon; (n_horizons,) each, NaN where there was no trial.
-
-    Attributes
-    ----------
-    trials : int64
-    expected, p50, p95, largest : float64 [m]; the expected error is the mean
-    """
-
-    trials: Ints
-    expected: Floats
-    p50: Floats
-    p95: Floats
-    largest: Floats
-
-
-class Intervals(NamedTuple):
-    """Confidence intervals of the expected error and of p95, per horizon; float64 (n_horizons,) [m] each.
-
-    NaN where the path with trials is shorter than `MIN_BLOCKS` horizons.
-    """
-
-    expected_low: Floats
-    expected_high: Floats
-    p95_low: Floats
-    p95_high: Floats
-
-
-class Histogram(NamedTuple):
-    """Share of trials by error: float64 (n_bins,) each, bins ``[left, right)`` [m] from zero on, percent of all."""
-
-    left: Floats
-    right: Floats
-    percent: Floats
 
 
 def summarise(errors_m: Floats) -> Summary:
@@ -137,27 +98,72 @@ def resample_blocks(blocks: Floats, starts: Ints, segments: Ints, ordered: Float
         out[b, 1] = ordered[i]
 
 
+class Blocks(NamedTuple):
+    """The path of one horizon's trials, cut for resampling; the same for every model.
+
+    Attributes
+    ----------
+    rows : where the trials stand among all starts (m,)
+    first : (s,) first trial of each segment
+    kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
+    per_segment : (s, 2) trials, and kept ones
+    """
+
+    rows: slice | Ints
+    first: Ints
+    kept: Ints
+    segments: Ints
+    per_segment: Floats
+
+
+def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
+    """Cut the path of one horizon's trials into segments of a quarter block.
+
+    Parameters
+    ----------
+    tried : (n,) whether there is a trial from a start
+    path_m : (n,) [m], path length at each start, non-decreasing
+    block_m : path [m] of a block, usually the horizon
+
+    Returns
+    -------
+    None where there are fewer than `MIN_BLOCKS` blocks.
+    """
+    trials = np.flatnonzero(tried)
+    if not len(trials):
+        return None
+    rows: slice | Ints = trials
+    if trials[-1] - trials[0] + 1 == len(trials):
+        rows = slice(int(trials[0]), int(trials[-1]) + 1)  # the usual case, and a slice copies nothing
+    path, count = path_m[rows], len(trials)
+    edges = np.arange(path[0], path[-1] + block_m, block_m / BLOCK_PARTS)
+    first = np.searchsorted(path, edges)
+    # what lies beyond the path, and segments without a trial, begin where another one does
+    first = first[np.diff(first, append=count) > 0]
+    if len(first) < MIN_BLOCKS * BLOCK_PARTS:
+        return None
+    wanted = max(MIN_KEPT_TRIALS, TRIALS_PER_BLOCK * (len(first) // BLOCK_PARTS))
+    kept = np.arange(0, count, max(count // wanted, 1))
+    segments = np.searchsorted(first, kept, side="right") - 1
+    in_segment = np.diff(first, append=count), np.bincount(segments, minlength=len(first))
+    return Blocks(rows, first, kept, segments, np.stack(in_segment, axis=1).astype(np.float64))
+
+
 def bootstrap_interval(
-    errors_m: Floats,
-    path_m: Floats,
-    block_m: float,
-    rng: np.random.Generator,
-    resamples: int = 300,
-    level: float = 0.95,
+    errors_m: Floats, blocks: Blocks | None, rng: np.random.Generator, resamples: int = 300, level: float = 0.95
 ) -> tuple[float, float, float, float]:
     """Compute confidence intervals of one horizon's expected error and p95 by the moving-block bootstrap.
 
     Parameters
     ----------
     errors_m : (n,) [m], NaN where there was no trial
-    path_m : (n,) [m], path length at each start, non-decreasing
-    block_m : path [m] of a block, usually the horizon
+    blocks : of `cut_blocks`
     rng : random numbers; the same state gives the same blocks, so models can be compared on the same resamples
     resamples, level : number of resamples, and the share of them within the interval
 
     Returns
     -------
-    expected_low, expected_high, p95_low, p95_high [m]; NaN where there are fewer than `MIN_BLOCKS` blocks
+    expected_low, expected_high, p95_low, p95_high [m]; NaN without blocks
 
     Notes
     -----
@@ -168,56 +174,36 @@ def bootstrap_interval(
     interval is too narrow rather than too wide: on moving sums as long as the block, 95 % intervals of p95 covered the
     truth in 90 % of paths of 400 blocks, 84 % of 50 and 68 % of 10 (the mean: 90, 88, 84 %).
     """
-    tried = np.flatnonzero(~np.isnan(errors_m))
-    if not len(tried):
+    if blocks is None:
         return (math.nan,) * 4
-    rows: slice | Ints = tried
-    if tried[-1] - tried[0] + 1 == len(tried):
-        rows = slice(tried[0], tried[-1] + 1)  # the usual case, and a slice copies nothing
-    errors, path = errors_m[rows], path_m[rows]
-    edges = np.arange(path[0], path[-1] + block_m, block_m / BLOCK_PARTS)
-    first = np.searchsorted(path, edges)
-    # what lies beyond the path, and segments without a trial, begin where another one does
-    first = first[np.diff(first, append=len(path)) > 0]
-    n_starts = len(first) - BLOCK_PARTS + 1
-    if len(first) < MIN_BLOCKS * BLOCK_PARTS:
-        return (math.nan,) * 4
-    n_drawn = len(first) // BLOCK_PARTS
-    kept = np.arange(0, len(errors), max(len(errors) // max(MIN_KEPT_TRIALS, TRIALS_PER_BLOCK * n_drawn), 1))
-    segments = np.searchsorted(first, kept, side="right") - 1
-    order = np.argsort(errors[kept])[::-1]
-    per_segment = np.stack(
-        [
-            np.add.reduceat(errors, first),
-            np.diff(first, append=len(errors)),
-            np.bincount(segments, minlength=len(first)),
-        ],
-        axis=1,
-    )
-    blocks = np.sum([per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)], axis=0)
-    starts = rng.integers(0, n_starts, size=(resamples, n_drawn))
+    errors = errors_m[blocks.rows]
+    kept = errors[blocks.kept]
+    order = np.argsort(kept)[::-1]
+    per_segment = np.column_stack([np.add.reduceat(errors, blocks.first), blocks.per_segment])
+    n_starts = len(per_segment) - BLOCK_PARTS + 1
+    sums = np.sum([per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)], axis=0)
+    starts = rng.integers(0, n_starts, size=(resamples, len(per_segment) // BLOCK_PARTS))
     replicates = np.empty((resamples, 2))
-    resample_blocks(blocks, starts, segments[order], errors[kept][order], replicates)
+    resample_blocks(sums, starts, blocks.segments[order], kept[order], replicates)
     low, high = np.quantile(replicates, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
 def bootstrap_intervals(
-    errors_m: Floats, path_m: Floats, horizons_m: Floats, seed: int, resamples: int = 300, level: float = 0.95
+    errors_m: Floats, blocks: Sequence[Blocks | None], seed: int, resamples: int = 300, level: float = 0.95
 ) -> Intervals:
-    """Compute `bootstrap_interval` for every horizon, with blocks as long as the horizon.
+    """Compute `bootstrap_interval` for every horizon.
 
     Parameters
     ----------
     errors_m : (n_starts, n_horizons) [m]
-    path_m : (n_starts,) [m], path length at each start
-    horizons_m : (n_horizons,) [m]
+    blocks : of `cut_blocks`, one a horizon
     seed : every horizon starts from it, so that an interval does not depend on which others are asked for
     resamples, level : as in `bootstrap_interval`
     """
     rows = [
-        bootstrap_interval(errors_m[:, h], path_m, float(horizons_m[h]), np.random.default_rng(seed), resamples, level)
-        for h in range(len(horizons_m))
+        bootstrap_interval(column, cut, np.random.default_rng(seed), resamples, level)
+        for column, cut in zip(errors_m.T, blocks, strict=True)
     ]
     return Intervals(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
 

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.analysis.blind_paths import BlindDrive
 from icrtool.analysis.driven_run import DrivenRun
-from icrtool.analysis.dropout import DropoutReport, ModelResult
+from icrtool.analysis.dropout_records import BlindDrive, DropoutReport, ModelResult, Outage
 from icrtool.analysis.gates import BudgetDistance, Verdict
 from icrtool.analysis.ladder import Ladder
-from icrtool.analysis.outages import Outage
 from icrtool.analysis.turning import TurningSplit
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)

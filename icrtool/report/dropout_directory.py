@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.analysis.blind_paths import BlindDrive
-from icrtool.analysis.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, DropoutReport, ModelResult
+from icrtool.analysis.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES
+from icrtool.analysis.dropout_records import BlindDrive, DropoutReport, ModelResult
 from icrtool.core.open_loop_fast import TOLERANCE_M
 from icrtool.report.dropout_content import DropoutContent
 from icrtool.report.ladder_table import LADDER_COLUMNS, ladder_document, ladder_rows

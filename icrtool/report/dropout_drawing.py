@@ -11,29 +11,28 @@ from icrtool.report.drawing_process import Draw
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from icrtool.analysis.blind_paths import BlindDrive
-    from icrtool.analysis.dropout import DropoutReport
+    from icrtool.analysis.dropout_records import BlindDrive, DropoutReport, Outage
     from icrtool.analysis.ladder import Ladder
-    from icrtool.analysis.outages import Outage
     from icrtool.tables import States
 
 HISTOGRAM_MODELS = ("icr", "no_slip")
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
-def draw_paths(
-    draw: Draw,
-    title: str,
-    table: States,
-    drives: tuple[Sequence[BlindDrive], Sequence[BlindDrive]],
-    outages: Sequence[Outage],
-) -> None:
-    """Have the pictures of single drives drawn: `drives` are the examples and the worst."""
-    examples, worst = drives
+def draw_examples(draw: Draw, title: str, examples: Sequence[BlindDrive]) -> None:
+    """Have the typical drives drawn, where there are some."""
     if examples:
         draw(write_figure, f"examples_{examples[0].horizon_m:02.0f}m", title, examples)
+
+
+def draw_worst(draw: Draw, title: str, worst: Sequence[BlindDrive]) -> None:
+    """Have the worst drives drawn, where there are some."""
     if worst:
         draw(write_figure, "worst", title, worst)
+
+
+def draw_outages(draw: Draw, title: str, table: States, outages: Sequence[Outage]) -> None:
+    """Have the outages drawn, where there were some."""
     if outages:
         draw(write_figure, "outages", title, table.north_m, table.east_m, outages)
 
@@ -46,6 +45,17 @@ def draw_histograms(draw: Draw, title: str, report: DropoutReport) -> None:
             draw(write_figure, f"histogram_{horizon:02.0f}m", title, report, horizon)
 
 
+def watch_for_histograms(draw: Draw, title: str, models: Sequence[str]) -> Callable[[DropoutReport], None]:
+    """Return what has the histograms drawn when it is told that a report of these models holds those they show."""
+    last = [name for name in models if name in HISTOGRAM_MODELS][-1]
+
+    def told(report: DropoutReport) -> None:
+        if report.results[-1].name == last:
+            draw_histograms(draw, title, report)
+
+    return told
+
+
 def draw_summary(draw: Draw, title: str, report: DropoutReport, outages: Sequence[Outage]) -> None:
     """Have the summary over all horizons drawn, where there are trials."""
     if report.counts.trials.any():
@@ -54,7 +64,7 @@ def draw_summary(draw: Draw, title: str, report: DropoutReport, outages: Sequenc
 
 def draw_ladder(draw: Draw, title: str, ladder: Ladder) -> None:
     """Have the ladder of models drawn."""
-    draw(write_figure, "ladder", title, ladder)
+    draw(write_figure, "ladder", title, ladder.rungs, ladder.horizons_m, ladder.blocks)
 
 
 def write_figure(directory: Path, formats: tuple[str, ...], name: str, *content: object) -> None:
@@ -69,6 +79,11 @@ def write_figure(directory: Path, formats: tuple[str, ...], name: str, *content:
 
     with style():
         save(_figures()[name.partition("_")[0]](*content), directory / name, formats)
+
+
+def load_figures() -> None:
+    """Load what these pictures need, in the process that will draw them."""
+    _figures()
 
 
 def _figures() -> dict[str, Callable[..., Figure]]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from icrtool.errors import IcrToolError, OutputError
+from icrtool.errors import IcrToolError
 from icrtool.report.dropout_content import DropoutContent, shown_horizons
 from icrtool.report.dropout_table import budget_lines, metres_text, percent_text, ratio_text
 from icrtool.report.whole_file import whole_file
@@ -61,20 +61,6 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
             parts.append(format_markdown(outcome))
     with whole_file(path) as partial:
         partial.write_bytes("\n".join(parts).encode("utf-8", errors="backslashreplace"))
-
-
-def check_parent(path: Path) -> None:
-    """Refuse a file whose directory is not there, before any work is done for it.
-
-    Raises
-    ------
-    OutputError
-        The directory is missing, or `path` is one itself.
-    """
-    if not path.absolute().parent.is_dir():
-        raise OutputError(path, "its directory does not exist", "make it first, or name another file")
-    if path.is_dir():
-        raise OutputError(path, "is a directory", "name a file")
 
 
 def format_markdown(content: DropoutContent) -> str:

@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 from textwrap import wrap
 
-from icrtool.analysis.dropout import DropoutReport, ModelResult
+from icrtool.analysis.dropout_records import DropoutReport, ModelResult, Outage
 from icrtool.analysis.gates import BudgetDistance
-from icrtool.analysis.outages import Outage
 from icrtool.analysis.turning import TurningSplit
 from icrtool.report.dropout_content import DropoutContent, p95_at, shown_horizons
 from icrtool.report.ladder_table import format_ladder

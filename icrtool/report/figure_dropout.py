@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from icrtool.analysis.dropout import DropoutReport, ModelResult
-from icrtool.analysis.outages import Outage
-from icrtool.report.figure_style import ICR, MEAN, NO_SLIP, Pen, inches, new_figure
+from icrtool.analysis.dropout_records import DropoutReport, ModelResult, Outage
+from icrtool.report.figure_style import ICR, MEAN, NO_SLIP, Pen, fill_bins, inches, new_figure
 from icrtool.report.words import length_text
 from icrtool.tables import Floats
 
@@ -143,7 +142,7 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int) -> None:
     width = float(bins.right[0] - bins.left[0])
     end = min(HISTOGRAM_IN_P95 * p95, float(bins.right[-1])) if p95 > 0 else width
     edges = np.append(bins.left, bins.right[-1])
-    axes.stairs(bins.percent, edges, fill=True, color=PENS[result.name].color, alpha=0.75)
+    fill_bins(axes, edges, bins.percent, color=PENS[result.name].color, alpha=0.75)
     axes.axvline(p95, **P95.keywords())
     axes.axvline(expected, **MEAN.keywords())
     label = {"icr": "ICR", "no_slip": "no slip"}[result.name]

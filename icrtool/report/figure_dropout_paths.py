@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from icrtool.analysis.blind_paths import BlindDrive
-from icrtool.analysis.outages import Outage
+from icrtool.analysis.dropout_records import BlindDrive, Outage
 from icrtool.report.decimate import places
 from icrtool.report.figure_style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
 from icrtool.report.words import duration_text, length_text

@@ -18,6 +18,7 @@ from icrtool.report.figure_style import (
     MEAN,
     OUTAGE_COLOR,
     TimeAxis,
+    fill_bins,
     inches,
     new_figure,
     shade_spans,
@@ -197,7 +198,7 @@ def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weig
     width = _bin_width(span_m)
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
-    axes.stairs(100 * share / max(weight.sum(), 1e-9), edges, fill=True, color=BAR_COLOR)
+    fill_bins(axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR)
     axes.set_xlim(low, high)
     mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
     axes.axvline(mean, **MEAN.keywords())

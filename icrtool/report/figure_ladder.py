@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from icrtool.analysis.ladder import Ladder, Rung
-from icrtool.analysis.ladder_fits import CHOICE_HORIZON_M
+from icrtool.analysis.dropout_records import CHOICE_HORIZON_M, Rung
 from icrtool.report.figure_style import ICR, inches, new_figure
 from icrtool.report.words import FITTED
 
@@ -20,14 +20,19 @@ if TYPE_CHECKING:
 WIDTH_IN, ROW_IN = 7.2, 0.27
 
 
-def draw_ladder(title: str, ladder: Ladder) -> Figure:
-    """Draw 95 % (filled) and expected error (open) of each model; held-out ones as circles, others as squares."""
-    h = int(np.argmin(np.abs(np.array(ladder.horizons_m) - CHOICE_HORIZON_M)))
-    rungs = [rung for rung in ladder.rungs if rung.summary.trials[h]]
+def draw_ladder(title: str, rungs: Sequence[Rung], horizons_m: Sequence[float], blocks: int) -> Figure:
+    """Draw 95 % (filled) and expected error (open) of each model; held-out ones as circles, others as squares.
+
+    Parameters
+    ----------
+    rungs, horizons_m, blocks : of a `icrtool.analysis.ladder.Ladder`
+    """
+    h = int(np.argmin(np.abs(np.array(horizons_m) - CHOICE_HORIZON_M)))
+    rungs = [rung for rung in rungs if rung.summary.trials[h]]
     groups = sum(1 for rung in rungs if rung.measured_heading) > 0
     figure = new_figure(
         title,
-        f"Open-loop error after {ladder.horizons_m[h]:g} m, {ladder.blocks} blocks of way held out in turn",
+        f"Open-loop error after {horizons_m[h]:g} m, {blocks} blocks of way held out in turn",
         width_in=WIDTH_IN,
         height_in=1.65 + ROW_IN * (len(rungs) + 0.6 * groups),
     )

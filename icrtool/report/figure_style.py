@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -26,6 +27,7 @@ RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
     "axes.titlesize": 9.0,
+    "axes.titley": 1.0,
     "axes.labelsize": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -48,12 +50,12 @@ RC: dict[str, Any] = {
     "pdf.fonttype": 42,
 }
 
-METADATA: dict[str, dict[str, Any]] = {
-    "png": {"Software": "icrtool"},
-    "svg": {"Date": None, "Creator": "icrtool"},
-    "pdf": {"CreationDate": None, "Creator": "icrtool", "Producer": "icrtool"},
+SAVE: dict[str, dict[str, Any]] = {
+    "png": {"metadata": {"Software": "icrtool"}, "pil_kwargs": {"compress_level": 1}},
+    "svg": {"metadata": {"Date": None, "Creator": "icrtool"}},
+    "pdf": {"metadata": {"CreationDate": None, "Creator": "icrtool", "Producer": "icrtool"}},
 }
-"""Nothing that changes from run to run."""
+"""Keywords by format: nothing that changes from run to run; a PNG a tenth larger in a third of the time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,7 @@ def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
     """Write a figure as ``stem.format`` in each of `formats`; the bytes depend on the figure alone."""
     for form in formats:
         memory = BytesIO()
-        figure.savefig(memory, format=form, metadata=METADATA[form])
+        figure.savefig(memory, format=form, **SAVE[form])
         stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
 
 
@@ -133,6 +135,12 @@ class TimeAxis:
         if span_s <= 600:
             return cls("s", 1.0)
         return cls("min", 60.0) if span_s <= 4 * 3600 else cls("h", 3600.0)
+
+
+def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
+    """Fill the bins of a histogram from zero up; `Axes.stairs` measures every step of its outline and takes longer."""
+    filled = axes.fill_between(edges, np.append(heights, heights[-1:]), step="post", linewidth=0, **look)
+    filled.sticky_edges.y.append(0.0)
 
 
 def shade_spans(axes: Axes, spans: Floats, label: str = "") -> None:

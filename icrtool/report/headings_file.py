@@ -8,7 +8,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from icrtool.analysis.ladder_trials import MeasuredHeading
+from icrtool.analysis.measured_heading import MeasuredHeading
 from icrtool.tables import Ints
 
 HEADINGS_FILE = "headings.npz"

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.analysis.ladder import Ladder, Rung
+from icrtool.analysis.dropout_records import Rung
+from icrtool.analysis.ladder import Ladder
 from icrtool.analysis.ladder_fits import FEWEST_TO_CHOOSE
 from icrtool.analysis.window_models import CONSTANT
 from icrtool.report.words import FITTED, TABLE_WIDTH

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from icrtool.analysis.driven_run import RUN_SCHEMA
-from icrtool.analysis.ladder_trials import MeasuredHeading
-from icrtool.analysis.measured_heading import measured_headings
+from icrtool.analysis.measured_heading import MeasuredHeading, measured_headings
 from icrtool.errors import RunError
 from icrtool.report.drawing_process import Drawer, DrawingHere
 from icrtool.report.headings_file import HEADINGS_FILE, read_headings, write_headings

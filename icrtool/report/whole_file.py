@@ -29,3 +29,17 @@ def whole_file(file: Path) -> Iterator[Path]:
         # Where nothing can be written nothing can be removed either, and why has been told.
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def check_place(path: Path) -> None:
+    """Refuse a file whose directory is not there, before any work is done for it.
+
+    Raises
+    ------
+    OutputError
+        The directory is missing, or `path` is one itself.
+    """
+    if not path.absolute().parent.is_dir():
+        raise OutputError(path, "its directory does not exist", "make it first, or name another file")
+    if path.is_dir():
+        raise OutputError(path, "is a directory", "name a file")

@@ -15,7 +15,8 @@ from icrtool.analysis import dropout as module
 from icrtool.analysis.driven_run import drive_of
 from icrtool.analysis.dropout import Model, configured_horizons_m, dropout, load_kernels, models_of
 from icrtool.analysis.fit import FilterRun
-from icrtool.core.open_loop import FrozenIcrs, open_loop_errors_direct, trial_ends
+from icrtool.core.open_loop import open_loop_errors_direct, trial_ends
+from icrtool.core.trials import FrozenIcrs
 from icrtool.errors import ConfigError, DataError
 
 EQUAL_M = 1e-9

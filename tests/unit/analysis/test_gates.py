@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.analysis.dropout import DropoutReport, dropout
+from icrtool.analysis.dropout import dropout
+from icrtool.analysis.dropout_records import DropoutReport
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.gates import budget_distances, judge_gate, parse_gate
 from icrtool.errors import ConfigError

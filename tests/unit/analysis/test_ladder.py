@@ -12,12 +12,12 @@ import pytest
 from icrtool.analysis.fit import FilterRun, fit
 from icrtool.analysis.ladder import count_blocks, judge_ladder
 from icrtool.analysis.ladder_fits import clear_of
-from icrtool.analysis.ladder_trials import Along, MeasuredHeading, cut_trials, predict
-from icrtool.analysis.measured_heading import measured_headings
+from icrtool.analysis.ladder_trials import Along, cut_trials, predict
+from icrtool.analysis.measured_heading import MeasuredHeading, measured_headings
 from icrtool.analysis.window_fit import cut_windows
 from icrtool.config import parse_config
-from icrtool.core.open_loop import FrozenIcrs
 from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.core.trials import FrozenIcrs
 from icrtool.errors import DataError
 
 sys.path.insert(0, str(Path(__file__).parent))

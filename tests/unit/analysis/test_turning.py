@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icrtool.analysis.turning import CELLS, STRAIGHT_RAD, heading_range
-from icrtool.core.open_loop import Drive
+from icrtool.core.trials import Drive
 
 HORIZON_M, STEP_M = 5.0, 0.6
 

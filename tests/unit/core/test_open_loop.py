@@ -7,18 +7,9 @@ import numpy as np
 import pytest
 
 from icrtool.core import open_loop, open_loop_fast
-from icrtool.core.open_loop import (
-    GAP,
-    OUTAGE,
-    SHORT,
-    Drive,
-    FrozenIcrs,
-    count_trials,
-    open_loop_errors_direct,
-    open_loop_path,
-    trial_ends,
-)
+from icrtool.core.open_loop import GAP, OUTAGE, SHORT, count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
+from icrtool.core.trials import Drive, FrozenIcrs
 
 EQUAL_M = 1e-9  # what the fast algorithm promises against the direct integration
 ROUNDING = 1e-12  # two orders of the same few hundred additions of metres and radians

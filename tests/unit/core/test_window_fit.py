@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from icrtool.core import window_fit
-from icrtool.core.open_loop import Drive, open_loop_path
+from icrtool.core.open_loop import open_loop_path
+from icrtool.core.trials import Drive
 from icrtool.core.window_fit import NEUTRAL, PARAMETERS, Motion, displace, march, move, rates
 
 ROUNDING_M = 1e-10

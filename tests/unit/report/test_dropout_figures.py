@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,13 +14,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from icrtool.analysis.blind_paths import example_drives, worst_drives
-from icrtool.analysis.dropout import DropoutReport, dropout, models_of
+from icrtool.analysis.dropout import dropout, models_of
+from icrtool.analysis.dropout_records import DropoutReport, Outage
 from icrtool.analysis.fit import FilterRun
 from icrtool.analysis.forced_outages import force_outages, plan_outages
-from icrtool.analysis.outages import Outage, real_outages
+from icrtool.analysis.outages import real_outages
+from icrtool.report import dropout_drawing as pictures
 from icrtool.report.drawing_process import DrawingProcess
-from icrtool.report.dropout_drawing import HISTOGRAM_MODELS, draw_histograms, draw_paths
-from icrtool.report.dropout_drawing import draw_summary as order_summary
 from icrtool.report.figure_dropout import draw_histogram, draw_summary
 from icrtool.report.figure_dropout_paths import draw_examples, draw_outages, draw_worst
 from icrtool.report.figure_style import style
@@ -118,7 +119,7 @@ def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(repo
 
 
 def test_a_histogram_needs_no_other_models_than_it_says(run: FilterRun) -> None:
-    models = [model for model in models_of(run) if model.name in HISTOGRAM_MODELS]
+    models = [model for model in models_of(run) if model.name in pictures.HISTOGRAM_MODELS]
     assert len(drawn(lambda: draw_histogram("barn", dropout(run, [5.0], models=models), 5.0)).axes) == 2
 
 
@@ -134,16 +135,35 @@ def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Filter
         assert "no slip" not in " ".join(texts_of(drawn(draw)))
 
 
+def test_histograms_are_drawn_once_and_as_soon_as_their_models_are_done(run: FilterRun) -> None:
+    drawn: list[tuple[str, int]] = []
+
+    def draw(_: object, name: str, title: str, report: DropoutReport, horizon_m: float) -> None:
+        drawn.append((name, len(report.results)))
+
+    models = models_of(run)
+    watch = pictures.watch_for_histograms(draw, "barn", [model.name for model in models])
+    report = dropout(run, [5.0, 10.0], models=models, watch=watch)
+    assert len(report.results) == 3
+    assert drawn == [("histogram_05m", 2), ("histogram_10m", 2)]
+
+
+def test_drawing_needs_no_compiled_code() -> None:
+    code = "import sys, icrtool.report.dropout_drawing as d; d.load_figures(); sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="forks from a process with threads, as pytest's is, only there")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_the_second_process_draws_what_there_is(
     run: FilterRun, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
-    drives = (example_drives(run, 15.0), worst_drives(run))
     with DrawingProcess(("png", "svg")) as process, process.into(tmp_path / "plots") as draw:
-        draw_paths(draw, "barn", run.table, drives, outages)
-        draw_histograms(draw, "barn", report)
-        order_summary(draw, "barn", report, outages)
+        pictures.draw_examples(draw, "barn", example_drives(run, 15.0))
+        pictures.draw_worst(draw, "barn", worst_drives(run))
+        pictures.draw_outages(draw, "barn", run.table, outages)
+        pictures.draw_histograms(draw, "barn", report)
+        pictures.draw_summary(draw, "barn", report, outages)
     names = {path.stem for path in (tmp_path / "plots").iterdir()}
     assert names == {"summary", "histogram_05m", "histogram_10m", "examples_15m", "worst", "outages"}
     assert len(list((tmp_path / "plots").iterdir())) == 2 * len(names)
@@ -155,7 +175,7 @@ def test_what_goes_wrong_in_the_second_process_is_raised_here(report: DropoutRep
 
     def draw_all() -> None:
         with DrawingProcess(("png",)) as process, process.into(tmp_path / "plots") as draw:
-            draw_histograms(draw, "barn", report)
+            pictures.draw_histograms(draw, "barn", report)
 
     with pytest.raises(OSError, match="histogram_05m"):
         draw_all()
@@ -163,5 +183,5 @@ def test_what_goes_wrong_in_the_second_process_is_raised_here(report: DropoutRep
 
 def test_without_formats_nothing_is_started_or_drawn(report: DropoutReport, tmp_path: Path) -> None:
     with DrawingProcess(()) as process, process.into(tmp_path / "plots") as draw:
-        draw_histograms(draw, "barn", report)
+        pictures.draw_histograms(draw, "barn", report)
     assert list(tmp_path.iterdir()) == []

@@ -16,8 +16,9 @@ from icrtool.analysis.gates import BudgetDistance, budget_distances, judge_gate,
 from icrtool.analysis.outages import real_outages
 from icrtool.errors import OutputError, RunError
 from icrtool.report.dropout_content import DropoutContent, p95_at, shown_horizons, title_of
-from icrtool.report.dropout_exports import check_parent, format_markdown, write_junit, write_markdown
+from icrtool.report.dropout_exports import format_markdown, write_junit, write_markdown
 from icrtool.report.dropout_table import budget_lines, format_dropout
+from icrtool.report.whole_file import check_place
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
 GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001")
@@ -157,8 +158,8 @@ def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutCont
     with pytest.raises(OutputError, match="cannot be written"):
         write_junit(tmp_path / "missing" / "j.xml", [("barn", content)])
     with pytest.raises(OutputError, match="does not exist"):
-        check_parent(tmp_path / "missing" / "j.xml")
+        check_place(tmp_path / "missing" / "j.xml")
     with pytest.raises(OutputError, match="is a directory"):
-        check_parent(tmp_path)
-    check_parent(tmp_path / "new.xml")
+        check_place(tmp_path)
+    check_place(tmp_path / "new.xml")
     assert [path.name for path in tmp_path.iterdir()] == ["j.xml"]
