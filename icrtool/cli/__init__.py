@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
-import threading
+
+from icrtool.cli.interrupts import INTERRUPTED, end_in_order
 
 __all__ = ["main"]
-
-INTERRUPTED, TERMINATED = 130, 143
-"""What a shell says of a program that Ctrl-C or a kill ended: 128 and the number of the signal."""
 
 
 def main() -> None:
@@ -22,9 +19,7 @@ def main() -> None:
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)
-    if threading.current_thread() is threading.main_thread():
-        # Killed by a timeout or at a shutdown, a command still removes what is half written.
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    end_in_order(main.__code__)
     try:
         from icrtool.cli.standard_streams import standard_streams
 

@@ -93,8 +93,8 @@ class DrawingProcess:
 
     def __enter__(self) -> Self:
         try:
-            # An interrupt between two steps of this would leave a process that nobody ends.
-            with _interrupts_held():
+            # A signal between two steps of this would leave a process that nobody ends.
+            with _signals_held():
                 self._start()
         except BaseException:
             self._stop(at_once=True)
@@ -154,12 +154,12 @@ class DrawingProcess:
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Have Ctrl-C wait for the end of the block, where that can be."""
+def _signals_held() -> Iterator[None]:
+    """Have Ctrl-C, a kill and an alarm wait for the end of the block, where that can be."""
     if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGALRM})
     try:
         yield
     finally:
@@ -170,6 +170,9 @@ def _begin() -> None:
     """Leave an interrupt to the parent, and what matplotlib says of an unwritable home directory unsaid."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        # Held by the parent while it forked.
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_end_with_parent, daemon=True).start()
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 

@@ -1,0 +1,71 @@
+"""Ctrl-C and a kill in the middle of an import, where an exception could leave the import's lock held."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a signal cannot come again later there")
+
+LOADING = """
+import os, signal, sys, time
+for _ in range(int(os.environ["TIMES"])):
+    os.kill(os.getpid(), int(os.environ["SIGNAL"]))
+    time.sleep(0.03)
+print("loaded")
+"""
+
+COMMAND = """
+import signal, sys, time
+from icrtool.cli.interrupts import end_in_order
+
+def command():
+    import loading
+    time.sleep(10)
+
+end_in_order(command.__code__)
+try:
+    command()
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def load(folder: Path, number: int, times: int = 1, before: str = "") -> tuple[int, list[str]]:
+    """Load a module that gets a signal; return the exit status and what was said."""
+    (folder / "loading.py").write_text(LOADING)
+    path = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path, "SIGNAL": str(int(number)), "TIMES": str(times)}
+    code = before + COMMAND
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert not done.stderr
+    return done.returncode, done.stdout.split()
+
+
+def test_ctrl_c_waits_for_the_import(tmp_path: Path) -> None:
+    assert load(tmp_path, signal.SIGINT) == (0, ["loaded", "interrupted"])
+
+
+def test_a_kill_waits_for_the_import(tmp_path: Path) -> None:
+    assert load(tmp_path, signal.SIGTERM) == (143, ["loaded"])
+
+
+def test_a_second_ctrl_c_does_not_wait(tmp_path: Path) -> None:
+    assert load(tmp_path, signal.SIGINT, times=2) == (0, ["interrupted"])
+
+
+def test_an_import_further_out_is_no_matter(tmp_path: Path) -> None:
+    (tmp_path / "outer.py").write_text(COMMAND.replace("import loading", "import os; os.kill(os.getpid(), 2)"))
+    assert load(tmp_path, signal.SIGINT, times=0, before="import outer; raise SystemExit\n") == (0, ["interrupted"])
+
+
+def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
+    before = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import time; time.sleep = lambda s: None\n"
+    assert load(tmp_path, signal.SIGINT, before=before) == (0, ["loaded"])
