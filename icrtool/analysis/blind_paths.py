@@ -64,7 +64,7 @@ def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tupl
 
 def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
     """Return the start with the median error of a group, or of evenly spaced ones where it is large."""
-    sample = group[:: 1 + len(group) // TYPICAL_OF]
+    sample = group[:: -(-len(group) // TYPICAL_OF)]
     tried = np.full((len(ends), 1), SHORT)
     tried[sample, 0] = ends[sample]
     errors = open_loop_errors_direct(drive, model.icrs, tried)[sample, 0]

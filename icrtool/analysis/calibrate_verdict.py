@@ -13,7 +13,7 @@ from icrtool.analysis.calibrate_evidence import DriveFacts
 from icrtool.analysis.usable_streams import check_streams
 from icrtool.analysis.wheel_check import check_wheels
 from icrtool.config import Config
-from icrtool.tables import Floats, RobotLog
+from icrtool.tables import RobotLog
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
 
@@ -296,8 +296,3 @@ def _settings(findings: tuple[Finding, ...], config: Config) -> tuple[Setting, .
         times = 1.0 if given == "auto" else given
         add(f"wheels.{side}_scale", by_key[f"{side}_scale"], neutral=1.0, least=0.005, times=times)
     return tuple(settings)
-
-
-def icrs_of(calibration: Calibration) -> Floats:
-    """Return y_icr_right, y_icr_left, x_icr [m], NaN where they are not separable."""
-    return np.array([calibration.finding(key).value for key in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")])

@@ -66,8 +66,8 @@ def drive_of(run: DrivenRun) -> Drive:
 
 
 def toy_drive() -> Drive:
-    """Return a drive of a dozen states straight on, to load compiled kernels with."""
-    way = np.arange(12.0)
+    """Return a drive of twenty states straight on, to load compiled kernels with."""
+    way = np.arange(20.0)
     no = np.zeros(len(way), np.bool_)
     return Drive(np.ones_like(way), np.ones_like(way), np.ones_like(way), way, 0 * way, 0 * way, way, no, no.copy())
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.analysis.driven_run import DrivenRun, drive_of, toy_drive
-from icrtool.analysis.dropout_records import DropoutReport, ModelResult
-from icrtool.core.open_loop import count_trials, open_loop_path, trial_ends
+from icrtool.analysis.dropout_records import DEFAULT_SEED, DropoutReport, ModelResult
+from icrtool.core.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.core.open_loop_fast import open_loop_errors
 from icrtool.core.statistics import (
     Blocks,
@@ -27,9 +27,6 @@ from icrtool.core.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCoun
 from icrtool.core.window_fit import NEUTRAL, move, window_misses
 from icrtool.errors import ConfigError, DataError
 from icrtool.tables import Floats
-
-DEFAULT_SEED = 20140311
-"""Seed of the bootstrap: any number, but the same for every run and every model."""
 
 BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
@@ -47,6 +44,9 @@ STANDING_MPS = 0.01
 BULK_IN_P95 = 3.0
 MOST_BULKS = 10.0
 """A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
+
+SHORTEST_HORIZON_M = 1e-3
+"""Less than what a state is known to."""
 
 STARTS_A_CALL = 1 << 14
 """Starts tried by a thread at a time."""
@@ -96,6 +96,8 @@ def dropout(
         The run has fewer than two states.
     ConfigError
         A horizon that is no distance.
+    ValueError
+        Two models of one name.
 
     Notes
     -----
@@ -112,6 +114,8 @@ def dropout(
     groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
+    if len(parts) < len(models):
+        raise ValueError("two models have the same name")
 
     def done() -> DropoutReport:
         return DropoutReport(
@@ -157,8 +161,8 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
     if not len(horizons):
         raise ConfigError("horizons", "none is given", "name at least one distance in metres")
     for horizon in horizons:
-        if not (math.isfinite(horizon) and horizon > 0):
-            raise ConfigError("horizons", f"{horizon:g} m is not a distance", "give positive metres")
+        if not (math.isfinite(horizon) and horizon >= SHORTEST_HORIZON_M):
+            raise ConfigError("horizons", f"{horizon:g} m is no way", f"give {SHORTEST_HORIZON_M:g} m or more")
     return horizons
 
 
@@ -166,8 +170,10 @@ def load_kernels() -> None:
     """Have the compiled kernels ready: a toy drive, to be called while a run is still being read."""
     drive = toy_drive()
     way = drive.distance
-    icrs, horizon = FrozenIcrs.constant(1.0, -1.0, 0.0), np.array([1.0])
-    errors = open_loop_errors(drive, icrs, trial_ends(drive, horizon))
+    icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
+    ends = trial_ends(drive, np.array([1.0]))
+    open_loop_errors_direct(drive, icrs, ends)
+    errors = open_loop_errors(drive, icrs, ends)
     bootstrap_intervals(errors, [cut_blocks(way < way[-1], way, 0.5)], DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
     motion = move(

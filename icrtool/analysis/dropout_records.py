@@ -1,6 +1,6 @@
 """What a dropout analysis finds: the records that tables, files and pictures show.
 
-Nothing is computed here: a process that only draws them need not load numba.
+No kernel is here: a process that only draws them need not load numba.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 OutageKind = Literal["forced", "real"]
+
+DEFAULT_SEED = 20140311
+"""Seed of the bootstrap: any number, but the same for every run and every model."""
 
 CHOICE_HORIZON_M = 10.0
 """Where extended models are chosen, and where the ladder of models is pictured."""

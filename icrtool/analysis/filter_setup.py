@@ -162,7 +162,9 @@ def set_up_filter(
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     correlation_s = max(config.filter.heading_correlation_s, heading_correlation_at_least_s)
-    parameters = _parameters(config, data, antenna_m(log, config), process_position_mps, correlation_s)
+    # Of the whole stream: what an outage takes away must not change how the rest is weighed.
+    alike = _samples_that_err_alike(_seconds(log.heading.stamp_ns, epoch), correlation_s)
+    parameters = _parameters(config, data, antenna_m(log, config), process_position_mps, alike)
     x0, P0 = _start_state(data, t0, config, parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
@@ -303,7 +305,7 @@ def _parameters(
     data: Measurements,
     antenna: tuple[float, float],
     process_position_mps: float | None,
-    heading_correlation_s: float,
+    headings_alike: float,
 ) -> FilterParameters:
     settings = config.filter
     paper = settings.preset == "paper"
@@ -318,7 +320,7 @@ def _parameters(
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
-        heading_correlation=1.0 if paper else _samples_that_err_alike(data.heading_t, heading_correlation_s),
+        heading_correlation=1.0 if paper else headings_alike,
         antenna_forward=0.0 if paper else antenna[0],
         antenna_right=0.0 if paper else antenna[1],
         wheel_gap_s=math.inf if paper else wheel_gap_s(config, data.wheel_t),

@@ -13,6 +13,7 @@ from icrtool.analysis.filter_setup import set_up_filter
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.ekf import run_filter
 from icrtool.errors import ConfigError, DataError
+from icrtool.tables import Bools, Floats
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""
@@ -33,7 +34,8 @@ def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) ->
     Raises
     ------
     ConfigError
-        An outage that does not fit into the drive, or into the time between two others.
+        An outage that does not fit into the drive, or into the time between two others, or lies in one that the log
+        has itself.
     """
     last = float(run.table.t_s[-1])
     if not length_s > 0:
@@ -51,6 +53,13 @@ def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) ->
                 f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s",
                 "the filter must learn between two outages: place them further apart",
             )
+    for begin in begins:
+        if _in_real_outage(run, np.array([begin]), length_s).any():
+            raise ConfigError(
+                "outage",
+                f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own",
+                "there is no estimate to hold it against: choose another time",
+            )
     origin = int(run.table.stamp_ns[0])
     return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
 
@@ -60,6 +69,8 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
 
     Raises
     ------
+    ConfigError
+        A span holds fewer than two states of the disturbed run.
     DataError
         The run cannot be made again.
     """
@@ -87,26 +98,44 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     outages = []
     for begin, end in spans_ns:
         inside = slice(*np.searchsorted(stamps, [begin, end]))
-        if len(stamps[inside]) > 1:
-            outages.append(
-                Outage(
-                    kind="forced",
-                    begin_s=(begin - origin) / 1e9,
-                    end_s=(end - origin) / 1e9,
-                    distance_m=float(np.ptp(distance[inside])),
-                    end_error_m=float(away[inside][-1]),
-                    max_error_m=float(away[inside].max()),
-                    north_m=north[inside],
-                    east_m=east[inside],
-                )
+        if len(stamps[inside]) < 2:
+            raise ConfigError(
+                "outage",
+                f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states",
+                "the filter must have begun, and the outage last longer than a wheel sample",
             )
+        outages.append(
+            Outage(
+                kind="forced",
+                begin_s=(begin - origin) / 1e9,
+                end_s=(end - origin) / 1e9,
+                distance_m=float(np.ptp(distance[inside])),
+                end_error_m=float(away[inside][-1]),
+                max_error_m=float(away[inside].max()),
+                north_m=north[inside],
+                east_m=east[inside],
+            )
+        )
     return tuple(outages)
 
 
+def _in_real_outage(run: FilterRun, begin_s: Floats, length_s: float) -> Bools:
+    """Say which outages of a length, by their begins (k,) [s], share time with one that the log has itself."""
+    origin = int(run.table.stamp_ns[0])
+    shared = np.zeros(len(begin_s), np.bool_)
+    for begin, end in (run.outages_ns - origin) / 1e9:
+        shared |= (begin_s < end) & (begin_s + length_s > begin)
+    return shared
+
+
 def _spaced(run: FilterRun, length_s: float) -> list[float]:
-    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn."""
+    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
+
+    Time from which an outage would reach into one of the log's own is none to begin in.
+    """
     t, last = run.table.t_s, float(run.table.t_s[-1])
     moves = np.diff(run.table.distance_m) >= STANDING_MPS * np.diff(t)
+    moves &= ~_in_real_outage(run, t[:-1], length_s)
     moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
     settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
     before = float(np.interp(min(settled, last / 4), t, moved))

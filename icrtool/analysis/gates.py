@@ -31,6 +31,7 @@ class BudgetDistance(NamedTuple):
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : the budget still held at `distance_m`, the last horizon with trials
+    between_m : horizons interpolated between
     """
 
     model: str
@@ -38,6 +39,7 @@ class BudgetDistance(NamedTuple):
     budget_m: float
     distance_m: float
     beyond: bool
+    between_m: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,14 +131,17 @@ def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
     return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m))
 
 
-def _budget_distance(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool] | None:
+def _budget_distance(
+    horizons_m: Floats, p95_m: Floats, budget_m: float
+) -> tuple[float, bool, tuple[float, float]] | None:
     told = np.isfinite(p95_m)
     if not told.any():
         return None
     distance, p95 = np.concatenate([[0.0], horizons_m[told]]), np.concatenate([[0.0], p95_m[told]])
     over = np.flatnonzero(p95 > budget_m)
     if not len(over):
-        return float(distance[-1]), True
+        return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))
     i = int(over[0])
     share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
-    return float(distance[i - 1] + share * (distance[i] - distance[i - 1])), False
+    low, high = float(distance[i - 1]), float(distance[i])
+    return low + float(share) * (high - low), False, (low, high)

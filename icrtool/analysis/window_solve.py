@@ -41,7 +41,7 @@ class Solution(NamedTuple):
     ----------
     terms : (k,), in the model's order
     parameters : (8,), as `WindowFit` has them
-    misses : (2 w,) of all windows, (2 w, 8) `slopes` of them by the parameters, there
+    misses : (2 w,) of all windows, there; `slopes` (2 w, 8) of them by the parameters, one short step before
     weight : (2 w,) of the robust loss, over the scale; 0 for windows left out
     held : (k,) square roots of the prior's information
     scale : robust standard deviation of a miss [m per root metre]

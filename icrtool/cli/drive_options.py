@@ -1,4 +1,4 @@
-"""Options that describe a drive and its sensors, as `icrtool simulate` and `icrtool study` take them."""
+"""What tells a drive and its sensors on a command line: paths, readers of values, and --change."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def change_text(text: str) -> tuple[float, tuple[float, ...]]:
 
 def span_text(text: str) -> tuple[float, ...]:
     """Read ``BEGIN:END``."""
-    span = numbers(text.replace(":", ",", 1), "BEGIN:END", 2)
+    span = numbers(text.replace(":", ",", 1) if ":" in text else "", "BEGIN:END", 2)
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")
     return span

@@ -48,7 +48,7 @@ class Request:
     budgets_m: tuple[float, ...]
     gates: tuple[Gate, ...]
     trials: bool
-    seed: int | None
+    seed: int
     formats: tuple[str, ...]
     ladder: bool
     smoothed: bool
@@ -57,7 +57,7 @@ class Request:
 
 
 @click.command("dropout-report", epilog=EPILOG_GATE)
-@click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @click.option(
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
 )
@@ -104,21 +104,23 @@ def command(
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
+    from icrtool.analysis.dropout_records import DEFAULT_SEED
     from icrtool.analysis.gates import parse_gate
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         gates=tuple(parse_gate(text) for text in gates), trials=trials,
-        seed=seed, formats=formats, ladder=ladder, smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
+        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
+        smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, output, config, (junit, markdown))
-    with drawing_process(formats, fits=bool(places)) as drawer:
+    with picture_process(formats, fits=bool(places)) as drawer:
         outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
     leave(outcomes, junit=junit, markdown=markdown)
 
 
-def drawing_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
-    """Return a process for the pictures; it starts before the analysis is loaded, which drawing does not need."""
+def picture_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
+    """Return a process for the pictures; unless logs are to be fitted it starts before the analysis is loaded."""
     from icrtool.report.drawing_process import DrawingProcess
     from icrtool.report.dropout_drawing import load_figures
 
@@ -217,6 +219,10 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
 
         click.echo(format_dropout(content))
         click.echo(f"\nwritten to {directory / 'dropout'}")
+    else:
+        for verdict in content.verdicts:
+            if not verdict.passed:
+                click.echo(verdict.line(), err=True)
     if request.verbose:
         from icrtool.analysis.dropout import BOOTSTRAP_RESAMPLES
         from icrtool.core.open_loop_fast import TOLERANCE_M
@@ -267,7 +273,7 @@ def _analyse(
 ) -> DropoutContent:
     """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
     from icrtool.analysis.blind_paths import example_drives, worst_drives
-    from icrtool.analysis.dropout import DEFAULT_SEED, dropout, models_of
+    from icrtool.analysis.dropout import dropout, models_of
     from icrtool.analysis.gates import budget_distances, judge_gate
     from icrtool.analysis.outages import real_outages
     from icrtool.analysis.turning import split_by_turning
@@ -289,10 +295,9 @@ def _analyse(
         dropout_drawing.draw_worst(draw, title, worst := worst_drives(run))
         dropout_drawing.draw_outages(draw, title, run.table, outages)
         horizons = _horizons(run, request)
-        seed = request.seed if request.seed is not None else DEFAULT_SEED
         models = models_of(run)
         watch = dropout_drawing.watch_for_histograms(draw, title, [model.name for model in models])
-        report = dropout(run, horizons, models=models, seed=seed, sink=sink, watch=watch)
+        report = dropout(run, horizons, models=models, seed=request.seed, sink=sink, watch=watch)
         dropout_drawing.draw_summary(draw, title, report, outages)
         ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
         if ladder is not None:

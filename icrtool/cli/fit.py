@@ -127,6 +127,7 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR, or ``DIR/NAME`` for several."""
     from icrtool.errors import OutputError
     from icrtool.logio.read_log import log_name
+    from icrtool.report.run_directory import RUN_FILE
 
     names = [log_name(log) for log in logs]
     if len(set(names)) < len(names):
@@ -138,6 +139,8 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
         )
     if output is not None and len(logs) == 1:
         return [output]
+    if output is not None and (output / RUN_FILE).is_file():
+        raise OutputError(output, "is a run itself", "runs in it would go when it is fitted again: name another place")
     return [(output or RUNS) / name for name in names]
 
 

@@ -22,7 +22,9 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
-LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+# Whether one can be read is told where it is read, in our words and with our exit status.
+LOG = click.Path(path_type=Path, readable=False)
+LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
 def configuration(command: Command) -> Command:

@@ -136,10 +136,8 @@ def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
     if trials[-1] - trials[0] + 1 == len(trials):
         rows = slice(int(trials[0]), int(trials[-1]) + 1)  # the usual case, and a slice copies nothing
     path, count = path_m[rows], len(trials)
-    edges = np.arange(path[0], path[-1] + block_m, block_m / BLOCK_PARTS)
-    first = np.searchsorted(path, edges)
-    # what lies beyond the path, and segments without a trial, begin where another one does
-    first = first[np.diff(first, append=count) > 0]
+    segment = np.floor((path - path[0]) * (BLOCK_PARTS / block_m))
+    first = np.flatnonzero(np.diff(segment, prepend=-1.0))
     if len(first) < MIN_BLOCKS * BLOCK_PARTS:
         return None
     wanted = max(MIN_KEPT_TRIALS, TRIALS_PER_BLOCK * (len(first) // BLOCK_PARTS))
@@ -217,19 +215,14 @@ def round_bin_width(largest_m: float, bins: int = 50) -> float:
     return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
 
 
-def histogram(errors_m: Floats, bin_width_m: float) -> Histogram:
+def histogram_sorted(ordered: Floats, bin_width_m: float) -> Histogram:
     """Count the trials of one horizon in bins of `bin_width_m` from zero to the largest error (Figs. 28-30).
 
     Parameters
     ----------
-    errors_m : (n,) [m], NaN where there was no trial
+    ordered : of `sort_trials` [m]
     bin_width_m : [m], see `round_bin_width`
     """
-    return histogram_sorted(sort_trials(errors_m), bin_width_m)
-
-
-def histogram_sorted(ordered: Floats, bin_width_m: float) -> Histogram:
-    """Count trials as `histogram` does; `ordered` is the result of `sort_trials`."""
     if not len(ordered):
         return Histogram(*np.empty((3, 0)))
     edges = bin_width_m * np.arange(int(ordered[-1] / bin_width_m) + 3, dtype=np.float64)

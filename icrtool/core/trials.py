@@ -93,7 +93,7 @@ class Summary(NamedTuple):
 class Intervals(NamedTuple):
     """Confidence intervals of the expected error and of p95, per horizon; float64 (n_horizons,) [m] each.
 
-    NaN where the path with trials is shorter than `MIN_BLOCKS` horizons.
+    NaN where the path with trials is shorter than `icrtool.core.statistics.MIN_BLOCKS` horizons.
     """
 
     expected_low: Floats

@@ -215,12 +215,19 @@ def _metres_per_unit(
         name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
         if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
             return value, f" in {name}{per} (by the position reference)", []
+    if scale is None and unit == "unknown":
+        raise ConfigError(
+            "wheels.quantity",
+            f"{motion.topic} names no unit, and the log has no straight driving to find it from",
+            "drive straight for some metres; where they are ticks, give --set wheels.quantity=counts",
+        )
     lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
     if scale is None:
         raise ConfigError(
             lacking,
-            f"needed to read {motion.topic}, which is {'of unknown unit' if unit == 'unknown' else f'in {unit}'}",
+            f"needed to read {motion.topic}, which is in {unit}",
             f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
         )
     how = f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
-    return scale.value, how, [f"{lacking} is not given{how}"]
+    why = "no unit that the robot's keys know fits" if radius and counts else f"{lacking} is not given"
+    return scale.value, how, [f"{why}{how}"]

@@ -8,7 +8,7 @@ from icrtool.analysis.calibrate_verdict import Calibration
 from icrtool.errors import OutputError
 from icrtool.report.drawing_process import matplotlib_unsaid
 from icrtool.report.run_directory import PLOT_FORMATS
-from icrtool.report.whole_file import whole_file
+from icrtool.report.whole_file import check_place, whole_file
 
 
 def check_picture(file: Path) -> None:
@@ -21,10 +21,7 @@ def check_picture(file: Path) -> None:
     """
     if file.suffix.removeprefix(".").lower() not in PLOT_FORMATS:
         raise OutputError(file, "its suffix is no format of a picture", f"end it in .{', .'.join(PLOT_FORMATS)}")
-    if not file.absolute().parent.is_dir():
-        raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    if file.is_dir():
-        raise OutputError(file, "is a folder", "name a file")
+    check_place(file)
 
 
 def write_picture(calibration: Calibration, file: Path) -> None:

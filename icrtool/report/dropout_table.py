@@ -22,6 +22,9 @@ CELL = 18
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
 
+NEAR_HORIZONS_M = 1.5
+"""Between horizons that are further apart an interpolated distance is said to be one."""
+
 
 def format_dropout(content: DropoutContent) -> str:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
@@ -81,7 +84,12 @@ def ratio_text(numerator: float, denominator: float) -> str:
 
 
 def _reach_text(one: BudgetDistance) -> str:
-    return f"more than {one.distance_m:g} m" if one.beyond else f"{one.distance_m:.1f} m"
+    if one.beyond:
+        return f"more than {one.distance_m:g} m"
+    low, high = one.between_m
+    # The error grows faster than the way: on a straight line between far horizons the distance comes out too long.
+    far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
+    return f"{one.distance_m:.1f} m{far}"
 
 
 def _error_lines(report: DropoutReport) -> list[str]:

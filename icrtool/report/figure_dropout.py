@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.6, 2.15
+WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.6, 2.3
 
 PENS = {"icr": ICR, "no_slip": NO_SLIP}
 MARKERS = {"icr": "o", "no_slip": "s"}
@@ -47,7 +47,7 @@ def draw_summary(title: str, report: DropoutReport, outages: Sequence[Outage] = 
         height_in=SUMMARY_HEIGHT_IN,
     )
     panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
-    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.05), wspace=0.2)
+    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.05), wspace=0.28)
     for axes, shown in zip(panels, (("no_slip", "icr"), ("icr",)), strict=False):
         if (final := report.result("icr_final")) is not None:
             for values, dash in ((final.summary.p95, "-"), (final.summary.expected, DASH)):
@@ -61,7 +61,7 @@ def draw_summary(title: str, report: DropoutReport, outages: Sequence[Outage] = 
         axes.set_ylim(bottom=0)
         axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
         axes.set_xlabel("Way driven blind [m]")
-    panels[0].set_ylabel("Error [m]")
+        axes.set_ylabel("Error [m]")
     keys = _summary_keys(report, real=bool(_shown_outages(report, outages)))
     figure.legend(handles=keys, loc="lower center", ncols=4, columnspacing=1.6, handlelength=2.4)
     return figure
@@ -79,10 +79,10 @@ def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figur
     )
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
     margins = inches(figure, left=0.7, right=0.2, top=0.85, bottom=0.9)
-    figure.subplots_adjust(**margins, hspace=0.42)
+    figure.subplots_adjust(**margins, hspace=0.6)
     for axes, result in zip(panels, results, strict=True):
         _draw_bins(axes, result, h)
-    panels[-1].set_xlabel("Error [m]")
+        axes.set_xlabel("Error [m]")
     keys = [Line2D([], [], label="95 % of the trials", **P95.keywords())]
     keys.append(Line2D([], [], label="expected value", **MEAN.keywords()))
     figure.legend(handles=keys, loc="lower center", ncols=2, columnspacing=3.0)

@@ -53,14 +53,14 @@ def draw_examples(title: str, examples: Sequence[BlindDrive]) -> Figure:
         height_in=EXAMPLES_HEIGHT_IN,
     )
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
-    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=1.0, bottom=0.9), wspace=0.28)
+    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=1.0, bottom=0.9), wspace=0.34)
     for axes, drive in zip(panels, examples, strict=True):
         _draw_drive(axes, drive, box=(3.0, 2.75))
         facts = f"from {drive.t_s:.1f} s, turned {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s"
         errors = ",  ".join(f"{LABELS[name]} {length_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
-    panels[0].set_ylabel("North of start [m]")
+        axes.set_ylabel("North of start [m]")
     _add_keys(figure, examples)
     return figure
 

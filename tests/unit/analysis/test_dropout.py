@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,7 +15,7 @@ import pytest
 import icrtool
 from icrtool.analysis import dropout as module
 from icrtool.analysis.driven_run import drive_of
-from icrtool.analysis.dropout import Model, configured_horizons_m, dropout, load_kernels, models_of
+from icrtool.analysis.dropout import Model, configured_horizons_m, dropout, models_of
 from icrtool.analysis.fit import FilterRun
 from icrtool.core.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.core.trials import FrozenIcrs
@@ -208,5 +210,18 @@ def test_standing_states_are_counted(make_run: Callable[..., FilterRun]) -> None
     assert dropout(parked, [1.0]).standing == len(parked.table) - 1
 
 
-def test_kernels_load_on_a_toy_drive() -> None:
-    load_kernels()
+def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
+    code = (
+        "from icrtool.analysis.dropout import load_kernels; load_kernels()\n"
+        "from icrtool.core import open_loop, open_loop_fast as fast, statistics, window_fit\n"
+        "kernels = [open_loop.find_trial_ends, open_loop.integrate_trials, open_loop.integrate_path, fast.last_end,\n"
+        "    fast.plan_block, fast.solve_block, statistics.resample_blocks, window_fit.march, window_fit.fill_misses]\n"
+        "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_two_models_of_one_name_are_refused(run: FilterRun) -> None:
+    model = models_of(run)[0]
+    with pytest.raises(ValueError, match="same name"):
+        dropout(run, [1.0], models=[model, model])

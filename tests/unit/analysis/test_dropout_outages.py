@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -50,6 +50,35 @@ def test_no_spaced_outage_begins_where_the_robot_stands(clean: FilterRun) -> Non
     for begin, end in spans:
         assert not 20 < begin < 39.9
         assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.1
+
+
+def test_no_outage_reaches_into_one_of_the_logs_own(run: FilterRun) -> None:
+    origin = int(run.table.stamp_ns[0])
+    ((own_begin, own_end),) = [((a - origin) / 1e9, (b - origin) / 1e9) for a, b in run.outages_ns.tolist()]
+    spans = seconds(run, plan_outages(run, 2.0))
+    assert len(spans) > 3
+    assert all(end <= own_begin + 0.03 or begin >= own_end - 0.03 for begin, end in spans)
+    with pytest.raises(ConfigError, match="of the log's own"):
+        plan_outages(run, 2.0, (own_begin - 1.0,))
+
+
+def test_an_outage_that_takes_nothing_away_is_refused(clean: FilterRun) -> None:
+    for length, begin in ((5.0, 0.0), (1e-6, 20.0)):
+        with pytest.raises(ConfigError, match="fewer than two states"):
+            force_outages(clean, plan_outages(clean, length, (begin,)))
+
+
+def test_outages_do_not_change_how_headings_at_odd_times_are_weighed(make_run: Callable[..., FilterRun]) -> None:
+    log = make_run(troubles=False).log
+    # A little more than half of the headings come at a third of the rate: without some of them the median interval
+    # would be that of the others.
+    rows = np.arange(len(log.heading.stamp_ns))
+    kept = (rows < len(rows) * 0.24) | (rows % 3 == 0)
+    columns = {field.name: getattr(log.heading, field.name) for field in fields(log.heading)}
+    thinned = {name: column[kept] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    heading = replace(log.heading, **thinned)
+    run = fit(replace(log, heading=heading))
+    assert force_outages(run, plan_outages(run, 15.0, (40.0,)))
 
 
 def test_outages_stand_where_they_are_asked_for(clean: FilterRun) -> None:
@@ -105,10 +134,6 @@ def test_an_outage_is_never_better_than_none_and_none_costs_nothing(clean: Filte
     assert 0 <= short.max_error_m < 0.03 < long.max_error_m
     for outage in (short, long):
         assert outage.end_error_m <= outage.max_error_m
-
-
-def test_an_outage_from_the_very_first_state_delays_the_start_and_is_told(clean: FilterRun) -> None:
-    assert len(force_outages(clean, plan_outages(clean, 5.0, (0.0,)))) <= 1
 
 
 def test_a_warm_started_run_is_made_again_from_its_own_start(clean: FilterRun) -> None:

@@ -11,8 +11,9 @@ from icrtool.core.statistics import (
     bootstrap_interval,
     bootstrap_intervals,
     cut_blocks,
-    histogram,
+    histogram_sorted,
     round_bin_width,
+    sort_trials,
     summarise,
 )
 
@@ -147,13 +148,13 @@ class TestBootstrap:
 class TestHistogram:
     def test_is_percent_of_the_trials_per_bin(self):
         errors = np.array([0.0, 0.05, 0.1, 0.25, np.nan, 0.31])
-        bins = histogram(errors, 0.1)
+        bins = histogram_sorted(sort_trials(errors), 0.1)
         np.testing.assert_allclose(bins.left, [0.0, 0.1, 0.2, 0.3])
         np.testing.assert_allclose(bins.right, [0.1, 0.2, 0.3, 0.4])
         np.testing.assert_allclose(bins.percent, [40.0, 20.0, 20.0, 20.0])
 
     def test_of_no_trial_is_empty(self):
-        assert len(histogram(np.array([np.nan]), 0.1).percent) == 0
+        assert len(histogram_sorted(sort_trials(np.array([np.nan])), 0.1).percent) == 0
 
     @pytest.mark.parametrize(
         ("largest", "width"), [(0.0, 0.01), (math.nan, 0.01), (0.5, 0.01), (0.51, 0.02), (12.0, 0.5), (49.0, 1.0)]
@@ -163,6 +164,6 @@ class TestHistogram:
 
     def test_expected_error_is_the_mean_of_the_histogram_as_bins_narrow(self):
         errors = np.random.default_rng(0).exponential(size=5000)
-        bins = histogram(errors, 0.001)
+        bins = histogram_sorted(sort_trials(errors), 0.001)
         middle = 0.5 * (bins.left + bins.right)
         assert np.sum(middle * bins.percent) / 100.0 == pytest.approx(errors.mean(), abs=0.0005)

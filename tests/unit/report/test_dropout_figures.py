@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from icrtool.analysis import dropout as dropout_analysis
 from icrtool.analysis.blind_paths import example_drives, worst_drives
 from icrtool.analysis.dropout import dropout, models_of
 from icrtool.analysis.dropout_records import DropoutReport, Outage
@@ -135,7 +136,11 @@ def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Filter
         assert "no slip" not in " ".join(texts_of(drawn(draw)))
 
 
-def test_histograms_are_drawn_once_and_as_soon_as_their_models_are_done(run: FilterRun) -> None:
+@pytest.mark.parametrize("table_bytes", [1, 1 << 30])
+def test_histograms_are_drawn_once_and_as_soon_as_their_models_are_done(
+    run: FilterRun, monkeypatch: pytest.MonkeyPatch, table_bytes: int
+) -> None:
+    monkeypatch.setattr(dropout_analysis, "LARGEST_TABLE_BYTES", table_bytes)
     drawn: list[tuple[str, int]] = []
 
     def draw(_: object, name: str, title: str, report: DropoutReport, horizon_m: float) -> None:
@@ -149,7 +154,18 @@ def test_histograms_are_drawn_once_and_as_soon_as_their_models_are_done(run: Fil
 
 
 def test_drawing_needs_no_compiled_code() -> None:
-    code = "import sys, icrtool.report.dropout_drawing as d; d.load_figures(); sys.exit('numba' in sys.modules)"
+    # What dropout-report loads before it starts the process that draws, and what that process loads.
+    before = [
+        "cli.dropout_report",
+        "analysis.gates",
+        "report.dropout_source",
+        "report.whole_file",
+        "report.drawing_process",
+    ]
+    loads = "; ".join(f"import icrtool.{module}" for module in before)
+    code = (
+        f"import sys, icrtool.report.dropout_drawing as d; {loads}; d.load_figures(); sys.exit('numba' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -95,12 +95,12 @@ def test_verdicts_are_lines_of_the_table(content: DropoutContent) -> None:
 
 def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
     budgets = [
-        BudgetDistance("icr", "ICR, momentary", 0.5, 7.34, beyond=False),
-        BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False),
-        BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True),
+        BudgetDistance("icr", "ICR, momentary", 0.5, 7.34, beyond=False, between_m=(7.0, 8.0)),
+        BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
+        BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True, between_m=(20.0, 20.0)),
     ]
     assert budget_lines(budgets) == [
-        "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m",
+        "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m (interpolated between 1 and 20 m)",
         "stays within 9 m (95 %) for more than 20 m",
     ]
 
