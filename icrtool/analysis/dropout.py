@@ -111,6 +111,7 @@ def dropout(
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
     models = models if models is not None else models_of(run)
+    standing = int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1]))
     groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
@@ -124,7 +125,7 @@ def dropout(
             results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
             counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
             states=len(run.table),
-            standing=int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1])),
+            standing=standing,
             seed=seed,
         )
 

@@ -53,8 +53,8 @@ def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) ->
                 f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s",
                 "the filter must learn between two outages: place them further apart",
             )
-    for begin in begins:
-        if _in_real_outage(run, np.array([begin]), length_s).any():
+    for begin, lost in zip(begins, _in_real_outage(run, np.array(begins), length_s), strict=True):
+        if lost:
             raise ConfigError(
                 "outage",
                 f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own",

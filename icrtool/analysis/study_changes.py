@@ -14,6 +14,7 @@ from icrtool.analysis.study import Finding, StudyRequest, StudyResult, statistic
 from icrtool.analysis.study_measures import ICR_NAMES, inverted, measure_times, trace
 from icrtool.analysis.study_runs import Chunk, Progress
 from icrtool.analysis.study_sweeps import Level, base_scenario, run_levels, spread
+from icrtool.errors import ConfigError
 from icrtool.tables import Floats
 
 CHANGE_TIMES_S = (175.0, 350.0)
@@ -40,6 +41,9 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
     if not plan.changes:
         icrs = tuple((time, changed(plan.icrs_m, number + 1)) for number, time in enumerate(CHANGE_TIMES_S))
         plan = replace(plan, changes=tuple(change for change in icrs if change[0] < plan.duration_s))
+        if not plan.changes:
+            why = f"{plan.duration_s:g} s end before the first change, at {CHANGE_TIMES_S[0]:g} s"
+            raise ConfigError("duration", why, "drive longer, or say when with --change")
     request = replace(request, plan=plan)
     levels = [
         Level(preset, name, replace(base_scenario(request, preset), inflate=inflate))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import click
 
@@ -54,6 +55,14 @@ def gnss_text(text: str) -> float:
     if metres < 0:
         raise click.BadParameter(f"{text!r} is a negative noise")
     return metres
+
+
+def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) -> None:
+    """Refuse a change of the ICRs that a drive is too short for."""
+    late = next((time for time, _ in changes if time >= duration_s), None)
+    if late is not None:
+        why = f"no change at {late:g} s: the drive lasts {duration_s:g} s"
+        raise click.BadParameter(why, param_hint="--change")
 
 
 CHANGE = click.option(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import CHANGE, PATHS, gnss_text, icrs_text, place_text, span_text
+from icrtool.cli.drive_options import CHANGE, PATHS, check_changes, gnss_text, icrs_text, place_text, span_text
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
@@ -266,10 +266,7 @@ def _plan(config: Config, given: dict[str, Any]) -> Drive:
         path = read_speeds(given["speeds"])
         duration = duration if duration is not None else float(path.t_s[-1])
     duration = duration if duration is not None else 100.0
-    late = next((time for time, _ in given["changes"] if time >= duration), None)
-    if late is not None:
-        why = f"no change at {late:g} s: the drive lasts {duration:g} s"
-        raise click.BadParameter(why, param_hint="--change")
+    check_changes(given["changes"], duration)
     rate = given["wheel_rate"] or COMMAND_RATE_HZ
     return Drive(
         icrs_m=given["icrs"] or default_icrs(config),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import CHANGE, PATHS, gnss_text, icrs_text, numbers
+from icrtool.cli.drive_options import CHANGE, PATHS, check_changes, gnss_text, icrs_text, numbers
 from icrtool.cli.fit import RUNS, plot_formats
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 from icrtool.cli.simulate import default_icrs, encoder_counts
@@ -154,6 +154,7 @@ def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyReq
     if given["icrs"] is not None or config.robot.track_width_m is not None:
         plan = replace(plan, icrs_m=given["icrs"] or default_icrs(config))
     plan = replace(plan, **_given({"duration_s": given["duration"], "changes": given["changes"] or None}))
+    check_changes(plan.changes, plan.duration_s)
     changed: dict[str, Any] = {"plan": plan, "sensors": _sensors(request.sensors, config, given)}
     if given["kind"] is not None and request.paths:
         changed["paths"] = (given["kind"],)

@@ -182,6 +182,13 @@ def test_a_change_after_the_end_and_a_time_that_is_none_are_wrong_usage(icrtool)
     status, _, err = icrtool("simulate", "-o", "a.mcap", "--duration", "20", "--change", "40:1,-1,0")
     assert status == 2
     assert "--change: no change at 40 s: the drive lasts 20 s" in err
+    short = ("study", "icr-change", "--duration", "100", "--runs", "1")
+    status, _, err = icrtool(*short, "--change", "175:1,-1,0")
+    assert status == 2
+    assert "--change: no change at 175 s: the drive lasts 100 s" in err
+    status, _, err = icrtool(*short)
+    assert status == 1
+    assert err.startswith("Error: duration: 100 s end before the first change, at 175 s; drive longer")
     status, _, err = icrtool("fit", "a.mcap", "--terrain-change", "soon")
     assert status == 2
     assert "'soon' is neither; give seconds or auto" in err
