@@ -68,8 +68,8 @@ def ingest(logs: dict[str, Path], repeats: int) -> None:
 def filter_speed(logs: dict[str, Path], repeats: int) -> None:
     """Run the filter alone on one core."""
     import icrtool
-    from icrtool.analysis.filter_setup import set_up_filter
-    from icrtool.core.ekf import run_filter
+    from icrtool.estimation.filter_setup import set_up_filter
+    from icrtool.kernels.ekf import run_filter
 
     config = icrtool.load_config(robot="segway-rmp400")
     setup = set_up_filter(icrtool.read_log(logs["hour.mcap"], config), config)

@@ -6,7 +6,7 @@ Frames and signs
     World: local plane, north and east [m] about a datum, z down. Body: x forward, y right, z down.
     Heading psi [rad] is clockwise from north. A faster *left* side turns the robot clockwise.
     Track ICRs are body coordinates [m]: ``y_icr_right > 0 > y_icr_left`` and ``x_icr`` (both tracks share it).
-    ROS logs are ENU/FLU (REP-103); they are converted once, in ``icrtool.logio``, where a message becomes columns.
+    ROS logs are ENU/FLU (REP-103); they are converted once, in ``icrtool.logs``, where a message becomes columns.
 Units
     SI and radians inside. At every boundary (column, option, configuration key) the unit is the suffix of the name:
     ``_s _ns _m _mps _rad _radps _deg _pct``.
@@ -28,13 +28,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from icrtool.analysis.dropout import dropout
-    from icrtool.analysis.dropout_records import DropoutReport
-    from icrtool.analysis.fit import FilterRun, fit
     from icrtool.config import Config, load_config
+    from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
-    from icrtool.logio import read_log
-    from icrtool.tables import RobotLog
+    from icrtool.estimation.fit import FilterRun, fit
+    from icrtool.logs import read_log
+    from icrtool.records.dropout import DropoutReport
+    from icrtool.records.tables import RobotLog
 
 __version__ = "0.1.0"
 
@@ -53,14 +53,14 @@ __all__ = [
 
 _HOMES = {
     "Config": "icrtool.config",
-    "DropoutReport": "icrtool.analysis.dropout_records",
-    "FilterRun": "icrtool.analysis.fit",
+    "DropoutReport": "icrtool.records.dropout",
+    "FilterRun": "icrtool.estimation.fit",
     "IcrToolError": "icrtool.errors",
-    "RobotLog": "icrtool.tables",
-    "dropout": "icrtool.analysis.dropout",
-    "fit": "icrtool.analysis.fit",
+    "RobotLog": "icrtool.records.tables",
+    "dropout": "icrtool.dropout_analysis.trials",
+    "fit": "icrtool.estimation.fit",
     "load_config": "icrtool.config",
-    "read_log": "icrtool.logio",
+    "read_log": "icrtool.logs",
 }
 
 

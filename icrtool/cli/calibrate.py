@@ -11,7 +11,7 @@ from icrtool.cli import options
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.tables import RobotLog
+    from icrtool.records.tables import RobotLog
 
 
 @click.command("calibrate")
@@ -41,8 +41,8 @@ def command(
       icrtool calibrate field.mcap --robot husky-a200
       icrtool calibrate icrtool-runs/field -o calibration.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.report.calibration_picture import check_picture, write_picture
-    from icrtool.report.calibration_table import calibration_file, format_calibration, write_calibration
+    from icrtool.output.figures.calibration_picture import check_picture, write_picture
+    from icrtool.output.tables.calibration import calibration_file, format_calibration, write_calibration
 
     config = options.load(config_file, robot, sets)
     if output is not None:
@@ -50,7 +50,7 @@ def command(
     if plot is not None:
         check_picture(plot)
     log, config = _read(source, config, quiet=quiet)
-    from icrtool.analysis.calibrate_verdict import calibrate
+    from icrtool.calibration.findings import calibrate
 
     found = calibrate(log, config, x_icr_m=x_icr)
     options.warn(log.warnings, quiet=quiet)
@@ -71,13 +71,13 @@ def command(
 
 def _read(source: Path, config: Config, *, quiet: bool) -> tuple[RobotLog, Config]:
     """Read a log, or the log of a run with the run's configuration."""
-    from icrtool.logio import read_log
-    from icrtool.report.run_directory import is_run_directory
+    from icrtool.logs import read_log
+    from icrtool.output.run_directory import is_run_directory
 
     path = source
     if is_run_directory(source):
         from icrtool.errors import ConfigError
-        from icrtool.report.dropout_source import log_of, read_source, stored_config
+        from icrtool.output.run_source import log_of, read_source, stored_config
 
         if config.given_sections:
             section = min(config.given_sections)

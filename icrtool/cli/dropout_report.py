@@ -16,17 +16,17 @@ from icrtool.cli.fit import RUNS, plot_formats, run_directories
 from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
-    from icrtool.analysis.driven_run import DrivenRun
-    from icrtool.analysis.dropout import ErrorSink
-    from icrtool.analysis.dropout_records import Outage
-    from icrtool.analysis.fit import FilterRun
-    from icrtool.analysis.gates import Gate
     from icrtool.config import Config
-    from icrtool.report.drawing_process import DrawingProcess
-    from icrtool.report.dropout_content import DropoutContent
-    from icrtool.report.dropout_exports import Outcome
-    from icrtool.report.run_directory import StoredRun
-    from icrtool.tables import Ints
+    from icrtool.dropout_analysis.acceptance_limits import Gate
+    from icrtool.dropout_analysis.trials import ErrorSink
+    from icrtool.estimation.fit import FilterRun
+    from icrtool.output.dropout_content import DropoutContent
+    from icrtool.output.exports.acceptance import Outcome
+    from icrtool.output.figures.drawing_process import DrawingProcess
+    from icrtool.output.run_directory import StoredRun
+    from icrtool.records.dropout import Outage
+    from icrtool.records.run import DrivenRun
+    from icrtool.records.tables import Ints
 
 EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
 
@@ -104,8 +104,8 @@ def command(
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    from icrtool.analysis.dropout_records import DEFAULT_SEED
-    from icrtool.analysis.gates import parse_gate
+    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.records.dropout import DEFAULT_SEED
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
@@ -121,8 +121,8 @@ def command(
 
 def picture_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
     """Return a process for the pictures; unless logs are to be fitted it starts before the analysis is loaded."""
-    from icrtool.report.drawing_process import DrawingProcess
-    from icrtool.report.dropout_drawing import load_figures
+    from icrtool.output.figures.drawing_process import DrawingProcess
+    from icrtool.output.figures.dropout_figures import load_figures
 
     return options.drawing_process(formats) if fits else DrawingProcess(formats, load_figures)
 
@@ -146,9 +146,9 @@ def plan_sources(
 
     Whatever can be refused at once is refused here, before any work.
     """
-    from icrtool.report.dropout_source import newest_run
-    from icrtool.report.run_directory import RUN_FILE
-    from icrtool.report.whole_file import check_place
+    from icrtool.output.atomic_file import check_place
+    from icrtool.output.run_directory import RUN_FILE
+    from icrtool.output.run_source import newest_run
 
     for export in exports:
         if export is not None:
@@ -179,7 +179,7 @@ def report_all(
 def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdown: Path | None) -> None:
     """Write the exports, and leave with the status that the outcomes ask for."""
     from icrtool.errors import IcrToolError
-    from icrtool.report.dropout_exports import write_junit, write_markdown
+    from icrtool.output.exports.acceptance import write_junit, write_markdown
 
     if junit is not None:
         write_junit(junit, outcomes)
@@ -215,7 +215,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
         run, directory = _fit(source, place, request, drawer), place
     content = _analyse(run, directory, request, drawer)
     if not request.quiet:
-        from icrtool.report.dropout_table import format_dropout
+        from icrtool.output.tables.dropout import format_dropout
 
         click.echo(format_dropout(content))
         click.echo(f"\nwritten to {directory / 'dropout'}")
@@ -224,8 +224,8 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
             if not verdict.passed:
                 click.echo(verdict.line(), err=True)
     if request.verbose:
-        from icrtool.analysis.dropout import BOOTSTRAP_RESAMPLES
-        from icrtool.core.open_loop_fast import TOLERANCE_M
+        from icrtool.dropout_analysis.trials import BOOTSTRAP_RESAMPLES
+        from icrtool.kernels.open_loop_fast import TOLERANCE_M
 
         blocks = "moving blocks as long as the horizon"
         click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {content.report.seed}", err=True)
@@ -237,11 +237,11 @@ def _read(directory: Path) -> StoredRun:
     """Read a run; what the analysis needs is loaded beside it."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from icrtool.report.dropout_source import read_source
+    from icrtool.output.run_source import read_source
 
     with ThreadPoolExecutor(1) as pool:
         reading = pool.submit(read_source, directory)
-        from icrtool.analysis.dropout import load_kernels
+        from icrtool.dropout_analysis.trials import load_kernels
 
         load_kernels()
         return reading.result()
@@ -249,15 +249,15 @@ def _read(directory: Path) -> StoredRun:
 
 def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> FilterRun:
     """Fit a log and write its run directory, as `icrtool fit` does."""
-    from icrtool.report.run_directory import check_target, write_run
+    from icrtool.output.run_directory import check_target, write_run
 
     check_target(directory)
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
-        from icrtool.logio import read_log
+        from icrtool.logs import read_log
 
         measured = read_log(log, request.config, progress)
-    from icrtool.analysis.fit import fit
-    from icrtool.analysis.smooth import smooth
+    from icrtool.estimation.fit import fit
+    from icrtool.estimation.smooth import smooth
 
     run = fit(measured, request.config)
     write_run(run, directory, smoothed=smooth(run) if request.smoothed else None, drawer=drawer)
@@ -272,16 +272,16 @@ def _analyse(
     filtered: StoredRun | FilterRun, directory: Path, request: Request, drawer: DrawingProcess
 ) -> DropoutContent:
     """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
-    from icrtool.analysis.blind_paths import example_drives, worst_drives
-    from icrtool.analysis.dropout import dropout, models_of
-    from icrtool.analysis.gates import budget_distances, judge_gate
-    from icrtool.analysis.outages import real_outages
-    from icrtool.analysis.turning import split_by_turning
-    from icrtool.report import dropout_drawing
-    from icrtool.report.dropout_content import DropoutContent, title_of
-    from icrtool.report.dropout_directory import dropout_directory, write_content
-    from icrtool.report.dropout_ladder import ladder_of
-    from icrtool.report.dropout_source import judged_run
+    from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate
+    from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
+    from icrtool.dropout_analysis.real_outages import real_outages
+    from icrtool.dropout_analysis.straight_and_turning import split_by_turning
+    from icrtool.dropout_analysis.trials import dropout, models_of
+    from icrtool.output.dropout_content import DropoutContent, title_of
+    from icrtool.output.dropout_directory import dropout_directory, write_content
+    from icrtool.output.dropout_ladder import ladder_of
+    from icrtool.output.figures import dropout_figures as dropout_drawing
+    from icrtool.output.run_source import judged_run
 
     run = judged_run(filtered, directory) if request.smoothed else filtered
     title = title_of(run)
@@ -322,7 +322,7 @@ def _analyse(
 
 def _horizons(run: DrivenRun, request: Request) -> list[float]:
     """Return the horizons asked for: by option, else configured; and those that gates name."""
-    from icrtool.analysis.dropout import configured_horizons_m
+    from icrtool.dropout_analysis.trials import configured_horizons_m
 
     config = request.config
     configured = config.dropout.horizons_m if "dropout.horizons_m" in config.given else configured_horizons_m(run)
@@ -343,8 +343,8 @@ def _forced_outages(run: StoredRun | FilterRun, request: Request) -> tuple[Outag
         raise click.UsageError("--outage-at says when, and needs --outage to say how long")
     if not lengths:
         return ()
-    from icrtool.analysis.forced_outages import force_outages, plan_outages
-    from icrtool.report.run_directory import StoredRun
+    from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
+    from icrtool.output.run_directory import StoredRun
 
     filtered = _fit_again(run, quiet=request.quiet) if isinstance(run, StoredRun) else run
     plans = [plan_outages(filtered, length, request.outage_at_s) for length in lengths]
@@ -353,9 +353,9 @@ def _forced_outages(run: StoredRun | FilterRun, request: Request) -> tuple[Outag
 
 def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
     """Filter a stored run's log once more, for what the run directory does not hold: the measurements."""
-    from icrtool.analysis.fit import fit
-    from icrtool.logio import read_log
-    from icrtool.report.dropout_source import (
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+    from icrtool.output.run_source import (
         check_same_log,
         check_same_states,
         log_of,
@@ -379,7 +379,7 @@ def _trials_sink(directory: Path, stamp_ns: Ints, *, wanted: bool) -> Iterator[E
     if not wanted:
         yield None
         return
-    from icrtool.report.dropout_trials import trials_file
+    from icrtool.output.trials_file import trials_file
 
     with trials_file(directory / "trials.parquet", stamp_ns) as sink:
         yield sink

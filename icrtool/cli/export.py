@@ -10,7 +10,7 @@ import click
 from icrtool.cli.fit import RUNS
 
 if TYPE_CHECKING:
-    from icrtool.report.export import Target
+    from icrtool.output.exports.controllers import Target
 
 TARGETS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json")
 
@@ -29,9 +29,9 @@ def command(run: Path | None, target: str) -> None:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for json > calibration.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.analysis.calibrate_export import export_numbers
-    from icrtool.report.dropout_source import newest_run, read_source
-    from icrtool.report.export import format_export
+    from icrtool.calibration.controller_numbers import export_numbers
+    from icrtool.output.exports.controllers import format_export
+    from icrtool.output.run_source import newest_run, read_source
 
     stored = read_source(run if run is not None else newest_run(RUNS))
     click.echo(format_export(export_numbers(stored), cast("Target", target)))

@@ -11,9 +11,9 @@ import click
 from icrtool.cli import options
 
 if TYPE_CHECKING:
-    from icrtool.analysis.filter_setup import WarmStart
     from icrtool.config import Config
-    from icrtool.report.drawing_process import DrawingProcess
+    from icrtool.estimation.filter_setup import WarmStart
+    from icrtool.output.figures.drawing_process import DrawingProcess
 
 RUNS = Path("icrtool-runs")
 AUTO = "auto"
@@ -126,8 +126,8 @@ def plot_formats(text: str) -> tuple[str, ...]:
 def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR, or ``DIR/NAME`` for several."""
     from icrtool.errors import OutputError
-    from icrtool.logio.read_log import log_name
-    from icrtool.report.run_directory import RUN_FILE
+    from icrtool.logs.read_log import log_name
+    from icrtool.output.run_directory import RUN_FILE
 
     names = [log_name(log) for log in logs]
     if len(set(names)) < len(names):
@@ -162,17 +162,17 @@ def _beside(request: FitRequest) -> str:
 
 
 def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> None:
-    from icrtool.report.run_directory import check_target, log_of_run, read_warm_start, write_run
+    from icrtool.output.run_directory import check_target, log_of_run, read_warm_start, write_run
 
     check_target(directory)
     before = log_of_run(directory)
     start = read_warm_start(request.warm_start) if request.warm_start is not None else None
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
-        from icrtool.logio import read_log
+        from icrtool.logs import read_log
 
-        options.load_ahead("pymap3d", "icrtool.analysis.fit")
+        options.load_ahead("pymap3d", "icrtool.estimation.fit")
         measured = read_log(log, request.config, progress)
-    from icrtool.analysis.fit import fit
+    from icrtool.estimation.fit import fit
 
     run = fit(
         measured,
@@ -183,7 +183,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     )
     smoothed = None
     if request.smooths:
-        from icrtool.analysis.smooth import smooth
+        from icrtool.estimation.smooth import smooth
 
         smoothed = smooth(run)
     write_run(run, directory, states=request.states, smoothed=smoothed, drawer=drawer)
@@ -191,7 +191,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
     options.warn((*run.warnings, *_other_robot(request, start), *note), quiet=request.quiet)
     if not request.quiet:
-        from icrtool.report.run_table import format_run
+        from icrtool.output.tables.run import format_run
 
         click.echo(format_run(run))
         click.echo(f"\nwritten to {directory}{_beside(request)}")

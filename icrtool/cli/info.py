@@ -10,9 +10,9 @@ import click
 from icrtool.cli import options
 
 if TYPE_CHECKING:
-    from icrtool.analysis.fit import FilterRun
     from icrtool.config import Config
-    from icrtool.tables import RobotLog
+    from icrtool.estimation.fit import FilterRun
+    from icrtool.records.tables import RobotLog
 
 
 @click.command("info")
@@ -51,8 +51,8 @@ def command(
 def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
     """Print what a log holds; say whether it can be fitted."""
     from icrtool.errors import IcrToolError
-    from icrtool.logio import assemble, survey_log
-    from icrtool.logio.describe import describe_survey
+    from icrtool.logs import assemble, survey_log
+    from icrtool.logs.describe import describe_survey
 
     with options.progress_bar(f"reading {log.name}", quiet=quiet) as progress:
         survey = survey_log(log, config, progress)
@@ -65,7 +65,7 @@ def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
     if not quiet:
         click.echo(describe_survey(survey, measured, everything=verbose))
         if run is not None:
-            from icrtool.report.run_table import excitation_lines
+            from icrtool.output.tables.run import excitation_lines
 
             click.echo("\n".join(excitation_lines(run)))
     found = run if run is not None else measured
@@ -77,6 +77,6 @@ def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
 
 def _try(measured: RobotLog, config: Config) -> FilterRun:
     """Fit the log: what the drive could show, and what contradicts what, only the filter tells."""
-    from icrtool.analysis.fit import fit
+    from icrtool.estimation.fit import fit
 
     return fit(measured, config)

@@ -15,7 +15,7 @@ import click
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
-    from icrtool.report.drawing_process import DrawingProcess
+    from icrtool.output.figures.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -73,13 +73,13 @@ def not_all_used(failed: int, of: int, what: str) -> IcrToolError:
 
 def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
     """Return a process for the figures of logs to be fitted; where it is forked, it has what is loaded here first."""
-    from icrtool.report.drawing_process import DrawingProcess
+    from icrtool.output.figures.drawing_process import DrawingProcess
 
     if not formats:
         return DrawingProcess(())
-    importlib.import_module("icrtool.analysis.fit")
-    importlib.import_module("icrtool.logio.read_log")
-    from icrtool.report.run_directory import load_figures
+    importlib.import_module("icrtool.estimation.fit")
+    importlib.import_module("icrtool.logs.read_log")
+    from icrtool.output.run_directory import load_figures
 
     return DrawingProcess(formats, load_figures)
 

@@ -13,10 +13,10 @@ from icrtool.cli.drive_options import CHANGE, PATHS, check_changes, gnss_text, i
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
-    from icrtool.analysis.simulate import Drive, Icrs, Sensors
-    from icrtool.analysis.simulate_record import TruthTable
     from icrtool.config import Config
-    from icrtool.logio.write_log import WriteOptions
+    from icrtool.logs.writing.log import WriteOptions
+    from icrtool.simulation.drives import Drive, Icrs, Sensors
+    from icrtool.simulation.record import TruthTable
 
 WHEEL_MESSAGES = ("joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped")
 DEFAULT_ROBOT = "pentzer-tracked"
@@ -215,9 +215,9 @@ def command(
     config = simulated_robot(config_file, robot, sets)
     plan, sensors = _plan(config, given), _sensors(config, given)
     writing = _write_options(log, config, sensors, given)
-    from icrtool.analysis.simulate_record import simulate
-    from icrtool.logio.write_log import SensorColumns, write_log
-    from icrtool.report.truth_csv import log_and_truth, truth_path, write_truth
+    from icrtool.logs.writing.log import SensorColumns, write_log
+    from icrtool.output.truth_file import log_and_truth, truth_path, write_truth
+    from icrtool.simulation.record import simulate
 
     with log_and_truth(log, force=given["force"]) as (fresh_log, fresh_truth):
         recorded, truth = simulate(plan, sensors, given["seed"])
@@ -255,13 +255,13 @@ def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> f
 
 
 def _plan(config: Config, given: dict[str, Any]) -> Drive:
-    from icrtool.analysis.paths import PathPlan
-    from icrtool.analysis.simulate import Drive
+    from icrtool.simulation.drives import Drive
+    from icrtool.simulation.paths import PathPlan
 
     path: Any = PathPlan(given["kind"], given["speed"], given["radius"], given["leg"])
     duration = given["duration"]
     if given["speeds"] is not None:
-        from icrtool.report.truth_csv import read_speeds
+        from icrtool.output.truth_file import read_speeds
 
         path = read_speeds(given["speeds"])
         duration = duration if duration is not None else float(path.t_s[-1])
@@ -280,7 +280,7 @@ def _plan(config: Config, given: dict[str, Any]) -> Drive:
 
 
 def _sensors(config: Config, given: dict[str, Any]) -> Sensors:
-    from icrtool.analysis.simulate import Sensors
+    from icrtool.simulation.drives import Sensors
 
     default_rate = COMMAND_RATE_HZ if given["wheels"] == "commanded" else ENCODER_RATE_HZ
     return Sensors(
@@ -311,7 +311,7 @@ def encoder_counts(config: Config, given: dict[str, Any]) -> float:
 
 def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str, Any]) -> WriteOptions:
     from icrtool.errors import ConfigError
-    from icrtool.logio.write_log import WriteOptions
+    from icrtool.logs.writing.log import WriteOptions
 
     if log.suffix not in ("", ".mcap", ".bag"):
         raise ConfigError(

@@ -16,9 +16,9 @@ from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 from icrtool.cli.simulate import default_icrs, encoder_counts
 
 if TYPE_CHECKING:
-    from icrtool.analysis.simulate import Sensors
-    from icrtool.analysis.study import StudyName, StudyRequest
     from icrtool.config import Config
+    from icrtool.simulation.drives import Sensors
+    from icrtool.simulation.studies import StudyName, StudyRequest
 
 STUDIES = (
     "convergence", "initial", "icr-change", "turn-radius", "input-noise", "input-bias", "input-source", "gnss", "rate",
@@ -119,14 +119,14 @@ def command(
     Example:
       icrtool study convergence --robot husky-a200 --wheels encoder --gnss waas
     """  # noqa: D301 - click reads the escape
-    from icrtool.report.study_directory import check_study_target, write_study
+    from icrtool.output.study_directory import check_study_target, write_study
 
     formats = plot_formats(plots)
     request = replace(_request(name, options.load(config_file, robot, sets), given), seed=seed)
     directory = output if output is not None else RUNS / f"study-{name}"
     check_study_target(directory)
-    from icrtool.analysis.study import run_study
-    from icrtool.report.study_table import format_study
+    from icrtool.output.tables.study import format_study
+    from icrtool.simulation.studies import run_study
 
     with options.progress_bar(f"study {name}", quiet=quiet) as progress:
         result = run_study(request, progress)
@@ -140,7 +140,7 @@ def command(
 
 def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyRequest:
     """Return the study's defaults with what the options say put in."""
-    from icrtool.analysis.study import KINDS, default_request
+    from icrtool.simulation.studies import KINDS, default_request
 
     own = VARIES.get(name)
     if own is not None and given[own] is not None:

@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
-from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
 ROBOT = ("--set", "robot.track_width_m=0.55", "--set", "robot.wheel_radius_m=0.165")

@@ -8,7 +8,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from icrtool.cli.export import TARGETS
-from icrtool.report import export
+from icrtool.output.exports import controllers as export
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
@@ -16,9 +16,9 @@ LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from icrtool.analysis.fit import fit
-    from icrtool.logio import read_log
-    from icrtool.report.run_directory import write_run
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+    from icrtool.output.run_directory import write_run
 
     config = __import__("icrtool").load_config(robot="segway-rmp400")
     folder = tmp_path_factory.mktemp("runs")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.analysis.fit import FilterRun
 from icrtool.errors import IcrToolError, LogError, MissingStreamError
+from icrtool.estimation.fit import FilterRun
 
 RUNS = {
     "simulated/wheeled_lawnmower": ("segway-rmp400", (0.74, -0.73, 0.02)),

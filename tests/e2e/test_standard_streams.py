@@ -41,7 +41,7 @@ def test_a_reader_that_has_enough_stops_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "a").is_file()
 
 
-@pytest.mark.parametrize("module", ["click", "icrtool.logio.read_log"])
+@pytest.mark.parametrize("module", ["click", "icrtool.logs.read_log"])
 def test_ctrl_c_while_modules_are_imported_is_one_line_and_status_130(tmp_path: Path, module: str) -> None:
     (tmp_path / "sitecustomize.py").write_text(
         "import os, signal, sys\n"

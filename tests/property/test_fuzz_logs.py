@@ -28,8 +28,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from icrtool.config import load_config
 from icrtool.errors import IcrToolError
-from icrtool.logio import assemble, survey_log
-from icrtool.logio.write_log import SensorColumns, WriteOptions, write_log
+from icrtool.logs import assemble, survey_log
+from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
 CONFIG = load_config(
@@ -331,7 +331,8 @@ READ_WITH_LITTLE_MEMORY = """
 import resource, sys
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logio import assemble, survey_log
+from icrtool.logs import assemble
+from icrtool.logs import survey_log
 
 def read(path):
     try:

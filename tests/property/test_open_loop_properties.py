@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icrtool.core import open_loop_fast
-from icrtool.core.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.core.open_loop_fast import open_loop_errors
-from icrtool.core.trials import Drive, FrozenIcrs
+from icrtool.kernels import open_loop_fast
+from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop_fast import open_loop_errors
+from icrtool.kernels.trials import Drive, FrozenIcrs
 
 EQUAL_M = 1e-9  # what the fast algorithm promises; moving the world by 1e5 m rounds positions to 1.5e-11 m
 HORIZONS = np.array([0.3, 1.0, 2.5, 6.0])

@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from icrtool.analysis.fit import FilterRun, fit
 from icrtool.cli.drive_options import PATHS
 from icrtool.cli.simulate import WHEEL_MESSAGES, command
 from icrtool.config import load_config
-from icrtool.logio import read_log
+from icrtool.estimation.fit import FilterRun, fit
+from icrtool.logs import read_log
 
 SIGMAS = 3.0
 ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icrtool.analysis.fit import FilterRun, fit
 from icrtool.config import Config, parse_config
-from icrtool.tables import (
+from icrtool.estimation.fit import FilterRun, fit
+from icrtool.records.tables import (
     Datum,
     HeadingSamples,
     InputFile,

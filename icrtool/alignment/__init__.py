@@ -1,0 +1,1 @@
+"""From a log as recorded to measurements that fit together: wheels, heading, delays, GNSS quality."""

@@ -1,0 +1,267 @@
+"""Judge the fixes: fixed, float or other by what they say and how they move; noise by class; jumps counted.
+
+A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
+tens of seconds: taken for independent they would pull the filter along. Some drivers go on claiming a centimetre.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from icrtool.alignment.gnss_steps import FixSteps, measure_steps
+from icrtool.alignment.heading_alignment import HeadingCheck
+from icrtool.alignment.misreported_fixes import find_sold
+from icrtool.alignment.reference_delay import delayed
+from icrtool.config import Config
+from icrtool.records.tables import (
+    FIXED_FIX,
+    FLOAT_FIX,
+    NOT_TOLD,
+    OTHER_FIX,
+    RTK_FIX,
+    Bools,
+    Bytes,
+    Floats,
+    Ints,
+    RobotLog,
+)
+
+LARGEST_SANE_GNSS_STD_M = 100.0
+"""A message that states more says nothing about its noise (1000 or 1e6 stand for "unknown")."""
+
+REFERENCE = 0
+CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED_FIX: "fixed"}
+"""Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and nothing is told apart."""
+
+FIXED_STD_M = 0.1
+"""What states more than this is no fixed solution; nmea_navsat_driver says 0.02 m times HDOP of one, 4 m of a float."""
+
+SURELY_FIXED_STD_M = 0.05
+"""... and what states less is one, where no status says anything."""
+
+NORM_SHARE = 0.5
+"""Where at least this share of the fixes is fixed, the others are RTK losses."""
+
+CLASS_STD_M = {OTHER_FIX: 1.0, FLOAT_FIX: 0.4}
+"""Least standard deviation of fixes that are not fixed, in a log where fixed is the norm."""
+
+CORRELATION_S = 10.0
+"""How long such a fix errs alike."""
+
+NOISIER = 1.5
+"""White noise from step to step that is this many times what the messages state is believed instead."""
+
+SHORTEST_LOSS_S = 2.0
+MOST_LISTED = 50
+
+
+@dataclass(frozen=True, slots=True)
+class FixQuality:
+    """What the fixes of a log are.
+
+    Attributes
+    ----------
+    log : with the variances that the fixes deserve; the given one in preset ``paper``
+    fix_class : uint8 (m,), keys of `CLASSES`
+    sold : bool (m,), fixes that claim to be fixed and are not
+    down_weighted : bool (m,), given a larger variance for their class
+    step_std_m : by class name, white noise from step to step [m]; NaN where too few steps tell
+    jump_stamp_ns : (j,) first fix after a jump; jump_m : (j,) its size
+    losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
+    """
+
+    log: RobotLog
+    fix_class: Bytes
+    sold: Bools
+    down_weighted: Bools
+    step_std_m: dict[str, float]
+    jump_stamp_ns: Ints
+    jump_m: Floats
+    losses_ns: Ints
+    warnings: tuple[str, ...]
+
+    def summary(self, used: Bools, rejected: Bools) -> dict[str, Any]:
+        """Return classes and jumps for run.json; `used` and `rejected` (m,) are what became of the fixes."""
+        gnss, classes = self.log.gnss, {}
+        std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+        for code, name in CLASSES.items():
+            rows = self.fix_class == code
+            if not rows.any():
+                continue
+            step, given = self.step_std_m[name], std[rows & np.isfinite(std)]
+            classes[name] = {
+                "fixes": int(np.count_nonzero(rows)),
+                "used": int(np.count_nonzero(rows & used)),
+                "rejected": int(np.count_nonzero(rows & rejected)),
+                "down_weighted": int(np.count_nonzero(rows & self.down_weighted)),
+                "sold_as_fixed": int(np.count_nonzero(rows & self.sold)),
+                "std_m": float(np.median(given)) if len(given) else None,
+                "step_std_m": step if math.isfinite(step) else None,
+            }
+        return {
+            "classes": classes,
+            "jumps": len(self.jump_m),
+            "jump_list": [
+                {"stamp_ns": int(stamp), "size_m": float(size)}
+                for stamp, size in list(zip(self.jump_stamp_ns, self.jump_m, strict=True))[:MOST_LISTED]
+            ],
+        }
+
+    def earlier(self, delay_s: float) -> FixQuality:
+        """Return the same of fixes that are taken `delay_s` earlier."""
+        shift = round(delay_s * 1e9)
+        return replace(
+            self,
+            log=delayed(self.log, delay_s),
+            jump_stamp_ns=self.jump_stamp_ns - shift,
+            losses_ns=self.losses_ns - shift,
+        )
+
+
+def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQuality:
+    """Tell the classes of the fixes apart, and give each the noise it deserves.
+
+    The order of evidence: what the message tells (status, flags, solution type), the variance it states, then how the
+    fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
+    other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
+    number of samples that err alike. Preset ``paper`` takes every fix as it is.
+    """
+    gnss, changes = log.gnss, config.filter.preset != "paper"
+    steps = measure_steps(log, mirrored=check.applied_mirror, offset_rad=check.applied_offset_rad)
+    stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    kinds, sold = _classes(log, stated, steps)
+    white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
+    fixed = kinds == FIXED_FIX
+    norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
+    variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
+    raised: list[str] = []
+    if changes:
+        variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
+    down = ~fixed & norm
+    variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
+    if raised or down.any():
+        gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
+    quality = FixQuality(
+        log=replace(log, gnss=gnss),
+        fix_class=kinds,
+        sold=sold,
+        down_weighted=down,
+        step_std_m=white,
+        jump_stamp_ns=gnss.stamp_ns[steps.jump_row],
+        jump_m=steps.jump_m,
+        losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
+        warnings=(),
+    )
+    notes = _notes(quality, stated, raised, changes=changes)
+    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
+
+
+def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
+    """Return the class of each fix (m,), and which claim to be fixed and are not (m,)."""
+    gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
+    if log.datum is None:
+        return np.full(len(stated), REFERENCE, np.uint8), none
+    told = _told(gnss.told_class, stated)
+    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
+    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
+    return np.where(sold, FLOAT_FIX, told).astype(np.uint8), sold
+
+
+def _told(told: Bytes | None, stated: Floats) -> Bytes:
+    """Return the class of each fix by what its message says: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
+    told = np.full(len(stated), NOT_TOLD, np.uint8) if told is None else told
+    rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
+    silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
+    kinds: Bytes = np.select([told == RTK_FIX, told == NOT_TOLD], [rtk, silent], told).astype(np.uint8)
+    return kinds
+
+
+def _at_least_white(
+    variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float
+) -> tuple[Floats, list[str]]:
+    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated.
+
+    Returns the variances, and the names of the classes that were raised.
+    """
+    raised, names = variance.copy(), []
+    for code, name in CLASSES.items():
+        rows, std = kinds == code, white.get(name, math.nan)
+        if not rows.any() or not math.isfinite(std):
+            continue
+        stated = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_std_m**2)
+        if std**2 > NOISIER**2 * float(np.median(stated)):
+            raised[rows] = np.maximum(stated, std**2)
+            names.append(name)
+    return raised, names
+
+
+def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
+    """Return variances (m, 2) of fixes that are not fixed: at least their class's, and shared by all that err alike."""
+    least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
+    interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
+    alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
+    own = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
+    # Beyond the largest sane value the filter would take a variance for unknown, and the fix for a good one.
+    grown: Floats = np.minimum(alike * own, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
+    return grown
+
+
+def _losses(stamps: Ints, fixed: Bools) -> Ints:
+    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough.
+
+    Others before the first and after the last fixed one make a span with the log's end.
+    """
+    rows = np.flatnonzero(fixed)
+    begin, end = rows[:-1], rows[1:]
+    lost = (end - begin > 1) & (stamps[end] - stamps[begin] > SHORTEST_LOSS_S * 1e9)
+    spans = [(int(stamps[i]), int(stamps[k])) for i, k in zip(begin[lost], end[lost], strict=True)]
+    if len(rows) and stamps[rows[0]] - stamps[0] > SHORTEST_LOSS_S * 1e9:
+        spans.insert(0, (int(stamps[0]), int(stamps[rows[0]])))
+    if len(rows) and rows[-1] + 1 < len(stamps) and stamps[-1] - stamps[rows[-1]] > SHORTEST_LOSS_S * 1e9:
+        spans.append((int(stamps[rows[-1]]), int(stamps[-1]) + 1))
+    return _spans(spans)
+
+
+def _spans(pairs: list[tuple[int, int]]) -> Ints:
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
+    """Say what the fixes do not say of themselves, and what was done to their noise."""
+    notes, sold, rows = [], quality.sold, quality.fix_class
+    if sold.any():
+        notes.append(
+            f"{_counted(sold)} claim {_accuracy(stated[sold], 'to be fixed')} but scatter or jump like "
+            f"RTK float{': taken as float' if changes else ''}"
+        )
+    down = quality.down_weighted & ~sold
+    if down.any():
+        gnss = quality.log.gnss
+        given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
+        notes.append(
+            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: "
+            f"given ±{np.median(given):.2g} m, as they err alike"
+        )
+    for code, name in CLASSES.items():
+        if name in raised and not quality.down_weighted[rows == code].all():
+            kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
+            notes.append(
+                f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
+                f"{quality.step_std_m[name]:.2g} m: that is used"
+            )
+    return notes
+
+
+def _counted(rows: Bools) -> str:
+    count = int(np.count_nonzero(rows))
+    return f"{count:,} fixes ({100 * count / len(rows):.0f} %)"
+
+
+def _accuracy(stated: Floats, silent: str) -> str:
+    """Return the median accuracy stated (m,) [m] in words, `silent` where none is."""
+    known = stated[np.isfinite(stated) & (stated > 0)]
+    return f"±{np.median(known):.2g} m" if len(known) else silent

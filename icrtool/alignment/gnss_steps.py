@@ -1,0 +1,190 @@
+"""How the fixes step against the wheels laid along the heading: white noise, noisy stretches, jumps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes, RobotLog
+
+FEWEST_STEPS = 40
+"""Fewer steps tell no noise; a stretch is judged by as many."""
+
+FEWEST_FIXES = 30
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""... over its scale."""
+
+CLIP_SIGMAS = 6.0
+JUMP_SIGMAS = 8.0
+SMALLEST_JUMP_M = 0.1
+PERSISTS_S = 1.0
+PERSISTS_SHARE = 0.5
+"""A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
+
+MOVES_MPS = 0.05
+"""Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
+
+MOST_TO_FIT = 10_000
+GAP_IN_INTERVALS = 5.0
+
+LONGEST_INTERVAL_S = 1.0
+"""Between wheel samples further apart the way is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixSteps:
+    """Steps between neighbouring fixes, north + j east, without what wheels and heading explain.
+
+    Attributes
+    ----------
+    step : complex (m - 1,) [m], NaN across a gap
+    product : (m - 2,) minus the product of neighbouring steps [m^2], NaN at gaps and wild steps: white noise of
+        variance s^2 an axis makes it 2 s^2 on average; what the wheels get wrong for longer makes it less
+    moves : bool (m - 1,), whether the wheels went on
+    jump_row : (j,) rows of the first fix after a jump; jump : complex (j,) [m]
+    """
+
+    step: Complexes
+    product: Floats
+    moves: Bools
+    jump_row: Ints
+    jump: Complexes
+
+    @property
+    def jump_m(self) -> Floats:
+        """Sizes of the jumps (j,) [m]."""
+        return np.asarray(np.abs(self.jump), np.float64)
+
+    def white_std_m(self, rows: Bools) -> float:
+        """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where too few steps tell."""
+        inside = rows[:-2] & rows[1:-1] & rows[2:] & np.isfinite(self.product)
+        if np.count_nonzero(inside) < FEWEST_STEPS:
+            return float("nan")
+        return float(np.sqrt(max(float(self.product[inside].mean()) / 2, 0.0)))
+
+    def stretch_levels(self, claimed: Bools) -> Floats:
+        """Return the white variance, both axes [m^2], of stretches of `FEWEST_STEPS` fixes; NaN where unknown."""
+        stretches = len(self.product) // FEWEST_STEPS
+        inside = claimed[:-2] & claimed[1:-1] & claimed[2:] & np.isfinite(self.product)
+        inside[np.clip(np.concatenate([self.jump_row - 2, self.jump_row - 1]), 0, None)] = False
+        values = np.where(inside, self.product, 0.0)[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS)
+        count = inside[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).sum(axis=1)
+        level = np.full(stretches, np.nan)
+        np.divide(values.sum(axis=1), count, out=level, where=count > FEWEST_STEPS // 2)
+        return level
+
+    def stretch_moves(self) -> Bools:
+        """Return whether the robot moved for most of each of the same stretches."""
+        stretches = len(self.product) // FEWEST_STEPS
+        share = self.moves[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).mean(axis=1)
+        return np.asarray(share > 0.5)
+
+
+def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 0.0) -> FixSteps:
+    """Compare each step between fixes with the way of the wheels along the heading.
+
+    Parameters
+    ----------
+    mirrored, offset_rad : what is done to the heading
+
+    Notes
+    -----
+    Scale and direction of the way, and an arm from the body origin, are fitted to the steps by clipped least squares:
+    wheels that slip and an antenna that is off centre make no jumps.
+    """
+    gnss, wheels, heading = log.gnss, log.wheels, log.heading
+    if min(len(gnss.stamp_ns), len(wheels.stamp_ns), len(heading.stamp_ns)) < 3:
+        count, none = len(gnss.stamp_ns), np.empty(0, np.complex128)
+        unknown = np.full(max(count - 2, 0), np.nan)
+        still = np.zeros(max(count - 1, 0), np.bool_)
+        return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, still, np.empty(0, np.int64), none)
+    speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
+    travelled = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
+    way = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
+
+    def nose(stamps: Ints) -> Complexes:
+        # The sample at hand is near enough for steps of centimetres, and needs no unwrapping of all the others.
+        row = np.minimum(np.searchsorted(heading.stamp_ns, stamps), len(heading.stamp_ns) - 1)
+        psi = heading.heading_rad[row]
+        return np.asarray(np.exp(1j * ((-psi if mirrored else psi) - offset_rad)), np.complex128)
+
+    laid = way * nose(gnss.stamp_ns[:-1] + np.diff(gnss.stamp_ns) // 2)
+    swing = np.diff(nose(gnss.stamp_ns))
+    seen = np.diff(gnss.north_m + 1j * gnss.east_m)
+    dt = np.diff(gnss.stamp_ns) / 1e9
+    usual = float(np.median(dt))
+    some = slice(None, None, max(1, len(seen) // MOST_TO_FIT))
+    along, arm = _explain(laid[some], swing[some], seen[some])
+    step = seen - along * laid - arm * swing
+    step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
+    moves = np.abs(way) > MOVES_MPS * dt
+    moving = step[moves & np.isfinite(step)]
+    scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
+    with np.errstate(invalid="ignore"):
+        usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
+    product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
+    rows, jumps = _jumps(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
+    return FixSteps(step, product, moves, rows, jumps)
+
+
+def bend_std_m(gnss: PositionFixes) -> float:
+    """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
+
+    NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the
+    robot does between two fixes adds little where they are frequent, and much where they are not:
+    `FixSteps.white_std_m` is the one that leaves it out.
+    """
+    if len(gnss.stamp_ns) < FEWEST_FIXES:
+        return float("nan")
+    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
+
+
+def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[complex, complex]:
+    """Return the factors of `laid` and `swing` (m,) that explain most of `seen` (m,), wild steps left out."""
+    along, arm = 1.0 + 0.0j, 0.0 + 0.0j
+    for _ in range(2):
+        left = np.abs(seen - along * laid - arm * swing)
+        kept = left <= CLIP_SIGMAS * max(float(np.median(left)), 1e-9)
+        a, b, z = laid[kept], swing[kept], seen[kept]
+        # Normal equations of two unknowns; the sums are written out: BLAS would start its threads for them.
+        aa, bb = float((np.abs(a) ** 2).sum()) + 1e-9, float((np.abs(b) ** 2).sum()) + 1e-9
+        ab, az, bz = (complex((np.conj(one) * other).sum()) for one, other in ((a, b), (a, z), (b, z)))
+        determinant = aa * bb - abs(ab) ** 2
+        if determinant <= 1e-9 * aa * bb:
+            return az / aa, 0.0j
+        along, arm = (bb * az - ab * bz) / determinant, (aa * bz - ab.conjugate() * az) / determinant
+    return along, arm
+
+
+def _scale(step: Complexes) -> float:
+    """Return the robust standard deviation of steps, an axis [m]."""
+    size = np.abs(step[np.isfinite(step)])
+    return max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
+
+
+def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
+    """Return the first row after each jump, and the jumps [m]."""
+    count = len(step)
+    with np.errstate(invalid="ignore"):
+        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
+    found = found[(found >= span) & (found + span < count)]
+    if not len(found):
+        return np.empty(0, np.int64), np.empty(0, np.complex128)
+    level = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
+    around = sliding_window_view(level, span)
+    # level[k] is fix k's; the step k leads from fix k to fix k + 1.
+    before, after = around[found - span + 1], around[found + 1]
+    change = np.median(after.real, axis=1) - np.median(before.real, axis=1)
+    shift = change + 1j * (np.median(after.imag, axis=1) - np.median(before.imag, axis=1))
+    stays = np.abs(shift - step[found]) < PERSISTS_SHARE * np.abs(step[found])
+    rows: Ints = (found[stays] + 1).astype(np.int64)
+    return rows, step[found[stays]]
+
+
+def unbroken(interval_s: Floats) -> Floats:
+    """Return intervals between wheel samples [s], zero for those that are too long to say what happened in them."""
+    return np.where(interval_s < LONGEST_INTERVAL_S, interval_s, 0.0)

@@ -1,1 +1,0 @@
-"""Tables to results: knows time and meaning, never files, never pictures."""

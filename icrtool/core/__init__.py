@@ -1,1 +1,0 @@
-"""Equations: arrays in, arrays or NamedTuples out; pure; no files, no pandas, no errors raised for data."""

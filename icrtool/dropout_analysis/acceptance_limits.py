@@ -1,0 +1,147 @@
+"""Budgets and gates: how far an error stays within a bound, and bounds on the dropout numbers for CI."""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.errors import ConfigError
+from icrtool.records.dropout import DropoutReport
+from icrtool.records.tables import Floats
+
+_FORM = re.compile(
+    r"^\s*(?P<model>\w+)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
+    r"(?P<relation><=|>=|<|>)\s*(?P<bound>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*m?\s*$"
+)
+_RELATIONS: dict[str, Callable[[float, float], bool]] = {
+    "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
+}  # fmt: skip
+
+
+class BudgetDistance(NamedTuple):
+    """How far a model's 95th percentile stays within a budget.
+
+    Attributes
+    ----------
+    distance_m : interpolated between horizons, from 0 m at 0 m
+    beyond : the budget still held at `distance_m`, the last horizon with trials
+    between_m : horizons interpolated between
+    """
+
+    model: str
+    label: str
+    budget_m: float
+    distance_m: float
+    beyond: bool
+    between_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """One bound: ``icr.p95@10m <= 3.8``."""
+
+    text: str
+    model: str
+    metric: str
+    horizon_m: float
+    relation: str
+    bound_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a gate found.
+
+    Attributes
+    ----------
+    value_m : NaN where the log has no trial of that length
+    margin_m : negative when the bound was missed
+    """
+
+    gate: Gate
+    value_m: float
+    margin_m: float
+    passed: bool
+
+    def line(self) -> str:
+        """Return the verdict in one line."""
+        word = "pass" if self.passed else "FAIL"
+        if math.isnan(self.value_m):
+            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log"
+        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m"
+
+
+def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDistance, ...]:
+    """Return how far the 95th percentile of each model stays within a budget [m]; models without trials are left out.
+
+    Raises
+    ------
+    ConfigError
+        The budget is no length.
+    """
+    if not (math.isfinite(budget_m) and budget_m > 0):
+        raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
+    reached = ((result, _budget_distance(report.horizons_m, result.summary.p95, budget_m)) for result in report.results)
+    return tuple(BudgetDistance(result.name, result.label, budget_m, *found) for result, found in reached if found)
+
+
+def parse_gate(text: str) -> Gate:
+    """Read a gate.
+
+    Raises
+    ------
+    ConfigError
+        The text is not of the form ``model.metric@HORIZONm <= bound``.
+    """
+    match = _FORM.match(text)
+    if match is None:
+        form = "model.p50|p95|expected|max@HORIZONm <= metres"
+        raise ConfigError(f"gate {text!r}", f"not of the form {form}", 'for example "icr.p95@10m <= 3.8"')
+    horizon_m, bound_m = float(match["horizon"]), float(match["bound"])
+    if not horizon_m > 0:
+        raise ConfigError(f"gate {text!r}", "a horizon of 0 m is no drive", "name a distance, for example @10m")
+    return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m)
+
+
+def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
+    """Hold a gate against a report.
+
+    Raises
+    ------
+    ConfigError
+        A model or horizon that the report does not have.
+    """
+    result = report.result(gate.model)
+    if result is None:
+        known = ", ".join(one.name for one in report.results)
+        advice = f"this run has {known}; no_slip needs robot.track_width_m"
+        raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
+    places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m))
+    if not len(places):
+        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", "add it to dropout.horizons_m")
+    column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
+    value = float(getattr(result.summary, column)[places[0]])
+    margin = gate.bound_m - value if gate.relation.startswith("<") else value - gate.bound_m
+    return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m))
+
+
+def _budget_distance(
+    horizons_m: Floats, p95_m: Floats, budget_m: float
+) -> tuple[float, bool, tuple[float, float]] | None:
+    told = np.isfinite(p95_m)
+    if not told.any():
+        return None
+    distance, p95 = np.concatenate([[0.0], horizons_m[told]]), np.concatenate([[0.0], p95_m[told]])
+    over = np.flatnonzero(p95 > budget_m)
+    if not len(over):
+        return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))
+    i = int(over[0])
+    share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
+    low, high = float(distance[i - 1]), float(distance[i])
+    return low + float(share) * (high - low), False, (low, high)

@@ -1,0 +1,101 @@
+"""Single blind drives worth a picture: the worst, a typical cornering, a typical straight one (Figs. 33-34)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.dropout_analysis.trials import Model, models_of
+from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop_fast import open_loop_errors
+from icrtool.kernels.trials import Drive
+from icrtool.records.dropout import BlindDrive
+from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.tables import Ints
+
+WORST_COUNT = 10
+WORST_HORIZON_M = 10.0
+EXAMPLE_HORIZON_M = 15.0
+ALIKE_RAD = np.radians(10.0)
+STRAIGHT_SHARE = 0.05
+TYPICAL_OF = 30
+"""Trials enough to tell which error is the median one."""
+PICTURED = ("icr", "no_slip")
+
+
+def worst_drives(
+    run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT
+) -> tuple[BlindDrive, ...]:
+    """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
+    drive, models = drive_of(run), models_of(run)
+    ends = trial_ends(drive, np.array([horizon_m]))
+    errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
+    ends, starts = ends[:, 0], np.arange(len(errors))
+    left = np.nan_to_num(errors, nan=-1.0)
+    chosen: list[int] = []
+    while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
+        chosen.append(worst)
+        left[(starts <= ends[worst]) & (ends >= worst)] = -1.0
+    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[BlindDrive, ...]:
+    """Return a typical cornering trial and a typical straight one, none when no trial is that long.
+
+    Notes
+    -----
+    Cornering: the heading changes by about half a turn, or as nearly so as the drive has it. Straight: of the
+    twentieth part of the trials that turns least. Typical: of those, the one with the median error of the momentary
+    ICRs.
+    """
+    drive, models = drive_of(run), models_of(run)
+    ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
+    starts = np.flatnonzero(ends >= 0)
+    # A parked start repeats the same way many times: the last state of each stop stands for it.
+    moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]
+    if not len(moving):
+        return ()
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])
+    turning = turned[ends[moving]] - turned[moving]
+    off = np.abs(np.abs(drive.heading[ends[moving]] - drive.heading[moving]) - np.pi)
+    groups = (moving[off <= off.min() + ALIKE_RAD], moving[turning <= np.quantile(turning, STRAIGHT_SHARE)])
+    chosen = (_typical(drive, models[0], ends, group) for group in groups)
+    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
+    """Return the start with the median error of a group, or of evenly spaced ones where it is large."""
+    sample = group[:: -(-len(group) // TYPICAL_OF)]
+    tried = np.full((len(ends), 1), SHORT)
+    tried[sample, 0] = ends[sample]
+    errors = open_loop_errors_direct(drive, model.icrs, tried)[sample, 0]
+    return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
+
+
+def _blind_drive(
+    run: DrivenRun, drive: Drive, models: tuple[Model, ...], start: int, end: int, horizon_m: float
+) -> BlindDrive:
+    paths, errors = {}, {}
+    for model in models:
+        if model.name not in PICTURED:
+            continue
+        right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
+        path = open_loop_path(drive, right, left, x, start, end)
+        paths[model.name] = path
+        errors[model.name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
+    table = run.table
+    duration = float(table.t_s[end] - table.t_s[start])
+    return BlindDrive(
+        start=start,
+        end=end,
+        stamp_ns=int(table.stamp_ns[start]),
+        t_s=float(table.t_s[start]),
+        north_m=float(table.north_m[start]),
+        east_m=float(table.east_m[start]),
+        horizon_m=horizon_m,
+        heading_change_rad=float(table.heading_rad[end] - table.heading_rad[start]),
+        speed_mean_mps=float(table.distance_m[end] - table.distance_m[start]) / duration if duration > 0 else 0.0,
+        reference_north_m=table.north_m[start : end + 1],
+        reference_east_m=table.east_m[start : end + 1],
+        paths=paths,
+        errors_m=errors,
+    )

@@ -1,0 +1,150 @@
+"""Forced outages: where they are placed, and how the filter drives through them (Pentzer 2014, Fig. 27)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from icrtool.dropout_analysis.trials import STANDING_MPS
+from icrtool.errors import ConfigError, DataError
+from icrtool.estimation.filter_setup import set_up_filter
+from icrtool.estimation.fit import FilterRun
+from icrtool.kernels.ekf import run_filter
+from icrtool.records.dropout import Outage
+from icrtool.records.tables import Bools, Floats
+
+LONGEST_SHARE = 0.5
+"""Spaced outages leave at least this share of the time between them to learn."""
+
+MOST_SPACED = 10
+
+SAME_M = 1e-6
+"""Before the first outage the disturbed run is the undisturbed one, to rounding."""
+
+
+def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
+    """Place outages of one length: at given seconds, or spaced over the time in which the robot moves.
+
+    Returns
+    -------
+    Half-open spans [ns], in order.
+
+    Raises
+    ------
+    ConfigError
+        An outage that does not fit into the drive, or into the time between two others, or lies in one that the log
+        has itself.
+    """
+    last = float(run.table.t_s[-1])
+    if not length_s > 0:
+        raise ConfigError("outage", f"{length_s:g} s is no duration", "give positive seconds")
+    begins = sorted(float(t) for t in at_s) if at_s else _spaced(run, length_s)
+    for begin in begins:
+        if not 0 <= begin <= last - length_s:
+            raise ConfigError(
+                "outage", f"{length_s:g} s from {begin:g} s on do not fit", f"the drive lasts {last:.1f} s"
+            )
+    for begin, following in pairwise(begins):
+        if begin + length_s >= following:
+            raise ConfigError(
+                "outage",
+                f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s",
+                "the filter must learn between two outages: place them further apart",
+            )
+    for begin, lost in zip(begins, _in_real_outage(run, np.array(begins), length_s), strict=True):
+        if lost:
+            raise ConfigError(
+                "outage",
+                f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own",
+                "there is no estimate to hold it against: choose another time",
+            )
+    origin = int(run.table.stamp_ns[0])
+    return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
+
+
+def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
+    """Run the filter again without GNSS and heading in the spans, and hold it against the undisturbed run.
+
+    Raises
+    ------
+    ConfigError
+        A span holds fewer than two states of the disturbed run.
+    DataError
+        The run cannot be made again.
+    """
+    setup = set_up_filter(
+        run.log,
+        run.config,
+        heading_mirrored=run.heading_check.applied_mirror,
+        heading_offset_rad=run.heading_check.applied_offset_rad,
+        heading_std_at_least_rad=run.heading_check.applied_std_rad,
+        heading_correlation_at_least_s=run.heading_check.applied_correlation_s,
+        process_position_mps=run.process_position_mps,
+        changes_s=run.changes_s,
+        warm_start=run.warm_start,
+        outages_ns=tuple(spans_ns),
+    )
+    output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
+    rows = min(len(output.x), len(run.table))
+    north, east = output.x[-rows:, 0], output.x[-rows:, 1]
+    away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
+    stamps, distance = run.table.stamp_ns[-rows:], run.table.distance_m[-rows:]
+    if (away[stamps < min(begin for begin, _ in spans_ns)] > SAME_M).any():
+        raise DataError(run.name, "the run cannot be made again for forced outages", "run icrtool fit again")
+    origin = int(run.table.stamp_ns[0])
+    outages = []
+    for begin, end in spans_ns:
+        inside = slice(*np.searchsorted(stamps, [begin, end]))
+        if len(stamps[inside]) < 2:
+            raise ConfigError(
+                "outage",
+                f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states",
+                "the filter must have begun, and the outage last longer than a wheel sample",
+            )
+        outages.append(
+            Outage(
+                kind="forced",
+                begin_s=(begin - origin) / 1e9,
+                end_s=(end - origin) / 1e9,
+                distance_m=float(np.ptp(distance[inside])),
+                end_error_m=float(away[inside][-1]),
+                max_error_m=float(away[inside].max()),
+                north_m=north[inside],
+                east_m=east[inside],
+            )
+        )
+    return tuple(outages)
+
+
+def _in_real_outage(run: FilterRun, begin_s: Floats, length_s: float) -> Bools:
+    """Say which outages of a length, by their begins (k,) [s], share time with one that the log has itself."""
+    origin = int(run.table.stamp_ns[0])
+    shared = np.zeros(len(begin_s), np.bool_)
+    for begin, end in (run.outages_ns - origin) / 1e9:
+        shared |= (begin_s < end) & (begin_s + length_s > begin)
+    return shared
+
+
+def _spaced(run: FilterRun, length_s: float) -> list[float]:
+    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
+
+    Time from which an outage would reach into one of the log's own is none to begin in.
+    """
+    t, last = run.table.t_s, float(run.table.t_s[-1])
+    moves = np.diff(run.table.distance_m) >= STANDING_MPS * np.diff(t)
+    moves &= ~_in_real_outage(run, t[:-1], length_s)
+    moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
+    settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
+    before = float(np.interp(min(settled, last / 4), t, moved))
+    rest = float(moved[-1]) - before
+    count = min(MOST_SPACED, int(rest * LONGEST_SHARE / length_s))
+    if count < 1:
+        text = f"{length_s:g} s is too long for a drive of {last:.1f} s, {moved[-1]:.1f} s of it moving"
+        raise ConfigError("outage", text, "choose a shorter one")
+    free = (rest - count * length_s) / (count + 1)
+    begins = before + free + np.arange(count) * (length_s + free)
+    # Where the robot stood for a while, the outage begins when it goes on.
+    return [float(t[place - 1]) for place in np.searchsorted(moved, begins, side="right")]

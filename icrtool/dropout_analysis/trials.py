@@ -1,0 +1,270 @@
+"""GPS-dropout analysis: open loop from every recorded state, over every horizon (Pentzer 2014, Section 6.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.error_statistics import (
+    Blocks,
+    bootstrap_intervals,
+    cut_blocks,
+    histogram_sorted,
+    round_bin_width,
+    sort_trials,
+    summarise_sorted,
+)
+from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop_fast import open_loop_errors
+from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.kernels.window_errors import NEUTRAL, move, window_misses
+from icrtool.records.dropout import DEFAULT_SEED, DropoutReport, ModelResult
+from icrtool.records.run import DrivenRun, drive_of, toy_drive
+from icrtool.records.tables import Floats
+
+BOOTSTRAP_RESAMPLES = 300
+BOOTSTRAP_LEVEL = 0.95
+"""Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
+
+LARGEST_TABLE_BYTES = 96 << 20
+"""Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
+
+BYTES_A_TRIAL = 12
+"""An error, and where its trial ends."""
+
+STANDING_MPS = 0.01
+"""Slower than this the robot stands."""
+
+BULK_IN_P95 = 3.0
+MOST_BULKS = 10.0
+"""A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
+
+SHORTEST_HORIZON_M = 1e-3
+"""Less than what a state is known to."""
+
+STARTS_A_CALL = 1 << 14
+"""Starts tried by a thread at a time."""
+
+THREADS = 2
+"""The kernels run beside each other; more threads would need more memory and find little more to do."""
+
+
+class Model(NamedTuple):
+    """A way to predict motion from wheel speeds: ICRs per start, or one triple."""
+
+    name: str
+    label: str
+    icrs: FrozenIcrs
+
+
+ErrorSink = Callable[[str, Floats, Floats], None]
+"""Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
+
+ReportWatch = Callable[[DropoutReport], None]
+"""Called with a report that holds all horizons of some of the models, those that are done."""
+
+
+def dropout(
+    run: DrivenRun,
+    horizons_m: Sequence[float] | None = None,
+    *,
+    models: Sequence[Model] | None = None,
+    seed: int = DEFAULT_SEED,
+    sink: ErrorSink | None = None,
+    watch: ReportWatch | None = None,
+) -> DropoutReport:
+    """Say how far off the robot is after driving blind, from every recorded state.
+
+    Parameters
+    ----------
+    run : a `FilterRun`, or a run read back from its directory
+    horizons_m : distances driven blind, in any order; default those of the run's configuration
+    models : what to predict with; default `models_of` of the run
+    seed : of the bootstrap
+    sink : receives every single error (for ``--trials``)
+    watch : told of the report as it grows, after each model
+
+    Raises
+    ------
+    DataError
+        The run has fewer than two states.
+    ConfigError
+        A horizon that is no distance.
+    ValueError
+        Two models of one name.
+
+    Notes
+    -----
+    ICRs are frozen at the start, wheel speeds alone drive on, the error is the horizontal distance to the filter's
+    estimate where the path has grown by the horizon. A start with less path left, a way across a gap in the wheel data
+    and an end inside a real GNSS outage are no trials; they are counted. Overlapping trials are not independent: the
+    intervals come from a moving-block bootstrap with blocks of the horizon's length.
+    """
+    if len(run.table) < 2:
+        raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
+    horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
+    drive = drive_of(run)
+    models = models if models is not None else models_of(run)
+    standing = int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1]))
+    groups = _groups(len(horizons), len(run.table))
+    counts: list[TrialCounts] = []
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
+    if len(parts) < len(models):
+        raise ValueError("two models have the same name")
+
+    def done() -> DropoutReport:
+        return DropoutReport(
+            name=run.name,
+            horizons_m=horizons,
+            results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
+            counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
+            states=len(run.table),
+            standing=standing,
+            seed=seed,
+        )
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for group in groups:
+            ends, count = _ends(drive, horizons[group], pool)
+            blocks = _blocks(drive, horizons[group], ends, pool)
+            counts.append(count)
+            for model in models:
+                errors = _errors(drive, model.icrs, ends, pool)
+                if sink is not None:
+                    sink(model.name, horizons[group], errors)
+                parts[model.name].append(_judge(model, errors, blocks, seed, pool))
+                if watch is not None and group is groups[-1]:
+                    watch(done())
+    return done()
+
+
+def configured_horizons_m(run: DrivenRun) -> tuple[float, ...]:
+    """Return the horizons [m] of the configuration a run was made with."""
+    horizons: Iterable[float] = run.summary["config"]["dropout"]["horizons_m"]
+    return tuple(horizons)
+
+
+def check_horizons(horizons_m: Iterable[float]) -> Floats:
+    """Return horizons [m] in ascending order, each once.
+
+    Raises
+    ------
+    ConfigError
+        One is not a positive number, or there is none.
+    """
+    horizons = np.unique(np.fromiter(horizons_m, np.float64))
+    if not len(horizons):
+        raise ConfigError("horizons", "none is given", "name at least one distance in metres")
+    for horizon in horizons:
+        if not (math.isfinite(horizon) and horizon >= SHORTEST_HORIZON_M):
+            raise ConfigError("horizons", f"{horizon:g} m is no way", f"give {SHORTEST_HORIZON_M:g} m or more")
+    return horizons
+
+
+def load_kernels() -> None:
+    """Have the compiled kernels ready: a toy drive, to be called while a run is still being read."""
+    drive = toy_drive()
+    way = drive.distance
+    icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
+    ends = trial_ends(drive, np.array([1.0]))
+    open_loop_errors_direct(drive, icrs, ends)
+    errors = open_loop_errors(drive, icrs, ends)
+    bootstrap_intervals(errors, [cut_blocks(way < way[-1], way, 0.5)], DEFAULT_SEED)
+    open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
+    motion = move(
+        way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
+    )
+    window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
+
+
+def models_of(run: DrivenRun) -> tuple[Model, ...]:
+    """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
+    table = run.table
+    models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
+    width = run.track_width_m
+    if width is not None:
+        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
+    final = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
+    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*final)))
+    return tuple(models)
+
+
+def _groups(horizons: int, states: int) -> list[slice]:
+    """Cut the horizons into groups whose table of errors is not too large."""
+    size = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * max(states, 1)))
+    return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
+
+
+def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
+    """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
+    states = len(drive.distance)
+    ends = np.empty((len(horizons), states), np.int32)
+
+    def fill(lo: int) -> TrialCounts:
+        hi = min(lo + STARTS_A_CALL, states)
+        found = trial_ends(drive, horizons, lo, hi)
+        ends[:, lo:hi] = found.T
+        return count_trials(found)
+
+    counts = pool.map(fill, range(0, states, STARTS_A_CALL))
+    return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+
+
+def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Executor) -> list[Blocks | None]:
+    """Return what the bootstrap resamples, for each horizon."""
+
+    def cut(h: int) -> Blocks | None:
+        return cut_blocks(ends[h] >= 0, drive.distance, float(horizons[h]))
+
+    return list(pool.map(cut, range(len(horizons))))
+
+
+def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
+    states = ends.shape[1]
+    errors = np.empty(ends.shape)
+
+    def fill(lo: int) -> None:
+        hi = min(lo + STARTS_A_CALL, states)
+        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+
+    list(pool.map(fill, range(0, states, STARTS_A_CALL)))
+    return errors.T
+
+
+def _judge(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
+    """Say what the errors of one model tell, horizon by horizon."""
+
+    def judge(h: int) -> ModelResult:
+        column = errors[:, h : h + 1]
+        ordered = sort_trials(column[:, 0])
+        summary = summarise_sorted([ordered])
+        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
+        bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
+        return ModelResult(model.name, model.label, summary, intervals, (bins,))
+
+    return _joined(list(pool.map(judge, range(len(blocks)))))
+
+
+def _bin_width(p95_m: float, largest_m: float) -> float:
+    """Return the width of bins that show the bulk of the trials, few outliers apart, in at most some hundred bins."""
+    if math.isnan(largest_m):
+        return round_bin_width(0.0)
+    return round_bin_width(max(min(largest_m, BULK_IN_P95 * p95_m), largest_m / MOST_BULKS))
+
+
+def _joined(parts: list[ModelResult]) -> ModelResult:
+    """Join what several horizons, or groups of them, gave for one model."""
+    return ModelResult(
+        parts[0].name,
+        parts[0].label,
+        Summary(*(np.concatenate(column) for column in zip(*(part.summary for part in parts), strict=True))),
+        Intervals(*(np.concatenate(column) for column in zip(*(part.intervals for part in parts), strict=True))),
+        tuple(one for part in parts for one in part.histograms),
+    )

@@ -1,0 +1,115 @@
+"""What a user should know before trusting a run, in words."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.estimation.filter_setup import configured_process_position_mps
+from icrtool.estimation.noise_adaptation import AdaptedRun
+from icrtool.estimation.summary import separation_multiplier
+from icrtool.kernels.ekf import GATED, UNSEEN
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.records.tables import Floats, RobotLog, States
+
+if TYPE_CHECKING:
+    from icrtool.records.run import MeasurementOutcome
+
+LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
+"""What drives and turns less has shown nothing of the ICRs."""
+
+SMALLEST_MULTIPLIER = 0.9
+"""ICRs nearer to each other than this share of the track width are no robot's that slips."""
+
+LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
+"""ICRs whose middle is off by more than this are not taken for even ones."""
+
+
+def adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
+    """Say what was done about clocks and wheels that contradict the position reference."""
+    notes = []
+    if config.frames.reference_delay_s == "auto" and adapted.reference_delay_s:
+        side = "late" if adapted.reference_delay_s > 0 else "early"
+        notes.append(
+            f"{name}: the position reference is {abs(adapted.reference_delay_s):.2f} s {side} against the wheels: "
+            "taken out; frames.reference_delay_s sets it"
+        )
+    if adapted.process_position_mps != configured_process_position_mps(config):
+        notes.append(
+            f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
+            f"position noise raised to {adapted.process_position_mps:.1f} m/s; filter.process_position_mps sets it"
+        )
+    return notes
+
+
+def doubts(name: str, table: States, gnss: MeasurementOutcome, width: float | None = None) -> list[str]:
+    """Return what a user should know before trusting the numbers; `width` is that of the track [m], where known."""
+    found = []
+    distance, turns = float(table.distance_m[-1]), _turns(table)
+    if distance < LITTLE_WAY_M and not turns:
+        found.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
+    elif not turns:
+        found.append("the robot hardly turned: the ICRs are not observable on a straight drive")
+    elif width is not None and separation_multiplier(table, width) < SMALLEST_MULTIPLIER:
+        found.append(
+            f"the ICRs are {separation_multiplier(table, width):.2f} of the track width apart; slip makes it "
+            "more than 1: check robot.track_width_m, wheel radius and sides"
+        )
+    if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
+        found.append(
+            "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
+        )
+    seen = int(np.count_nonzero(gnss.code > UNSEEN))
+    gated = int(np.count_nonzero(gnss.code == GATED))
+    if seen and gated > 0.1 * seen:
+        found.append(
+            f"{100 * gated / seen:.0f} % of the fixes were rejected: "
+            "clocks, antenna place or fix quality do not fit the wheels"
+        )
+    return [f"{name}: {doubt}" for doubt in found]
+
+
+def antenna_doubt(log: RobotLog, config: Config, table: States, covariance: Floats) -> list[str]:
+    """Say that both ICRs lie to one side of a position reference whose place on the robot nobody told.
+
+    Parameters
+    ----------
+    covariance : (6, 6) of the last state
+
+    Notes
+    -----
+    The drive cannot tell an antenna off the centre line from sides that slip unequally: only the difference shows
+    (`icrtool.calibration.calibrate`). So nothing is moved.
+    """
+    if log.antenna_m is not None or config.frames.antenna_right_m != "auto" or not _turns(table):
+        return []
+    settled = slice(len(table) // 2, None)
+    middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
+    sigma = math.sqrt(max(float(covariance[3, 3] + covariance[4, 4] + 2 * covariance[3, 4]), 0.0)) / 2
+    if abs(middle) <= max(LOPSIDED_M, LOPSIDED_SIGMAS * sigma):
+        return []
+    side, other = ("right", "left") if middle > 0 else ("left", "right")
+    where = f"{abs(middle):.2f} m"
+    return [
+        (
+            f"{log.name}: both ICRs lie {where} to the {side} of the antenna (the position's sensor): it is {other} of "
+            f"the centre line, or the sides slip unequally; if it is {where} {other}, set "
+            f"frames.antenna_right_m={-middle:.2f} (and antenna_forward_m: x_icr is counted from it too)"
+        )
+    ]
+
+
+def _turns(table: States) -> bool:
+    """Say whether the robot turned enough to show its ICRs: by the heading and, if it went nowhere, by the wheels too.
+
+    A parked robot whose heading drifts has learned nothing, and one that spun on the spot has.
+    """
+    turned = float(np.ptp(table.heading_rad))
+    if float(table.distance_m[-1]) < LITTLE_WAY_M:
+        width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
+        ahead = np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1])
+        turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
+    return turned >= LITTLE_TURN_RAD

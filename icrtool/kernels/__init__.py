@@ -1,0 +1,1 @@
+"""Compiled equations: arrays in, arrays or NamedTuples out; numpy and numba only; the letters are the paper's."""

@@ -1,0 +1,326 @@
+"""The ICR EKF, compiled: event-driven propagation and updates (Pentzer 2014, Section 3, Eqs. 13-25).
+
+The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
+`icrtool.kernels.ekf_plain` is the same filter in matrix form, the one to read; the tests hold this one to it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.compiled import njit
+from icrtool.kernels.ekf_step import (
+    DIAGONAL,
+    EAST,
+    HEADING,
+    NORTH,
+    Floats,
+    correct,
+    measured_column,
+    predict,
+    wrap,
+)
+
+Codes = NDArray[np.uint8]
+
+UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
+"""What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+
+REFERENCE_STEP_S = 0.01
+"""The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
+
+
+class FilterParameters(NamedTuple):
+    """Constants of one run.
+
+    Attributes
+    ----------
+    process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
+    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
+    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
+        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
+    gnss_gate, heading_gate : largest NIS accepted; inf accepts all
+    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
+    antenna_forward, antenna_right : lever arm of the antenna [m], body frame
+    wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
+    gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
+    recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
+    icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
+    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
+    """
+
+    process_variance: tuple[float, float, float, float, float, float]
+    rate_invariant: bool
+    step_heading: float
+    gnss_gate: float
+    heading_gate: float
+    heading_correlation: float
+    antenna_forward: float
+    antenna_right: float
+    wheel_gap_s: float
+    gap_speed_variance: float
+    gap_turn_variance: float
+    recovery_count: int
+    recovery_s: float
+    icr_inflation_m2: float
+    least_icr: float
+
+
+class Measurements(NamedTuple):
+    """Inputs of one run: times [s] since any one epoch, non-decreasing.
+
+    Attributes
+    ----------
+    wheel_t : (n,); v_left, v_right : (n,) [m/s], held over [k, k+1)
+    gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
+    heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
+    change_t : (c,) times of terrain changes
+    """
+
+    wheel_t: Floats
+    v_left: Floats
+    v_right: Floats
+    gnss_t: Floats
+    gnss_z: Floats
+    gnss_r: Floats
+    heading_t: Floats
+    heading_z: Floats
+    heading_r: Floats
+    change_t: Floats
+
+
+class FilterOutput(NamedTuple):
+    """What one run leaves behind.
+
+    Attributes
+    ----------
+    x : (k, 6) states after all updates at the stamps of the last k wheel samples; variance : (k, 6) diagonal of P
+    distance : (k,) path length [m]
+    gnss_nis, heading_nis : (m,), (h,) normalised innovation squared, NaN where unseen
+    gnss_code, heading_code : UNSEEN, USED, GATED or RECOVERED
+    gnss_residual : (m, 2) fix minus estimate after the update [m]
+    heading_innovation : (h,) [rad]
+    P : (21,) upper triangle of the covariance at the end, row by row
+    """
+
+    x: Floats
+    variance: Floats
+    distance: Floats
+    gnss_nis: Floats
+    gnss_code: Codes
+    gnss_residual: Floats
+    heading_nis: Floats
+    heading_code: Codes
+    heading_innovation: Floats
+    P: Floats
+
+
+@njit
+def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
+    """Remember a rejected innovation; say whether the run of rejected ones has been right all along.
+
+    A wrong fix disagrees with the next wrong fix; a filter that is wrong sees the same innovation again and again.
+    `run` (4,) holds count, time of the first, and the last innovation; `limit` is the squared difference that two
+    consecutive innovations of a run may have.
+    """
+    step_n, step_e = nu_n - run[2], nu_e - run[3]
+    if run[0] > 0.0 and step_n * step_n + step_e * step_e <= limit:
+        run[0] += 1.0
+    else:
+        run[0] = 1.0
+        run[1] = t
+    run[2] = nu_n
+    run[3] = nu_e
+    return bool(run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s)
+
+
+@njit
+def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
+    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
+
+    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
+    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
+    """
+    for _ in range(2):
+        for place, bound in ((3, least), (4, -least)):
+            beyond = bound - x[place]
+            if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
+                variance = measured_column(P, place, 0.0, PH)
+                for i in range(6):
+                    x[i] += PH[i] / variance * beyond
+
+
+@njit
+def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
+    """Return the antenna's place relative to the body origin: a = R(psi) (forward, right), north and east [m].
+
+    h(x) = (N, E) + a, so dh/dpsi = (-a_E, a_N); without a lever arm H is Eq. 22.
+    """
+    c, s = math.cos(x[2]), math.sin(x[2])
+    return forward * c - right * s, forward * s + right * c
+
+
+@njit
+def take_fix(
+    t: float, z_n: float, z_e: float, r_n: float, r_e: float, x: Floats, P: Floats, PH: Floats, run: Floats,
+    parameters: FilterParameters, residual: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """Gate and apply one fix z [m] of variances r [m^2]; return what became of it, and its NIS.
+
+    North and east are applied one after the other, which equals the joint update since their noises are independent.
+    """
+    a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
+    nu_n, nu_e = z_n - x[0] - a_n, z_e - x[1] - a_e
+    S_ee = measured_column(P, EAST, a_n, PH) + r_e
+    S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
+    S_ne = PH[1] + a_n * PH[2]
+    nis = (S_ee * nu_n * nu_n - 2.0 * S_ne * nu_n * nu_e + S_nn * nu_e * nu_e) / (S_nn * S_ee - S_ne * S_ne)
+    code = USED
+    if nis > parameters.gnss_gate:
+        if rejected_run(run, t, nu_n, nu_e, parameters.gnss_gate * 2.0 * (r_n + r_e), parameters):
+            code = RECOVERED
+            P[0] += nu_n * nu_n
+            P[6] += nu_e * nu_e
+            S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
+        else:
+            code = GATED
+    if code != GATED:
+        run[0] = 0.0
+        E, psi = x[1], x[2]
+        correct(x, P, PH, S_nn, nu_n)
+        S_ee = measured_column(P, EAST, a_n, PH) + r_e
+        correct(x, P, PH, S_ee, nu_e - (x[1] - E) - a_n * (x[2] - psi))
+        keep_sides(x, P, PH, parameters.least_icr)
+    a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
+    residual[0] = z_n - x[0] - a_n
+    residual[1] = z_e - x[1] - a_e
+    return code, nis
+
+
+@njit
+def take_heading(
+    t: float, z: float, r: float, x: Floats, P: Floats, PH: Floats, run: Floats, parameters: FilterParameters
+) -> tuple[int, float, float]:
+    """Gate and apply one heading z [rad] of variance r; return what became of it, its NIS and its innovation.
+
+    The gate asks whether this sample is right (variance r); the update gives it its share of what its neighbours say
+    too (variance r times the correlation).
+    """
+    nu = wrap(z - x[2])
+    nis = nu * nu / (P[11] + r)
+    code = USED
+    if nis > parameters.heading_gate:
+        if rejected_run(run, t, nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
+            code = RECOVERED
+            P[11] += nu * nu
+        else:
+            code = GATED
+    if code != GATED:
+        run[0] = 0.0
+        S = measured_column(P, HEADING, 0.0, PH) + r * parameters.heading_correlation
+        correct(x, P, PH, S, nu)
+        keep_sides(x, P, PH, parameters.least_icr)
+    return code, nis, nu
+
+
+@njit
+def advance(
+    dt: float, in_gap: bool, v_left: float, v_right: float, x: Floats, P: Floats, parameters: FilterParameters
+) -> float:
+    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length [m].
+
+    Through a gap in the wheel data nothing is dead-reckoned: the pose only grows uncertain.
+    """
+    travelled = 0.0
+    if in_gap:
+        P[0] += parameters.gap_speed_variance * dt
+        P[6] += parameters.gap_speed_variance * dt
+        P[11] += parameters.gap_turn_variance * dt
+    else:
+        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading)
+    scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
+    for i in range(6):
+        P[DIAGONAL[i]] += scale * parameters.process_variance[i]
+    return travelled
+
+
+@njit
+def filter_loop(  # noqa: C901 - the order of events, in one place
+    data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
+    parameters: FilterParameters, out: FilterOutput,
+) -> None:  # fmt: skip
+    """Run from time t0 over all wheel samples from `first` on, filling `out`; x and P end as the last state."""
+    j, h, c = start
+    n_gnss, n_heading, n_change = len(data.gnss_t), len(data.heading_t), len(data.change_t)
+    gnss_run, heading_run, PH = np.zeros(4), np.zeros(4), np.zeros(6)
+    t, travelled = t0, 0.0
+    for k in range(first, len(data.wheel_t)):
+        held = max(k - 1, 0)
+        t_wheel = data.wheel_t[k]
+        in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
+        while True:
+            t_next = t_wheel
+            if j < n_gnss:
+                t_next = min(t_next, data.gnss_t[j])
+            if h < n_heading:
+                t_next = min(t_next, data.heading_t[h])
+            if c < n_change:
+                t_next = min(t_next, data.change_t[c])
+            if t_next > t:
+                travelled += advance(t_next - t, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
+                t = t_next
+            while c < n_change and data.change_t[c] <= t:
+                for i in range(3, 6):
+                    P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
+                c += 1
+            while j < n_gnss and data.gnss_t[j] <= t:
+                out.gnss_code[j], out.gnss_nis[j] = take_fix(
+                    t, data.gnss_z[j, 0], data.gnss_z[j, 1], data.gnss_r[j, 0], data.gnss_r[j, 1],
+                    x, P, PH, gnss_run, parameters, out.gnss_residual[j],
+                )  # fmt: skip
+                j += 1
+            while h < n_heading and data.heading_t[h] <= t:
+                out.heading_code[h], out.heading_nis[h], out.heading_innovation[h] = take_heading(
+                    t, data.heading_z[h], data.heading_r[h], x, P, PH, heading_run, parameters
+                )
+                h += 1
+            if t >= t_wheel:
+                break
+        for i in range(6):
+            out.x[k - first, i] = x[i]
+            out.variance[k - first, i] = P[DIAGONAL[i]]
+        out.distance[k - first] = travelled
+
+
+def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
+    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 over all that follows.
+
+    Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
+    from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
+    """
+    first = int(np.searchsorted(data.wheel_t, t0))
+    j, h, c = (int(np.searchsorted(times, t0, side="right")) for times in (data.gnss_t, data.heading_t, data.change_t))
+    out = empty_output(data, first, P0)
+    filter_loop(data, t0, first, (j, h, c), x0.astype(np.float64), out.P, parameters, out)
+    return out
+
+
+def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
+    """Return the output of a run from wheel sample `first` on, before it has run; its P holds P0 (6, 6)."""
+    rows, n_gnss, n_heading = len(data.wheel_t) - first, len(data.gnss_t), len(data.heading_t)
+    return FilterOutput(
+        x=np.empty((rows, 6)),
+        variance=np.empty((rows, 6)),
+        distance=np.empty(rows),
+        gnss_nis=np.full(n_gnss, np.nan),
+        gnss_code=np.zeros(n_gnss, np.uint8),
+        gnss_residual=np.full((n_gnss, 2), np.nan),
+        heading_nis=np.full(n_heading, np.nan),
+        heading_code=np.zeros(n_heading, np.uint8),
+        heading_innovation=np.full(n_heading, np.nan),
+        P=P0[np.triu_indices(6)].astype(np.float64),
+    )

@@ -1,0 +1,130 @@
+"""One step of the ICR EKF in scalars: predict, correct (Pentzer 2014, Section 3, Eqs. 13-25).
+
+State x = (N, E, psi, y_r, y_l, x_v), shape (6,). The covariance P is its upper triangle row by row, shape (21,):
+``NN NE Np Nr Nl Nx  EE Ep Er El Ex  pp pr pl px  rr rl rx  ll lx  xx``. Both are changed in place.
+The sums are written out: loops over a 6 x 6 array take three times as long.
+`icrtool.kernels.ekf_plain` is the same filter in matrix form, the one to read; the tests hold this one to it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.compiled import njit
+from icrtool.kernels.kinematics import body_velocity, icr_separation
+
+Floats = NDArray[np.float64]
+
+NORTH, EAST, HEADING = (cast(int, np.int64(axis)) for axis in range(3))
+"""What is measured. With a type: of a function that is called with a plain number numba compiles a copy for it."""
+
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+"""Places of the variances in P."""
+
+PLACES = np.empty((6, 6), np.int64)
+PLACES[np.triu_indices(6)] = PLACES.T[np.triu_indices(6)] = np.arange(21)
+"""Places of the entries of the whole matrix in P."""
+
+
+@njit
+def wrap(angle: float) -> float:
+    """Wrap an angle [rad] to (-pi, pi]."""
+    if -math.pi < angle <= math.pi:
+        return angle
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
+
+
+@njit
+def row_times(G0: float, G1: float, G2: float, G3: float, p: float, r: float, l: float, x: float) -> float:  # noqa: E741 - the paper's l
+    """Return a row of G times the rows psi, y_r, y_l, x_v of a column."""
+    return G0 * p + G1 * r + G2 * l + G3 * x
+
+
+@njit
+def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, step_heading: float) -> float:
+    """Propagate state and covariance over dt [s] with the track speeds [m/s] held; return the path length [m].
+
+    Parameters
+    ----------
+    step_heading : where in the step's turn the heading is taken, see `icrtool.kernels.ekf.FilterParameters`
+
+    Notes
+    -----
+    Eq. 14 (Euler where step_heading is 0) and F P F^T of Eq. 16 with F = I + G (Eqs. 17, 27-29); only rows N, E, psi
+    and columns psi, y_r, y_l, x_v of G differ from zero. The process noise is `icrtool.kernels.ekf.advance`'s.
+    """
+    N, E, psi, y_r, y_l, x_v = x[0], x[1], x[2], x[3], x[4], x[5]
+    NN, NE, Np, Nr, Nl, Nx = P[0], P[1], P[2], P[3], P[4], P[5]
+    EE, Ep, Er, El, Ex = P[6], P[7], P[8], P[9], P[10]
+    pp, pr, pl, px = P[11], P[12], P[13], P[14]
+    rr, rl, rx, ll, lx, xx = P[15], P[16], P[17], P[18], P[19], P[20]
+    v_x, v_y, omega = body_velocity(v_left, v_right, y_r, y_l, x_v)
+    W = icr_separation(y_r, y_l)
+    sign = 1.0 if y_r >= y_l else -1.0
+    ahead = step_heading * dt
+    c, s = math.cos(psi + ahead * omega), math.sin(psi + ahead * omega)
+    vx_r, vx_l = (v_left - v_x * sign) / W, (v_x * sign - v_right) / W
+    w_r, w_l = -omega * sign / W, omega * sign / W
+    n0, e0 = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
+    # the ICRs move the place by the body velocity, and by the heading at which it is turned into the world
+    a_r, a_l = ahead * w_r, ahead * w_l
+    n1, e1 = dt * (vx_r * c + w_r * x_v * s) + n0 * a_r, dt * (vx_r * s - w_r * x_v * c) + e0 * a_r
+    n2, e2 = dt * (vx_l * c + w_l * x_v * s) + n0 * a_l, dt * (vx_l * s - w_l * x_v * c) + e0 * a_l
+    n3, e3 = dt * omega * s, -dt * omega * c
+    p1, p2 = dt * w_r, dt * w_l
+    # M = (I + G) P, the parts of it that P' needs
+    M_NN = NN + row_times(n0, n1, n2, n3, Np, Nr, Nl, Nx)
+    M_NE = NE + row_times(n0, n1, n2, n3, Ep, Er, El, Ex)
+    M_Np = Np + row_times(n0, n1, n2, n3, pp, pr, pl, px)
+    M_Nr = Nr + row_times(n0, n1, n2, n3, pr, rr, rl, rx)
+    M_Nl = Nl + row_times(n0, n1, n2, n3, pl, rl, ll, lx)
+    M_Nx = Nx + row_times(n0, n1, n2, n3, px, rx, lx, xx)
+    M_EE = EE + row_times(e0, e1, e2, e3, Ep, Er, El, Ex)
+    M_Ep = Ep + row_times(e0, e1, e2, e3, pp, pr, pl, px)
+    M_Er = Er + row_times(e0, e1, e2, e3, pr, rr, rl, rx)
+    M_El = El + row_times(e0, e1, e2, e3, pl, rl, ll, lx)
+    M_Ex = Ex + row_times(e0, e1, e2, e3, px, rx, lx, xx)
+    M_pp = pp + p1 * pr + p2 * pl
+    M_pr = pr + p1 * rr + p2 * rl
+    M_pl = pl + p1 * rl + p2 * ll
+    M_px = px + p1 * rx + p2 * lx
+    P[0] = M_NN + row_times(n0, n1, n2, n3, M_Np, M_Nr, M_Nl, M_Nx)
+    P[1] = M_NE + row_times(e0, e1, e2, e3, M_Np, M_Nr, M_Nl, M_Nx)
+    P[2] = M_Np + p1 * M_Nr + p2 * M_Nl
+    P[3], P[4], P[5] = M_Nr, M_Nl, M_Nx
+    P[6] = M_EE + row_times(e0, e1, e2, e3, M_Ep, M_Er, M_El, M_Ex)
+    P[7] = M_Ep + p1 * M_Er + p2 * M_El
+    P[8], P[9], P[10] = M_Er, M_El, M_Ex
+    P[11] = M_pp + p1 * M_pr + p2 * M_pl
+    P[12], P[13], P[14] = M_pr, M_pl, M_px
+    x[0] = N + e0
+    x[1] = E - n0
+    x[2] = psi + dt * omega
+    return dt * math.sqrt(v_x * v_x + v_y * v_y)
+
+
+@njit
+def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
+    """Fill PH (6,) = P H^T and return H P H^T, for H = e_axis + h_psi e_psi; h_psi is 0 unless the axis is N or E."""
+    for i in range(6):
+        PH[i] = P[PLACES[axis, i]]
+    if h_psi != 0.0:
+        for i in range(6):
+            PH[i] += h_psi * P[PLACES[HEADING, i]]
+    return float(PH[axis] + h_psi * PH[2])
+
+
+@njit
+def correct(x: Floats, P: Floats, PH: Floats, S: float, nu: float) -> None:
+    """Apply a scalar innovation nu of variance S, with PH = P H^T (Eqs. 21, 24, 25)."""
+    place = 0
+    for i in range(6):
+        K = PH[i] / S
+        x[i] += K * nu
+        for k in range(i, 6):
+            P[place] -= K * PH[k]
+            place += 1

@@ -1,0 +1,5 @@
+"""Bytes to tables and back: the only room that opens a log, and the only one that knows ENU."""
+
+from icrtool.logs.read_log import Survey, assemble, read_log, survey_log
+
+__all__ = ["Survey", "assemble", "read_log", "survey_log"]

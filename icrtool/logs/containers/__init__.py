@@ -1,0 +1,1 @@
+"""Log files and directories: bytes to blocks of raw messages by channel."""

@@ -1,0 +1,195 @@
+"""ROS 2 bag directories: metadata.yaml, one or more storage files, compressed by file or by message."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import Block, Channel, Container, Problems
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES
+from icrtool.logs.containers.mcap_file import McapFile
+from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
+from icrtool.logs.containers.sqlite_bag import SqliteBag
+from icrtool.records.tables import Ints
+
+_LARGEST_METADATA_BYTES = 1 << 24
+_LARGEST_RATIO = 1000
+"""A file that decompresses to more than so many times its size is no recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Metadata:
+    """The part of metadata.yaml that reading needs; `message_compression` is empty where there is none."""
+
+    files: tuple[str, ...] = ()
+    message_compression: str = ""
+
+
+class BagDirectory:
+    """A directory of storage files, read as one log.
+
+    Raises
+    ------
+    LogError
+        No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._problems = Problems(path.name)
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._parts: list[Container] = []
+        self._by_name = False
+        self.files: list[Path] = []
+        metadata = self._read_metadata()
+        try:
+            for file in self._find_files(metadata.files):
+                self._open_part(file, metadata.message_compression)
+            if not self._parts:
+                raise LogError(path, "no storage file in it can be read", "; ".join(self._problems))
+        except BaseException:
+            self.close()
+            raise
+        self._numbers: list[tuple[Ints, Ints]] = []
+        self.channels = self._merge_channels()
+
+    @property
+    def problems(self) -> list[str]:
+        """What could not be read, of the directory and of each file."""
+        return self._problems + [problem for part in self._parts for problem in part.problems]
+
+    def share_read(self) -> float:
+        """Return the mean over the files."""
+        return sum(part.share_read() for part in self._parts) / max(len(self._parts), 1)
+
+    def close(self) -> None:
+        """Release all files."""
+        for part in self._parts:
+            part.close()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted channels, file by file.
+
+        Raises
+        ------
+        LogError
+            At the end: the files, found by name, are recordings of different times.
+        """
+        spans = []
+        for file, part, (own, merged) in zip(self.files, self._parts, self._numbers, strict=True):
+            if not len(own):
+                continue
+            begins, ends = [], []
+            for block in part.blocks(frozenset(own[np.isin(merged, list(wanted))].tolist())):
+                if len(block.log_time_ns):
+                    begins.append(int(block.log_time_ns.min()))
+                    ends.append(int(block.log_time_ns.max()))
+                place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
+                yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
+            if begins:
+                spans.append(Span(min(begins), max(ends), file.name))
+        if self._by_name:
+            for odd in check_spans(self._path, spans):
+                self._problems.say(odd)
+
+    def _read_metadata(self) -> _Metadata:
+        """Return what metadata.yaml says; a recorder that was killed leaves none, or half of it."""
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+
+        file = self._path / "metadata.yaml"
+        if not file.is_file():
+            self._problems.say("no metadata.yaml; the storage files in it were read by name")
+            return _Metadata()
+        try:
+            if file.stat().st_size > _LARGEST_METADATA_BYTES:
+                raise ValueError("far too long")
+            document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+            information = document["rosbag2_bagfile_information"]
+            by_message = str(information.get("compression_mode")).upper() == "MESSAGE"
+            return _Metadata(
+                files=tuple(name for name in information["relative_file_paths"] if isinstance(name, str)),
+                message_compression=str(information.get("compression_format")) if by_message else "",
+            )
+        except (YAMLError, LookupError, TypeError, AttributeError, ValueError, OSError, RecursionError):
+            self._problems.say("its metadata.yaml cannot be read; the storage files in it were read by name")
+            return _Metadata()
+
+    def _find_files(self, names: tuple[str, ...]) -> list[Path]:
+        """Return the files that metadata.yaml names and that are there; all storage files where it names none."""
+        named = [self._path / Path(name).name for name in dict.fromkeys(names)]
+        missing = [file.name for file in named if not file.is_file()]
+        if missing:
+            self._problems.say(f"metadata.yaml names files that are not there: {', '.join(missing)}")
+        if len(missing) < len(named):
+            return [file for file in named if file.name not in missing]
+        self._by_name = True
+        return storage_files(self._path)
+
+    def _open_part(self, file: Path, message_compression: str) -> None:
+        try:
+            storage = self._unpacked(file) if file.suffix in (".zstd", ".zst") else file
+            kind = McapFile if storage.suffix == ".mcap" else SqliteBag
+            self._parts.append(kind(storage, message_compression))
+            self.files.append(file)
+        except LogError as err:
+            self._problems.say(f"{file.name}: {err.why}; {err.advice}")
+        except OSError as err:
+            self._problems.say(f"{file.name}: cannot be read; {err.strerror}")
+
+    def _unpacked(self, file: Path) -> Path:
+        """Decompress a storage file to a temporary folder, a piece at a time."""
+        import zstandard
+
+        if self._scratch is None:
+            self._scratch = tempfile.TemporaryDirectory(prefix="icrtool-")
+        folder = Path(self._scratch.name) / str(len(self.files))
+        folder.mkdir(exist_ok=True)
+        target = folder / file.stem
+        left = LARGEST_CHUNK_BYTES + _LARGEST_RATIO * file.stat().st_size
+        try:
+            with (
+                file.open("rb") as source,
+                zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True) as reader,
+                target.open("wb") as sink,
+            ):
+                while left > 0 and (piece := reader.read(1 << 20)):
+                    sink.write(piece)
+                    left -= len(piece)
+            if left <= 0:
+                self._problems.say(f"{file.name}: is over {_LARGEST_RATIO} times its size when decompressed; cut there")
+        except zstandard.ZstdError as err:
+            if not target.stat().st_size:
+                raise LogError(file, "does not decompress", str(err)) from err
+            self._problems.say(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
+        except OSError as err:
+            free = shutil.disk_usage(self._scratch.name).free
+            raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err
+        return target
+
+    def _merge_channels(self) -> list[Channel]:
+        """Give a topic that stands in several files one number."""
+        merged: dict[tuple[str, str, str], Channel] = {}
+        for part in self._parts:
+            numbers: dict[int, int] = {}
+            for channel in part.channels:
+                key = (channel.topic, channel.message_type, channel.encoding)
+                known = merged.get(key)
+                if known is None:
+                    merged[key] = replace(channel, id=len(merged))
+                else:
+                    both = known.count is not None and channel.count is not None
+                    count = (known.count or 0) + (channel.count or 0) if both else None
+                    merged[key] = replace(known, count=count, definition=known.definition or channel.definition)
+                numbers[channel.id] = merged[key].id
+            own = np.array(sorted(numbers), np.int64)
+            self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
+        return list(merged.values())

@@ -1,0 +1,135 @@
+"""What every container gives: channels, and blocks of raw messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.records.tables import Ints
+
+Bytes = NDArray[np.uint8]
+
+MOST_PROBLEMS = 20
+
+MOST_NAMED = 12
+"""Names that a message lists before it says that there are more."""
+
+LATEST_NS = 1 << 62
+"""The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic of a log.
+
+    Attributes
+    ----------
+    id : the number that blocks refer to
+    message_type : ``package/Name``, without ROS 2's ``/msg/``
+    encoding : ``cdr`` (ROS 2), ``ros1``, or what the log calls an encoding that cannot be read
+    definition : text of the message definition, empty when the log does not carry it
+    definition_format : how `definition` is written
+    count : number of messages where an index tells, else None
+    """
+
+    id: int
+    topic: str
+    message_type: str
+    encoding: str
+    definition: str = ""
+    definition_format: Literal["msg", "idl"] = "msg"
+    count: int | None = None
+
+
+class Block(NamedTuple):
+    """Messages that share one buffer. Valid until the next block is asked for.
+
+    Attributes
+    ----------
+    data : uint8 (bytes,)
+    channel : int64 (n,) channel ids
+    log_time_ns : int64 (n,)
+    start, end : int64 (n,) half-open byte ranges in `data`
+    """
+
+    data: Bytes
+    channel: Ints
+    log_time_ns: Ints
+    start: Ints
+    end: Ints
+
+
+class Container(Protocol):
+    """A log file or directory, opened."""
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """The topics, known before any block is read."""
+        ...
+
+    @property
+    def problems(self) -> Sequence[str]:
+        """What could not be read and was left out; complete after the last block."""
+        ...
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """The files that make up this log."""
+        ...
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the channels in `wanted` (others may be among them), in file order."""
+        ...
+
+    def share_read(self) -> float:
+        """Return how much of the log has gone by, 0 to 1."""
+        ...
+
+    def close(self) -> None:
+        """Release files."""
+        ...
+
+
+class Problems(list[str]):
+    """What could not be read of a file, in sentences: each is kept once, and no more of them than a person reads."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self._name = name
+
+    def say(self, problem: str) -> None:
+        """Add a sentence."""
+        text = printable(f"{self._name}: {problem}")
+        if text not in self and len(self) <= MOST_PROBLEMS:
+            self.append(text if len(self) < MOST_PROBLEMS else printable(f"{self._name}: and more of the kind"))
+
+
+def with_possible_times(block: Block, problems: Problems) -> Block:
+    """Return a block without the messages whose log time cannot be one."""
+    possible = (block.log_time_ns >= 0) & (block.log_time_ns < LATEST_NS)
+    if possible.all():
+        return block
+    problems.say("messages with an impossible log time left out")
+    _, *columns = block
+    return Block(block.data, *(column[possible] for column in columns))
+
+
+def printable(text: str) -> str:
+    """Return a text from a log fit for one line: what is no printable character becomes a replacement character."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return names in a row, the first ones of many."""
+    return ", ".join([*names[:MOST_NAMED], *(["…"] if len(names) > MOST_NAMED else [])])
+
+
+def ros_type_name(name: str) -> str:
+    """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``."""
+    package, _, rest = printable(name).partition("/")
+    return f"{package}/{rest.removeprefix('msg/')}"

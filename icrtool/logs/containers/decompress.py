@@ -1,0 +1,130 @@
+"""Decompression with a ceiling: what a chunk claims to hold is checked before memory is asked for."""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from icrtool.logs.containers.channel import Block
+
+LARGEST_CHUNK_BYTES = 1 << 28
+"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; one that claims more than this is damaged."""
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_BLOCK_BYTES = 1 << 24
+_UNKNOWN_SIZE_BYTES = 1 << 24
+
+
+class DecompressionError(Exception):
+    """A chunk that does not decompress; `args[0]` says why."""
+
+
+def decompress(data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
+    """Decompress a chunk.
+
+    Parameters
+    ----------
+    compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
+    size : the size the log says it has, in bytes
+    partial : the data is cut off; return what can be had of it
+
+    Raises
+    ------
+    DecompressionError
+        Damaged data, another size than announced, or a compression that is not known.
+    """
+    if compression in ("", "none"):
+        return bytes(data)
+    if size > LARGEST_CHUNK_BYTES:
+        raise DecompressionError(f"it claims {size} bytes")
+    decoder = _DECODERS.get(compression)
+    if decoder is None:
+        raise DecompressionError(f"compression {compression!r} is not known")
+    try:
+        out = decoder(data, size)
+    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
+        raise DecompressionError(str(err) or "not enough memory") from err
+    if len(out) != size and not partial:
+        raise DecompressionError(f"{len(out)} bytes instead of {size}")
+    return out
+
+
+def _lz4(data: bytes | memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    decoder = lz4.frame.LZ4FrameDecompressor()
+    return bytes(decoder.decompress(data, max_length=size + 1))
+
+
+def _bz2(data: bytes | memoryview, size: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
+
+
+def _zstd(data: bytes | memoryview, size: int) -> bytes:
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
+            return bytes(reader.read(size + 1))
+    except zstandard.ZstdError as err:
+        raise DecompressionError(str(err)) from err
+
+
+_DECODERS = {"lz4": _lz4, "zstd": _zstd, "bz2": _bz2}
+
+
+def unpack_messages(
+    blocks: Iterator[Block], wanted: frozenset[int], compression: str, say: Callable[[str], None]
+) -> Iterator[Block]:
+    """Decompress the wanted messages of a bag that was written with message compression.
+
+    Parameters
+    ----------
+    compression : ``zstd``, or what metadata.yaml calls a compression that cannot be read
+    say : told once, after the last block, how many messages do not decompress, and why
+    """
+    left_out, reason = 0, ""
+    for block in blocks:
+        rows: list[int] = []
+        messages: list[bytes] = []
+        held = 0
+        for row in np.flatnonzero(np.isin(block.channel, list(wanted))).tolist():
+            try:
+                message = _unpack(block.data[block.start[row] : block.end[row]].tobytes(), compression)
+            except DecompressionError as err:
+                left_out, reason = left_out + 1, reason or str(err.args[0])
+                continue
+            rows.append(row)
+            messages.append(message)
+            held += len(message)
+            if held > _BLOCK_BYTES:
+                yield _repacked(block, rows, messages)
+                rows, messages, held = [], [], 0
+        yield _repacked(block, rows, messages)
+    if left_out:
+        say(f"{left_out} compressed messages left out: {reason}")
+
+
+def _repacked(block: Block, rows: list[int], messages: list[bytes]) -> Block:
+    """Return the given rows of a block with other contents."""
+    end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
+    start = np.concatenate([[0], end])[:-1].astype(np.int64)
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    return Block(data, block.channel[rows], block.log_time_ns[rows], start, end)
+
+
+def _unpack(data: bytes, compression: str) -> bytes:
+    """Decompress one message."""
+    import zstandard
+
+    if compression != "zstd":
+        raise DecompressionError(f"compression {compression!r} is not known")
+    try:
+        size = zstandard.frame_content_size(data)
+        if size > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"one claims {size} bytes")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_UNKNOWN_SIZE_BYTES if size < 0 else 0)
+    except (zstandard.ZstdError, MemoryError) as err:
+        raise DecompressionError(str(err)) from err

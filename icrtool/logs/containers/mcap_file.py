@@ -1,0 +1,361 @@
+"""MCAP files: chunked or not, indexed or not, whole or cut off (https://mcap.dev/spec)."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import (
+    Block,
+    Bytes,
+    Channel,
+    Problems,
+    printable,
+    ros_type_name,
+    with_possible_times,
+)
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress, unpack_messages
+from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
+
+if TYPE_CHECKING:
+    from mcap.records import Channel as McapChannel
+    from mcap.records import ChunkIndex, Schema, Statistics
+
+    _Parsed = Schema | McapChannel | ChunkIndex | Statistics
+
+MAGIC = b"\x89MCAP0\r\n"
+PIECE_BYTES = 1 << 22
+_FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
+_HEAD_BYTES, _FOOTER_BYTES = 9, 20
+_CHECKSUM_BYTES = 4
+_ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
+
+
+class _Chunk(NamedTuple):
+    """Where a chunk record's content is: file offset and length; what an index tells of it.
+
+    Attributes
+    ----------
+    channels : those it holds, None where that is not told
+    index_length : length of the message index records that follow it
+    """
+
+    at: int
+    length: int
+    channels: frozenset[int] | None = None
+    index_length: int = 0
+
+
+class McapFile:
+    """One MCAP file.
+
+    Parameters
+    ----------
+    message_compression : how each message was compressed on its own (rosbag2's metadata.yaml tells), empty if not
+
+    Raises
+    ------
+    LogError
+        Not an MCAP file.
+    """
+
+    def __init__(self, path: Path, message_compression: str = "") -> None:
+        self._path = path
+        self._message_compression = message_compression
+        self.files = [path]
+        self.problems = Problems(path.name)
+        self._table = RecordTable()
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, McapChannel] = {}
+        self._counts: dict[int, int] = {}
+        self._stream = path.open("rb")
+        try:
+            self._size = path.stat().st_size
+            if self._stream.read(len(MAGIC)) != MAGIC:
+                raise LogError(path, "not an MCAP file", "its first bytes are not MCAP's")
+            self._chunks = self._read_index()
+            if self._chunks is None:
+                for _ in self._walk(learn=True):
+                    pass
+        except BaseException:
+            self.close()
+            raise
+        self.channels = [self._channel(number) for number in sorted(self._channels)]
+
+    def share_read(self) -> float:
+        """Return the place in the file as a share of its size."""
+        return self._stream.tell() / max(self._size, 1)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._stream.close()
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted channels, chunk by chunk."""
+        if not wanted:
+            return
+        blocks = self._walk() if self._chunks is None else self._indexed(self._chunks, wanted)
+        if self._message_compression:
+            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
+        yield from blocks
+
+    def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int]) -> Iterator[Block]:
+        for chunk in chunks:
+            if chunk.channels is None or chunk.channels & wanted:
+                yield from self._read_chunk(chunk)
+
+    def _channel(self, number: int) -> Channel:
+        channel = self._channels[number]
+        schema = self._schemas.get(channel.schema_id)
+        encoding, written = channel.message_encoding, schema.encoding if schema else ""
+        return Channel(
+            id=number,
+            topic=printable(channel.topic),
+            message_type=ros_type_name(schema.name) if schema else "",
+            encoding=printable(encoding),
+            definition=schema.data.decode("utf-8", "replace") if schema and (encoding, written) in _ENCODINGS else "",
+            definition_format="idl" if written == "ros2idl" else "msg",
+            count=self._counts.get(number) if self._chunks is not None else None,
+        )
+
+    def _read_index(self) -> list[_Chunk] | None:
+        """Return the chunks by the file's index; None where there is none, or the file is not as it says."""
+        from mcap.records import Channel as McapChannel
+        from mcap.records import ChunkIndex, Schema, Statistics
+
+        chunks: list[_Chunk] = []
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, McapChannel] = {}
+        statistics: Statistics | None = None
+        for opcode, content in self._summary_records():
+            match _parse(opcode, content):
+                case Schema() as schema:
+                    schemas[schema.id] = schema
+                case McapChannel() as channel:
+                    channels[channel.id] = channel
+                case Statistics() as found:
+                    statistics = found
+                case ChunkIndex() as index:
+                    held = frozenset(index.message_index_offsets) or None
+                    start, length = index.chunk_start_offset + _HEAD_BYTES, index.chunk_length - _HEAD_BYTES
+                    chunks.append(_Chunk(start, length, held, index.message_index_length))
+                case None:
+                    return None
+        if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
+            return None
+        if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
+            return None
+        chunks.sort(key=lambda chunk: chunk.at)
+        standing = self._held_against_file(chunks)
+        if standing is not None:
+            self._schemas, self._channels = schemas, channels
+            self._counts = dict(statistics.channel_message_counts)
+        return standing
+
+    def _summary_records(self) -> Iterator[tuple[int, bytes]]:
+        """Yield opcode and content of the records of the summary that reading needs; none where it is damaged."""
+        end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
+        self._stream.seek(max(end, 0))
+        footer = self._stream.read(_HEAD_BYTES + _FOOTER_BYTES)
+        start = int.from_bytes(footer[9:17], "little")
+        if footer[:1] != bytes([_FOOTER]) or self._stream.read() != MAGIC or not 0 < start <= end:
+            return
+        if end - start > LARGEST_CHUNK_BYTES:
+            return
+        self._stream.seek(start)
+        summary = self._stream.read(end - start)
+        checksum = int.from_bytes(footer[-_CHECKSUM_BYTES:], "little")
+        if checksum and zlib.crc32(footer[:-_CHECKSUM_BYTES], zlib.crc32(summary)) != checksum:
+            return
+        at = 0
+        while at + _HEAD_BYTES <= len(summary):
+            opcode, length = struct.unpack_from("<BQ", summary, at)
+            at += _HEAD_BYTES
+            if opcode in (MCAP_SCHEMA, MCAP_CHANNEL, _CHUNK_INDEX, _STATISTICS):
+                yield opcode, summary[at : at + length]
+            at += length
+
+    def _held_against_file(self, chunks: list[_Chunk]) -> list[_Chunk] | None:
+        """Return the chunks of the index that stand where it says; None where the records one by one tell more.
+
+        They do where messages stand outside chunks, and where the index does not fit a file that is whole.
+        """
+        by_place = {chunk.at - _HEAD_BYTES: chunk for chunk in chunks}
+        if len(by_place) == len(chunks) and self._reaches_end(by_place):
+            return chunks
+        if self._reaches_end(None):
+            return None
+        standing = []
+        for at, chunk in by_place.items():
+            if self._head(at) == (_CHUNK, chunk.length):
+                standing.append(chunk)
+            else:
+                self.problems.say(f"no chunk at byte {at}, where the index says one is")
+        return standing or None
+
+    def _reaches_end(self, chunks: dict[int, _Chunk] | None) -> bool:
+        """Say whether the records follow one another to the end of the data.
+
+        Parameters
+        ----------
+        chunks : by file offset of their record; they must be all there are, with no message outside them. None: any.
+        """
+        at, left = len(MAGIC), dict(chunks or {})
+        while True:
+            opcode, length = self._head(at)
+            if opcode in (_FOOTER, _DATA_END):
+                return not left
+            if opcode == 0 or length > self._size - at - _HEAD_BYTES:
+                return False
+            chunk = left.pop(at, None)
+            if chunks is not None and (opcode == MCAP_MESSAGE or (opcode == _CHUNK) != (chunk is not None)):
+                return False
+            at += _HEAD_BYTES + length
+            if chunk is not None:
+                if chunk.length != length:
+                    return False
+                at += chunk.index_length
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Return opcode and length of the record at a file offset; opcode 0 where none stands."""
+        if not 0 <= at < self._size:
+            return 0, 0
+        self._stream.seek(at)
+        head = self._stream.read(_HEAD_BYTES)
+        return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
+
+    def _walk(self, *, learn: bool = False) -> Iterator[Block]:
+        """Go through the records one after the other, as far as they can be read.
+
+        Parameters
+        ----------
+        learn : remember schemas and channels
+        """
+        at = len(MAGIC)
+        while True:
+            opcode, length = self._head(at)
+            left = self._size - at - _HEAD_BYTES
+            if opcode in (_FOOTER, _DATA_END):
+                return
+            if opcode == _CHUNK:
+                chunk = _Chunk(at + _HEAD_BYTES, min(length, left))
+                yield from self._read_chunk(chunk, learn=learn, cut=length > left)
+            elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
+                block, length = self._read_loose(at, length, learn=learn)
+                if block is not None:
+                    yield block
+            if opcode == 0 or length > left:
+                break
+            at += _HEAD_BYTES + length
+        self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
+
+    def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
+        """Read a run of records that stand outside chunks; return them and the bytes consumed after the first 9."""
+        stop = 0
+        if length <= LARGEST_CHUNK_BYTES:
+            self._stream.seek(at)
+            piece = np.frombuffer(self._stream.read(max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
+            rows, stop = self._table.scan_mcap(piece)
+            if stop:
+                return self._messages(piece, rows, learn=learn), stop - _HEAD_BYTES
+        self.problems.say(f"record at byte {at} left out: damaged")
+        return None, length
+
+    def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        try:
+            if chunk.length > LARGEST_CHUNK_BYTES:
+                raise DecompressionError(f"it claims {chunk.length} bytes")
+            self._stream.seek(chunk.at)
+            records = np.frombuffer(_chunk_records(self._stream.read(chunk.length), cut=cut), np.uint8)
+        except DecompressionError as err:
+            if not cut:
+                self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
+            return
+        stop, begin = 0, -1
+        while begin < stop < len(records):
+            begin = stop
+            rows, stop = self._table.scan_mcap(records, begin)
+            yield self._messages(records, rows, learn=learn)
+        if stop < len(records) and not cut:
+            lost = f"{len(records) - stop} of {len(records)} bytes left out, damaged"
+            self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES}: {lost}")
+
+    def _messages(self, data: Bytes, rows: NDArray[np.int64], *, learn: bool) -> Block:
+        is_message = rows[:, 0] == MCAP_MESSAGE
+        if learn:
+            for row in rows[~is_message]:
+                self._learn(int(row[0]), bytes(data[row[3] : row[4]]))
+        rows = rows[is_message]
+        block = Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
+        return with_possible_times(block, self.problems)
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        """Remember a schema or channel record that the walk came upon."""
+        from mcap.records import Channel as McapChannel
+        from mcap.records import Schema
+
+        record = _parse(opcode, content)
+        if isinstance(record, Schema):
+            known = self._schemas.setdefault(record.id, record) == record
+        elif isinstance(record, McapChannel):
+            known = self._channels.setdefault(record.id, record) == record
+        else:
+            self.problems.say("a schema or channel that cannot be read was left out")
+            return
+        if not known:
+            what = f"{type(record).__name__.lower()} {record.id}"
+            self.problems.say(f"{what} is described twice, differently; the first description was used")
+
+
+def _parse(opcode: int, content: bytes) -> _Parsed | None:
+    """Return a schema, channel, chunk index or statistics record, None where it is damaged."""
+    from io import BytesIO
+
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+    from mcap.records import Channel as McapChannel
+    from mcap.records import ChunkIndex, Schema, Statistics
+
+    kinds: dict[int, type[Schema | McapChannel | ChunkIndex | Statistics]] = {
+        MCAP_SCHEMA: Schema,
+        MCAP_CHANNEL: McapChannel,
+        _CHUNK_INDEX: ChunkIndex,
+        _STATISTICS: Statistics,
+    }
+    try:
+        record: _Parsed = kinds[opcode].read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct.error, ValueError, OverflowError, MemoryError):
+        return None
+    return record
+
+
+def _chunk_records(content: bytes, *, cut: bool) -> bytes:
+    """Return the records of a chunk record's content, decompressed and checked against its checksum."""
+    if len(content) < 40:
+        raise DecompressionError("its header is cut off")
+    size = int.from_bytes(content[16:24], "little")
+    checksum = int.from_bytes(content[24:28], "little")
+    name_end = 32 + int.from_bytes(content[28:32], "little")
+    compression = content[32 : min(name_end, 32 + 64)].decode("ascii", "replace")
+    if name_end + 8 > len(content):
+        raise DecompressionError("its header is damaged")
+    length = int.from_bytes(content[name_end : name_end + 8], "little")
+    packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
+    if len(packed) < length and not cut:
+        raise DecompressionError("its header is damaged")
+    data = decompress(packed, compression, size, partial=cut)
+    if checksum and not cut and zlib.crc32(data) != checksum:
+        raise DecompressionError("its checksum is wrong")
+    return data
+
+
+def is_mcap(stream: BinaryIO) -> bool:
+    """Say whether a stream begins like an MCAP file."""
+    return stream.read(len(MAGIC)) == MAGIC

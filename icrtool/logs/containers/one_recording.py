@@ -1,0 +1,97 @@
+"""Whether what lies in a directory without metadata.yaml is one recording: by the files' kinds, then by their times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import some_of
+
+STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
+
+LONGEST_PAUSE_S = 3600.0
+"""The files of a split recording follow each other at once; a pause in it may last, but not so long."""
+
+LEAST_OVERLAP_S = 1.0
+"""A recorder that fills one buffer while it writes another lets the files of a split overlap by less."""
+
+
+class Span(NamedTuple):
+    """First and last log time of a file's messages [ns]."""
+
+    begin_ns: int
+    end_ns: int
+    file: str
+
+
+def storage_files(directory: Path) -> list[Path]:
+    """Return the storage files of a directory, ``bag_10`` after ``bag_9``.
+
+    Raises
+    ------
+    LogError
+        There is none, or there are recordings of several kinds, of which one must be named.
+    """
+    found = sorted((file for file in directory.iterdir() if _is_storage(file)), key=_natural_key)
+    others = sorted((entry for entry in directory.iterdir() if _is_other_log(entry)), key=_natural_key)
+    kinds = {match[1] for file in found if (match := STORAGE.search(file.name))}
+    if not found and len(others) == 1:
+        raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} lies in it", "name that")
+    if len(kinds) > 1 or others:
+        why = f"holds more than one recording: {some_of([entry.name for entry in (*found, *others)])}"
+        raise LogError(directory, why, "name one of them")
+    if not found and (directory / "run.json").is_file():
+        raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
+    runs = sorted(entry.parent.name for entry in directory.glob("*/run.json")) if not found else []
+    if runs:
+        raise LogError(directory, f"holds runs, not a log: {some_of(runs)}", "icrtool dropout-report reads one of them")
+    if not found:
+        raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
+    return found
+
+
+def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
+    """Hold the times of files that were found by name against each other.
+
+    Returns
+    -------
+    list of str
+        What is odd about them.
+
+    Raises
+    ------
+    LogError
+        They are recordings of different times.
+    """
+    ordered, odd = sorted(spans), []
+    for number, (before, after) in enumerate(pairwise(ordered)):
+        pause_s = (after.begin_ns - max(span.end_ns for span in ordered[: number + 1])) / 1e9
+        if pause_s > LONGEST_PAUSE_S:
+            why = f"not one recording: {pause_s / 3600:.1f} h pass between {before.file} and {after.file}"
+            raise LogError(directory, why, f"name one of {some_of([span.file for span in ordered])}")
+        overlap_s = (min(before.end_ns, after.end_ns) - after.begin_ns) / 1e9
+        if overlap_s > LEAST_OVERLAP_S:
+            odd.append(
+                f"{before.file} and {after.file} overlap by {overlap_s:.0f} s and were read as one recording; "
+                "if they are two, name one of them"
+            )
+    return odd
+
+
+def _is_storage(entry: Path) -> bool:
+    return STORAGE.search(entry.name) is not None and entry.is_file()
+
+
+def _is_other_log(entry: Path) -> bool:
+    """Say whether an entry is a ROS 1 bag, or a bag directory of its own."""
+    if entry.is_dir():
+        return (entry / "metadata.yaml").is_file()
+    return entry.suffix == ".bag" and entry.is_file()
+
+
+def _natural_key(path: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

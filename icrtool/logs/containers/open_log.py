@@ -1,0 +1,52 @@
+"""From a path to an opened container, by content, not by name."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.bag_directory import BagDirectory
+from icrtool.logs.containers.channel import Container
+from icrtool.logs.containers.mcap_file import McapFile, is_mcap
+from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
+from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
+
+KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
+
+
+def open_log(path: Path) -> Container:
+    """Open a log.
+
+    Raises
+    ------
+    LogError
+        No such path, an empty file, none of the containers, or one of which nothing can be read.
+    """
+    try:
+        container = _open(path)
+    except FileNotFoundError as err:
+        raise LogError(path, "no such file or directory") from err
+    except OSError as err:
+        raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+    if container.problems and not container.channels:
+        container.close()
+        raise LogError(path, "nothing in it can be read", container.problems[0])
+    return container
+
+
+def _open(path: Path) -> Container:
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        return BagDirectory(path)
+    if not stat.S_ISREG(mode):
+        # A pipe would be waited for, and none of the containers can be read without going back.
+        raise LogError(path, "not a file", f"a log is {KINDS}")
+    with path.open("rb") as stream:
+        if not stream.read(1):
+            raise LogError(path, "an empty file", "the recording never began, or the copy failed")
+        for is_kind, container in ((is_mcap, McapFile), (is_ros1_bag, Ros1Bag), (is_sqlite, SqliteBag)):
+            stream.seek(0)
+            if is_kind(stream):
+                return container(path)
+    raise LogError(path, "not a log", f"a log is {KINDS}")

@@ -1,0 +1,235 @@
+"""ROS 1 bags, version 2.0: indexed or not, whole or cut off (http://wiki.ros.org/Bags/Format/2.0)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import Block, Bytes, Channel, Problems, printable, ros_type_name
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress
+from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
+from icrtool.records.tables import Ints
+
+MAGIC = b"#ROSBAG V2.0\n"
+_BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
+_LARGEST_HEADER_BYTES = 1 << 24
+
+
+class _Record(NamedTuple):
+    """A top-level record: header fields, file offset of its data, length of its data."""
+
+    fields: dict[bytes, bytes]
+    at: int
+    length: int
+
+    @property
+    def op(self) -> int:
+        return self.number(b"op", 1)
+
+    def number(self, name: bytes, size: int = 4) -> int:
+        return int.from_bytes(self.fields.get(name, b"")[:size], "little")
+
+    def text(self, name: bytes) -> str:
+        return self.fields.get(name, b"").decode("utf-8", "replace")
+
+
+class _Chunk(NamedTuple):
+    """File offset of a chunk record; the connections in it, where the index tells."""
+
+    at: int
+    connections: frozenset[int] | None
+
+
+class Ros1Bag:
+    """One ROS 1 bag.
+
+    Raises
+    ------
+    LogError
+        Not a bag of version 2.0, or encrypted.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.files = [path]
+        self.problems = Problems(path.name)
+        self._table = RecordTable()
+        self._connections: dict[int, Channel] = {}
+        self._stream = path.open("rb")
+        try:
+            self._size = path.stat().st_size
+            self._check_start()
+            self._chunks = self._read_index()
+            if self._chunks is None:
+                self.problems.say("has no index (not closed, or cut off); read from start to end")
+                for _ in self._walk(learn=True):
+                    pass
+        except BaseException:
+            self.close()
+            raise
+        self.channels = list(self._connections.values())
+
+    def share_read(self) -> float:
+        """Return the place in the file as a share of its size."""
+        return self._stream.tell() / max(self._size, 1)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._stream.close()
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted connections, chunk by chunk."""
+        if not wanted:
+            return
+        if self._chunks is None:
+            yield from self._walk()
+            return
+        for chunk in self._chunks:
+            if chunk.connections is not None and not chunk.connections & wanted:
+                continue
+            record = self._record(chunk.at)
+            if record is None or record.op != _CHUNK:
+                self.problems.say(f"no chunk at byte {chunk.at}, where the index says one is")
+                continue
+            yield from self._read_chunk(record)
+
+    def _check_start(self) -> None:
+        start = self._stream.read(len(MAGIC))
+        if start[:9] == MAGIC[:9] and start != MAGIC:
+            raise LogError(
+                self._path, "a bag of another version", "only 2.0 is read; `rosbag fix` turns older ones into it"
+            )
+        if start != MAGIC:
+            raise LogError(self._path, "not a ROS 1 bag", "its first bytes are not a bag's")
+
+    def _record(self, at: int) -> _Record | None:
+        """Read the header of the record at a file offset; None where no whole header stands."""
+        if not 0 <= at < self._size:
+            return None
+        self._stream.seek(at)
+        header_length = int.from_bytes(self._stream.read(4), "little")
+        if header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
+            return None
+        fields = _header_fields(self._stream.read(header_length))
+        length = int.from_bytes(self._stream.read(4), "little")
+        return _Record(fields, at + header_length + 8, length)
+
+    def _read_index(self) -> list[_Chunk] | None:
+        """Return the chunks by the bag's index; None where there is none, or it is damaged."""
+        first = self._record(len(MAGIC))
+        if first is None or first.op != _BAG_HEADER:
+            return None
+        if first.text(b"encryptor"):
+            raise LogError(self._path, "an encrypted bag", "decrypt it first")
+        at = first.number(b"index_pos", 8)
+        if at <= 0:
+            return None
+        chunks: dict[int, _Chunk] = {}
+        counts: dict[int, int] = {}
+        while at != self._size:
+            record = self._record(at)
+            if record is None or record.length > min(_LARGEST_HEADER_BYTES, self._size - record.at):
+                return None
+            self._stream.seek(record.at)
+            content = self._stream.read(record.length)
+            if record.op == BAG_CONNECTION:
+                self._learn(record.number(b"conn"), record.text(b"topic"), content)
+            elif record.op == _CHUNK_INFO:
+                held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
+                for connection, count in held:
+                    counts[connection] = counts.get(connection, 0) + count
+                place = record.number(b"chunk_pos", 8)
+                chunks[place] = _Chunk(place, frozenset(connection for connection, _ in held) or None)
+            else:
+                return None
+            at = record.at + record.length
+        if (len(chunks), len(self._connections)) != (first.number(b"chunk_count"), first.number(b"conn_count")):
+            return None
+        self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
+        return sorted(chunks.values(), key=lambda chunk: chunk.at)
+
+    def _walk(self, *, learn: bool = False) -> Iterator[Block]:
+        """Go through the records one after the other, as far as they can be read.
+
+        Parameters
+        ----------
+        learn : remember connections
+        """
+        at = len(MAGIC)
+        while at < self._size:
+            record = self._record(at)
+            if record is None or not 0 < record.op <= BAG_CONNECTION:
+                break
+            cut = record.length > self._size - record.at
+            if record.op == _CHUNK:
+                yield from self._read_chunk(record, learn=learn, cut=cut)
+            if cut:
+                break
+            if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_HEADER_BYTES:
+                self._stream.seek(record.at)
+                self._learn(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
+            at = record.at + record.length
+        if at < self._size:
+            self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
+
+    def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        size = record.number(b"size")
+        try:
+            if record.length > LARGEST_CHUNK_BYTES:
+                raise DecompressionError(f"it claims {record.length} bytes")
+            self._stream.seek(record.at)
+            packed = self._stream.read(record.length)
+            data = np.frombuffer(decompress(packed, record.text(b"compression"), size, partial=cut), np.uint8)
+        except DecompressionError as err:
+            if not cut:
+                self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")
+            return
+        stop, begin = 0, -1
+        while begin < stop < len(data):
+            begin = stop
+            rows, stop = self._table.scan_bag(data, begin)
+            yield self._messages(data, rows, learn=learn)
+        if stop < len(data) and not cut:
+            self.problems.say(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+
+    def _messages(self, data: Bytes, rows: Ints, *, learn: bool) -> Block:
+        if learn:
+            for _, number, header, start, end in rows[rows[:, 0] == BAG_CONNECTION].tolist():
+                topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
+                self._learn(number, topic, bytes(data[start:end]))
+        rows = rows[rows[:, 0] == BAG_MESSAGE]
+        return Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
+
+    def _learn(self, number: int, topic: str, content: bytes) -> None:
+        """Remember a connection record; `content` is the header that the publisher sent."""
+        fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
+        if number in self._connections or b"type" not in fields:
+            return
+        self._connections[number] = Channel(
+            id=number,
+            topic=printable(topic or fields.get(b"topic", "")),
+            message_type=ros_type_name(fields[b"type"]),
+            encoding="ros1",
+            definition=fields.get(b"message_definition", ""),
+        )
+
+
+def _header_fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a record's or a connection's header by name."""
+    fields, place = {}, 0
+    while place + 4 <= len(header):
+        end = place + 4 + int.from_bytes(header[place : place + 4], "little")
+        name, _, value = header[place + 4 : end].partition(b"=")
+        fields[name] = value
+        place = end
+    return fields
+
+
+def is_ros1_bag(stream: BinaryIO) -> bool:
+    """Say whether a stream begins like a ROS 1 bag of any version."""
+    return stream.read(9) == MAGIC[:9]

@@ -1,0 +1,269 @@
+"""rosbag2's sqlite3 storage: one ``.db3`` file, whole or damaged, with or without a write-ahead log beside it."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+import numpy as np
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import Block, Channel, Problems, printable, ros_type_name, with_possible_times
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
+
+MAGIC = b"SQLite format 3\0"
+_FIRST_ROWS, _MOST_ROWS = 64, 4096
+_BLOCK_BYTES = 1 << 24
+_UNKNOWN_ROWS = 1 << 40
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError)
+"""What sqlite3 raises; the latter where a damaged name stands in its message."""
+
+Row = tuple[Any, Any, Any, Any, int, int]
+"""Topic ids, log times [ns], sizes, messages; last row number, count of messages that are bytes.
+
+SQLite holds a column to no type.
+"""
+
+
+class SqliteBag:
+    """One ``.db3`` file.
+
+    Parameters
+    ----------
+    message_compression : how each message was compressed on its own (rosbag2's metadata.yaml tells), empty if not told
+
+    Raises
+    ------
+    LogError
+        Not an SQLite file, or not one of rosbag2's.
+    """
+
+    def __init__(self, path: Path, message_compression: str = "") -> None:
+        self._path = path
+        self.files = [path]
+        self.problems = Problems(path.name)
+        self._made_beside: Path | None = None
+        self._last_row = 0
+        try:
+            self._database = self._connect()
+            try:
+                self.channels = self._read_topics()
+                self._message_compression = message_compression or self._found_compression()
+                self._rows = self._count_rows()
+            except BaseException:
+                self.close()
+                raise
+        except _DAMAGE as err:
+            found = "; ".join([printable(str(err)), *self.problems])
+            raise LogError(path, "not a readable rosbag2 database", found) from err
+
+    def share_read(self) -> float:
+        """Return the last row read as a share of all rows."""
+        return self._last_row / max(self._rows, 1)
+
+    def close(self) -> None:
+        """Release the database; nothing stays beside it that was not there before."""
+        self._database.close()
+        if self._made_beside is not None:
+            self._made_beside.unlink(missing_ok=True)
+
+    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted topics in the order they were stored."""
+        if not wanted:
+            return
+        blocks = self._stored(wanted)
+        if self._message_compression:
+            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
+        yield from blocks
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open the database to read, with the write-ahead log that a recorder leaves when it is killed."""
+        log, index = (self._path.with_name(self._path.name + end) for end in ("-wal", "-shm"))
+        if log.exists() and log.stat().st_size:
+            self._made_beside = None if os.path.lexists(index) else index
+            database = self._open("mode=ro")
+            try:
+                database.execute("SELECT name FROM sqlite_master")
+            except _DAMAGE as err:
+                database.close()
+                self.problems.say(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
+            else:
+                return database
+        # Without `immutable` SQLite wants to write beside a log that was recorded in WAL mode.
+        database = self._open("mode=ro&immutable=1")
+        try:
+            database.execute("SELECT name FROM sqlite_master")
+        except _DAMAGE:
+            # SQLite refuses a file that is shorter than its header says. With this it reads the pages that are there.
+            database.execute("PRAGMA writable_schema = ON")
+        return database
+
+    def _open(self, mode: str) -> sqlite3.Connection:
+        name = quote(os.fsencode(self._path.resolve()))
+        database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK_BYTES)
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
+        return database
+
+    def _read_topics(self) -> list[Channel]:
+        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(map(str, tables))) or 'none'}")
+        definitions = self._read_definitions() if "message_definitions" in tables else {}
+        channels = []
+        for number, topic, name, encoding in self._database.execute(
+            "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer' ORDER BY id"
+        ):
+            written, text = definitions.get(name, ("", ""))
+            channels.append(
+                Channel(
+                    id=number,
+                    topic=printable(str(topic)),
+                    message_type=ros_type_name(str(name)),
+                    encoding=printable(str(encoding)),
+                    definition=text if written in ("ros2msg", "ros2idl") else "",
+                    definition_format="idl" if written == "ros2idl" else "msg",
+                )
+            )
+        return channels
+
+    def _read_definitions(self) -> dict[str, tuple[str, str]]:
+        """Return encoding and text of the message definitions by type."""
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        try:
+            return {name: (encoding, str(text)) for name, encoding, text in self._database.execute(query)}
+        except _DAMAGE as err:
+            self.problems.say(f"its message definitions cannot be read ({err})")
+            return {}
+
+    def _found_compression(self) -> str:
+        """Tell message compression by the first message: a serialised one never begins like a compressed one."""
+        try:
+            first = self._database.execute("SELECT data FROM messages LIMIT 1").fetchone()
+        except _DAMAGE:
+            return ""
+        return "zstd" if first and isinstance(first[0], bytes) and first[0].startswith(ZSTD_MAGIC) else ""
+
+    def _count_rows(self) -> int:
+        try:
+            return self._database.execute("SELECT max(rowid) FROM messages").fetchone()[0] or 0
+        except _DAMAGE:
+            return _UNKNOWN_ROWS
+
+    def _stored(self, wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages as they are stored; where pages are damaged, go on behind them."""
+        batch = self._batch_query(wanted)
+        after, count, step = 0, _FIRST_ROWS, 1
+        while after < self._rows:
+            try:
+                block, last = batch(after, count)
+            except _DAMAGE as err:
+                if count == 1:
+                    self.problems.say(f"damaged ({err}); what could be read of it was read")
+                    after, step = after + step, 2 * step
+                count = max(count // 2, 1)
+                continue
+            if last is None:
+                return
+            step = 1
+            if block is None and count > 1:
+                count //= 2
+                continue
+            self._last_row = after = max(after + 1, last)
+            if block is None:
+                self.problems.say("rows without a time or a message left out")
+                continue
+            yield with_possible_times(block, self.problems)
+            by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
+            count = max(1, min(4 * count, _MOST_ROWS, by_size))
+
+    def _rows_cut_off(self) -> frozenset[int]:
+        """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it.
+
+        Notes
+        -----
+        A message that is longer than a page and has its tail there is not found; what is needed is shorter.
+        """
+        size = self._path.stat().st_size
+        with self._path.open("rb") as stream:
+            # The field has two bytes, and 1 stands for 65536.
+            page_bytes = int.from_bytes(stream.read(18)[16:], "big")
+            page_bytes = page_bytes if page_bytes > 1 else 1 << 16
+            if size % page_bytes == 0:
+                return frozenset()
+            stream.seek(size - size % page_bytes)
+            page = stream.read()
+        self.problems.say("cut off; what could be read of it was read")
+        return frozenset(row for row, end in _table_rows(page) if end > len(page))
+
+    def _batch_query(self, wanted: frozenset[int]) -> Callable[[int, int], tuple[Block | None, int | None]]:
+        """Return what reads up to so many messages behind a row.
+
+        It gives them, None where they cannot be joined, and their last row, None where no row is left.
+
+        Notes
+        -----
+        SQLite joins the messages of a batch itself, without one Python object each and with the interpreter free. What
+        it cannot join (a column holds any type) is left to a batch of one.
+        """
+        # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
+        topics, lost = (",".join(str(number) for number in sorted(rows)) for rows in (wanted, self._rows_cut_off()))
+        rows = (
+            "SELECT topic_id AS topic, timestamp AS time, length(data) AS size, data, rowid AS number, "  # noqa: S608
+            "typeof(data) = 'blob' AS sound FROM messages "
+            f"WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) AND rowid > ? ORDER BY rowid LIMIT ?"
+        )
+        joined = (
+            "SELECT group_concat(topic), group_concat(time), group_concat(size), CAST(group_concat(data, '') AS BLOB), "  # noqa: S608
+            f"max(number), sum(sound) FROM ({rows})"
+        )
+
+        def batch(after: int, count: int) -> tuple[Block | None, int | None]:
+            row = self._database.execute(joined if count > 1 else rows, (after, count)).fetchone()
+            return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
+
+        return batch
+
+
+def _packed(row: Row) -> Block | None:
+    """Return the messages of a joined row, None where some are no messages or have no time."""
+    *texts, data, _, count = row
+    try:
+        topics, times, sizes = (np.fromstring(str(text), np.int64, sep=",") for text in texts)
+    except ValueError:
+        return None
+    end = np.cumsum(sizes)
+    if not len(topics) == len(times) == len(sizes) == count or not isinstance(data, bytes) or end[-1] != len(data):
+        return None
+    return Block(np.frombuffer(data, np.uint8), topics, times, end - sizes, end)
+
+
+def _table_rows(page: bytes) -> Iterator[tuple[int, int]]:
+    """Yield row number and end of the rows on a leaf page of a table (https://sqlite.org/fileformat.html, 1.6)."""
+    if page[:1] != b"\x0d":
+        return
+    count = min(int.from_bytes(page[3:5], "big"), (len(page) - 8) // 2)
+    for (place,) in struct.iter_unpack(">H", page[8 : 8 + 2 * max(count, 0)]):
+        length, at = _variable_integer(page, place)
+        row, at = _variable_integer(page, at)
+        yield row, at + length
+
+
+def _variable_integer(page: bytes, at: int) -> tuple[int, int]:
+    """Return SQLite's integer of one to nine bytes at a place, and the place behind it."""
+    value = 0
+    for byte in page[at : at + 8]:
+        value, at = value << 7 | byte & 0x7F, at + 1
+        if byte < 0x80:
+            return value, at
+    return value << 8 | int.from_bytes(page[at : at + 1], "big"), at + 1
+
+
+def is_sqlite(stream: BinaryIO) -> bool:
+    """Say whether a stream begins like an SQLite database."""
+    return stream.read(len(MAGIC)) == MAGIC

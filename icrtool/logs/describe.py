@@ -1,0 +1,113 @@
+"""What a surveyed log holds, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icrtool.logs.read_log import Survey
+from icrtool.logs.streams.heading_sources import HeadingSource
+from icrtool.logs.streams.position_sources import PositionSource
+from icrtool.logs.streams.stamps import rate_and_jitter
+from icrtool.logs.streams.wheel_sources import WheelMotion
+from icrtool.records.tables import Ints, RobotLog
+
+GAP_IN_INTERVALS = 5.0
+
+
+def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bool) -> str:
+    """Return the text of ``icrtool info``: topics, rates, gaps, stamps, candidates by role, the choice.
+
+    Parameters
+    ----------
+    measured : the assembled log, None when it cannot be used
+    everything : list the topics of types that no role can use, too
+    """
+    size = sum(file.bytes for file in survey.inputs)
+    topics, files = _count(len(survey.channels), "topic"), _count(len(survey.inputs), "file")
+    lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
+    lines += _topics(survey, everything=everything)
+    chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
+    for role, sources in (
+        ("wheels", survey.candidates.wheels),
+        ("gnss", survey.candidates.gnss),
+        ("heading", survey.candidates.heading),
+    ):
+        lines.append(f"\n{role} (* chosen):")
+        lines += _candidates(sources, chosen[role].topic if role in chosen else None)
+        if role in chosen:
+            stream = chosen[role]
+            lines.append(f"  -> {stream.topic}: {stream.why}")
+            lines.append(
+                f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, "
+                f"jitter {stream.jitter_ms:.3g} ms"
+            )
+    if measured is not None and measured.gyro is not None:
+        gyro = measured.gyro
+        lines.append(f"\ngyro:\n  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter")
+    if measured is not None:
+        spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
+        overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
+        lines.append(f"\nall three overlap for {max(overlap, 0):.1f} s")
+    return "\n".join(lines)
+
+
+def _topics(survey: Survey, *, everything: bool) -> list[str]:
+    tables = {table.topic: table for table in survey.tables}
+    lines, width = [], max((len(channel.topic) for channel in survey.channels), default=0)
+    unused = 0
+    for topic, channel in {channel.topic: channel for channel in survey.channels}.items():
+        table = tables.get(topic)
+        if table is None and not everything and topic not in survey.candidates.unread:
+            unused += 1
+            continue
+        text = f"  {topic:<{width}}  {channel.message_type}"
+        if table is not None:
+            rate, _ = rate_and_jitter(table.log_time_ns)
+            text += (
+                f"  {_count(len(table), 'message')}{f', {rate:.4g} Hz' if rate > 0 else ''}{_gaps(table.log_time_ns)}"
+            )
+            if table.unreadable:
+                text += f", {table.unreadable} unreadable"
+        elif topic in survey.candidates.unread:
+            text += f"  not read: {survey.candidates.unread[topic]}"
+        elif channel.count is not None:
+            text += f"  {_count(channel.count, 'message')}, no role"
+        else:
+            text += "  no role"
+        lines.append(text)
+    if unused:
+        lines.append(f"  and {unused} of types that no role can use (-v lists them)")
+    return lines
+
+
+def _gaps(stamps: Ints) -> str:
+    """Say how many intervals are far longer than usual, and the longest."""
+    if len(stamps) < 3:
+        return ""
+    interval = np.diff(stamps) / 1e9
+    long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
+    if not long.any():
+        return ""
+    return f", {_count(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
+
+
+def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource], chosen: str | None) -> list[str]:
+    if not sources:
+        return ["  no candidate"]
+    lines = []
+    for source in sources:
+        mark = "*" if source.topic == chosen else "-"
+        clock = (
+            source.stamps.note
+            or f"header stamps, {round(source.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
+        )
+        refused = "used all the same, as configured" if source.topic == chosen else "cannot be used"
+        verdict = f"{refused}: {source.problem}" if source.problem else source.why
+        lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
+    return lines

@@ -1,0 +1,1 @@
+"""Message definitions and decoding: blocks of raw messages to a table of columns per topic."""

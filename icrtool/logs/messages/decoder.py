@@ -1,0 +1,306 @@
+"""The compiled loop that runs a layout's program over raw messages."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.compiled import njit
+from icrtool.logs.containers.channel import Bytes
+from icrtool.logs.messages.schema import (
+    BEGIN_LOOP,
+    END_LOOP,
+    SKIP,
+    SKIP_SEQUENCE,
+    SKIP_STRING,
+    TAKE,
+    TAKE_SEQUENCE,
+    TAKE_STRING,
+    Layout,
+)
+from icrtool.records.tables import Bools, Ints
+
+_MAX_NESTING = 8
+_MOST_REMEMBERED = 512
+"""Ranges and columns of a message's shape; of messages with more, each one is walked."""
+
+_ZERO, _FOUR, _AS_BEFORE = (cast(int, np.int64(value)) for value in (0, 4, -1))
+"""With a type: of a function that is called with a plain number numba compiles a copy for that number."""
+
+_ITS_PLACE = _ZERO
+"""`_AS_BEFORE` and this stand in place of a size: for what is the same in all messages of a shape, and for the place
+of a text."""
+
+_CDR_LITTLE, _CDR_BIG = 1, 0
+_FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
+
+
+@njit
+def four_bytes(data: Bytes, at: np.uint64) -> np.uint64:
+    """Return four bytes as a little-endian unsigned number.
+
+    Notes
+    -----
+    The compiler makes one load of it: unsigned indices do not count from the end, and there is no loop.
+    """
+    return (
+        np.uint64(data[at])
+        | np.uint64(data[at + np.uint64(1)]) << np.uint64(8)
+        | np.uint64(data[at + np.uint64(2)]) << np.uint64(16)
+        | np.uint64(data[at + np.uint64(3)]) << np.uint64(24)
+    )
+
+
+@njit
+def eight_bytes(data: Bytes, at: np.uint64) -> np.uint64:
+    """Return eight bytes as a little-endian unsigned number."""
+    return four_bytes(data, at) | four_bytes(data, at + np.uint64(4)) << np.uint64(32)
+
+
+@njit
+def read_word(data: Bytes, at: int, size: int, big: int) -> np.uint64:
+    """Return `size` bytes as an unsigned number; `big` is 1 where the first of them is the most significant."""
+    place, value = np.uint64(at), np.uint64(0)
+    if size == 8 and not big:
+        return eight_bytes(data, place)
+    if size == 4 and not big:
+        return four_bytes(data, place)
+    for i in range(size):
+        byte = np.uint64(data[place + np.uint64(i)])
+        value = value << np.uint64(8) | byte if big else value | byte << np.uint64(8 * i)
+    return value
+
+
+@njit
+def hash_text(data: Bytes, at: int, length: int) -> np.uint64:
+    """Return a 64-bit hash of `length` bytes, eight at a time (FNV-1a over words, folded so that no bit is lost)."""
+    code = _FNV_OFFSET ^ np.uint64(length)
+    place, words_end = at, at + (length & ~7)
+    while place < words_end:
+        code = (code ^ eight_bytes(data, np.uint64(place))) * _FNV_PRIME
+        code ^= code >> np.uint64(29)
+        place += 8
+    if place < at + length:
+        code = (code ^ read_word(data, place, at + length - place, _ZERO)) * _FNV_PRIME
+        code ^= code >> np.uint64(29)
+    return code
+
+
+@njit
+def remember_same(same: Ints, used: int, first: int, stop: int) -> int:
+    """Add the bytes [first, stop) to those that make the shape of a message; return how many ranges are used now."""
+    if 0 < used <= len(same) and same[used - 1, 1] == first:
+        same[used - 1, 1] = stop
+        return used
+    if used < len(same):
+        same[used, 0], same[used, 1] = first, stop
+    return used + 1
+
+
+@njit
+def remember_column(taken: Ints, used: int, place: int, size: int, column: int) -> int:
+    """Add a column to those that a message of this shape fills; return how many are used now."""
+    if used < len(taken):
+        taken[used, 0], taken[used, 1], taken[used, 2] = place, size, column
+    return used + 1
+
+
+@njit
+def has_shape(data: Bytes, begin: int, model: int, same: Ints, ranges: int) -> bool:
+    """Say whether the message at `begin` equals the one at `model` in the ranges of bytes that make its shape."""
+    for k in range(ranges):
+        place, stop = same[k, 0], same[k, 1]
+        while place + 8 <= stop:
+            if eight_bytes(data, np.uint64(begin + place)) != eight_bytes(data, np.uint64(model + place)):
+                return False
+            place += 8
+        while place < stop:
+            if data[begin + place] != data[model + place]:
+                return False
+            place += 1
+    return True
+
+
+@njit
+def fill_row(
+    data: Bytes, begin: int, big: int, taken: Ints, columns: int, model: int, m: int, table: NDArray[np.uint64]
+) -> None:
+    """Fill row m of `table` from the message at `begin`, whose shape is that of the message of row `model`."""
+    for k in range(columns):
+        place, size, column = taken[k, 0], taken[k, 1], taken[k, 2]
+        if size == _AS_BEFORE:
+            table[m, column] = table[model, column]
+        elif size == _ITS_PLACE:
+            table[m, column] = np.uint64(begin + place)
+        else:
+            table[m, column] = read_word(data, begin + place, size, big)
+
+
+@njit
+def walk(
+    data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools
+) -> None:
+    """Fill a row of `table` (n, columns) per message; `readable` (n,) says which messages had the program's shape.
+
+    Nothing is read outside [start, end); a message that is shorter than its layout, or of an encapsulation that is
+    not plain CDR, is not readable.
+    """
+    walk_new_shapes(data, start, end, program, cdr, table, readable, np.empty(len(start), np.bool_))
+
+
+@njit
+def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
+    data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools,
+    walked: Bools,
+) -> None:  # fmt: skip
+    """Do what `walk` does; `walked` (n,) says which messages the program ran over.
+
+    The messages of a topic are alike: their strings and sequences are as long, and their strings the same, as those of
+    the message before. The bytes that say so are remembered while the program runs over a message. Where they are the
+    same in the next one, its numbers are at the same places, and are taken from there.
+    """
+    returns, left, column_base, iteration = (
+        np.zeros(_MAX_NESTING, np.int64), np.zeros(_MAX_NESTING, np.int64),
+        np.zeros(_MAX_NESTING, np.int64), np.zeros(_MAX_NESTING, np.int64),
+    )  # fmt: skip
+    same, taken = np.empty((_MOST_REMEMBERED, 2), np.int64), np.empty((_MOST_REMEMBERED, 3), np.int64)
+    ranges, columns, model, big = _ZERO, _ZERO, _AS_BEFORE, _ZERO
+    for m in range(len(start)):
+        at, stop, base = start[m], end[m], start[m]
+        walked[m] = False
+        readable[m] = True
+        if model >= 0 and stop - at >= end[model] - start[model] and has_shape(data, at, start[model], same, ranges):
+            fill_row(data, at, big, taken, columns, model, m, table)
+            continue
+        walked[m] = True
+        ranges, columns, model, big = _ZERO, _ZERO, m, _ZERO
+        if cdr:
+            if stop - at < 4 or data[at] != 0 or data[at + 1] > _CDR_LITTLE:
+                readable[m], model = False, -1
+                continue
+            big = _ZERO + (data[at + 1] == _CDR_BIG)
+            ranges = remember_same(same, ranges, _ZERO, _FOUR)
+            at += 4
+            base = at
+        depth, shift, taking, step = 0, 0, True, 0
+        while step < len(program):
+            operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
+            capacity = program[step, 4]
+            if operation in (SKIP, TAKE):
+                if cdr:
+                    at += (base - at) & (size - 1)
+                if at + size * count > stop:
+                    readable[m] = False
+                    break
+                if operation == TAKE and taking:
+                    for i in range(count):
+                        table[m, column + shift + i] = read_word(data, at + i * size, size, big)
+                        columns = remember_column(taken, columns, at + i * size - start[m], size, column + shift + i)
+                at += size * count
+                step += 1
+                continue
+            if operation == END_LOOP:
+                left[depth - 1] -= 1
+                if left[depth - 1] > 0:
+                    loop = returns[depth - 1]
+                    iteration[depth - 1] += 1
+                    if program[loop, 4] > 0:
+                        shift = column_base[depth - 1] + iteration[depth - 1] * program[loop, 5]
+                        taking = iteration[depth - 1] < program[loop, 4]
+                    step = loop + 1
+                    continue
+                depth -= 1
+                shift = column_base[depth]
+                taking = depth == 0 or iteration[depth - 1] < max(program[returns[depth - 1], 4], 1)
+                step += 1
+                continue
+            if operation in (SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE) or (
+                operation == BEGIN_LOOP and count < 0
+            ):
+                if cdr:
+                    at += (base - at) & 3
+                if at + 4 > stop:
+                    readable[m] = False
+                    break
+                count = np.int64(read_word(data, at, _FOUR, big))
+                ranges = remember_same(same, ranges, at - start[m], at - start[m] + 4)
+                at += 4
+                if count > stop - at:
+                    readable[m] = False
+                    break
+                if operation in (TAKE_SEQUENCE, BEGIN_LOOP) and column >= 0 and taking:
+                    table[m, column + shift] = np.uint64(count)
+                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift)
+            if operation == BEGIN_LOOP:
+                if count == 0:
+                    step = program[step, 6]
+                    continue
+                # An element takes a byte at least: elements of no fields would loop for free.
+                if depth >= _MAX_NESTING or count > stop - at:
+                    readable[m] = False
+                    break
+                returns[depth], left[depth], column_base[depth], iteration[depth] = step, count, shift, 0
+                depth += 1
+                step += 1
+                continue
+            if operation in (SKIP_STRING, TAKE_STRING):
+                if operation == TAKE_STRING and taking:
+                    length = count - 1 if cdr and count > 0 else count
+                    code = hash_text(data, at, length)
+                    table[m, column + shift] = np.uint64(at)
+                    table[m, column + shift + 1] = np.uint64(length)
+                    table[m, column + shift + 2] = code
+                    ranges = remember_same(same, ranges, at - start[m], at - start[m] + length)
+                    columns = remember_column(taken, columns, at - start[m], _ITS_PLACE, column + shift)
+                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift + 1)
+                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift + 2)
+                at += count
+                step += 1
+                continue
+            if count > 0 and cdr:
+                at += (base - at) & (size - 1)
+            if at + size * count > stop:
+                readable[m] = False
+                break
+            if operation == TAKE_SEQUENCE and taking:
+                for i in range(min(count, capacity)):
+                    table[m, column + shift + 1 + i] = read_word(data, at + i * size, size, big)
+                    columns = remember_column(taken, columns, at + i * size - start[m], size, column + shift + 1 + i)
+            at += size * count
+            step += 1
+        if not readable[m] or ranges > _MOST_REMEMBERED or columns > _MOST_REMEMBERED:
+            model = -1
+
+
+def walk_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[NDArray[np.uint64], Bools]:
+    """Return the table (n, columns) of a layout's fields for messages in `data`, and which of them were readable."""
+    table = empty_table(layout, len(start))
+    readable, walked = np.empty((2, len(start)), np.bool_)
+    walk_into(layout, data, start, end, table, readable, walked)
+    return table, readable
+
+
+def empty_table(layout: Layout, rows: int) -> NDArray[np.uint64]:
+    """Return a table (rows, columns) for a layout, one column after the other in memory."""
+    return np.zeros((layout.columns, rows), np.uint64).T
+
+
+def walk_into(
+    layout: Layout, data: Bytes, start: Ints, end: Ints, table: NDArray[np.uint64], readable: Bools, walked: Bools
+) -> None:
+    """Fill `table` (n, columns) from messages in `data`; say which were readable, and which had another shape.
+
+    Parameters
+    ----------
+    readable : bool (n,), set where a message had the layout's shape
+    walked : bool (n,), not set where a message has the lengths and the texts of the one before
+    """
+    if layout.program[:, 2].max(initial=0) > len(data):
+        # A fixed array that is longer than all messages together: a definition that is not theirs. Its length times
+        # the size of an element may be more than an integer holds.
+        readable[:] = False
+        walked[:] = True
+    else:
+        walk_new_shapes(data, start, end, layout.program, layout.cdr, table, readable, walked)

@@ -1,0 +1,101 @@
+"""Message definitions: the log's own, else the bundled vendor ones, else the distribution's standard ones."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from icrtool.errors import DefinitionError
+from icrtool.logs.containers.channel import Channel
+from icrtool.logs.messages.schema import BASE, NAME, Definitions
+
+_SEPARATOR = "=" * 80 + "\n"
+_TIME: Definitions = {
+    f"builtin_interfaces/msg/{name}": ([], [("sec", (BASE, ("int32", 0))), ("nanosec", (BASE, ("uint32", 0)))])
+    for name in ("Time", "Duration")
+}
+"""ROS 1's time and duration have no definition of their own; a definition text may leave ROS 2's out."""
+
+
+def definitions_of(channel: Channel) -> tuple[Definitions, str]:
+    """Return the definitions a channel's type needs, and where they come from (for the user).
+
+    Raises
+    ------
+    DefinitionError
+        Neither the log nor the bundle knows the type, or the log's text cannot be parsed.
+    """
+    if channel.definition:
+        types = {**_TIME, **parse_definition(channel)}
+        return (types if _is_complete(types) else {**standard_definitions(), **types}), "the log"
+    name = full_name(channel.message_type)
+    if channel.encoding == "ros1":
+        raise DefinitionError(channel.message_type, "its connection carries no definition")
+    known = bundled_definitions()
+    if name in known:
+        return {**standard_definitions(), **known}, "icrtool"
+    if name in standard_definitions():
+        return standard_definitions(), "ROS 2 Humble"
+    raise DefinitionError(channel.message_type, "its definition is not in the log and not bundled")
+
+
+def _is_complete(types: Definitions) -> bool:
+    """Say whether every type that a field refers to is among the types."""
+    for _, fields in types.values():
+        for _, (node, detail) in fields:
+            inner = detail[0] if int(node) > NAME else (node, detail)
+            if int(inner[0]) == NAME and inner[1] not in types:
+                return False
+    return True
+
+
+def full_name(message_type: str) -> str:
+    """Return ``package/msg/Name`` for ``package/Name``."""
+    package, _, name = message_type.partition("/")
+    return f"{package}/msg/{name}"
+
+
+def parse_definition(channel: Channel) -> Definitions:
+    """Parse the definition text of a channel, with those of the types it contains.
+
+    Raises
+    ------
+    DefinitionError
+    """
+    from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+    text = channel.definition
+    try:
+        if channel.definition_format == "msg":
+            return get_types_from_msg(text, full_name(channel.message_type))
+        parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
+        types: dict[str, Any] = {}
+        for part in parts:
+            types.update(get_types_from_idl(part.split("\n", 1)[1]))
+    except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
+        first = str(err).partition("\n")[0]
+        raise DefinitionError(channel.message_type, "the definition in the log cannot be parsed", first) from err
+    return types
+
+
+@cache
+def bundled_definitions() -> Definitions:
+    """Return the vendor types that come with icrtool (see ``definitions/SOURCES.md``)."""
+    from rosbags.typesys import get_types_from_msg
+
+    types: dict[str, Any] = {}
+    for package in resources.files("icrtool.logs.messages").joinpath("definitions").iterdir():
+        if package.is_dir():
+            for file in package.iterdir():
+                name = f"{package.name}/msg/{file.name.removesuffix('.msg')}"
+                types.update(get_types_from_msg(file.read_text(encoding="utf-8"), name))
+    return types
+
+
+@cache
+def standard_definitions() -> Definitions:
+    """Return the types that come with ROS 2 Humble."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE).fielddefs

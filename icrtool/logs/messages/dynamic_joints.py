@@ -1,0 +1,150 @@
+"""Lists within a list: control_msgs/DynamicJointState, brought to the columns of a JointState.
+
+The message holds one InterfaceValue a joint, and each of these holds lists of its own. In the bytes a sequence is its
+length and then its elements, one after the other: with the number of joints known it reads like a number and that many
+plain fields. So messages are sorted by their number of joints, and each kind goes through the compiled walk.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import DefinitionError
+from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.messages.decoder import walk_messages
+from icrtool.logs.messages.definitions import definitions_of, full_name
+from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
+from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables
+
+DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
+MOST_JOINTS = 100
+MOST_INTERFACES = 32
+"""A message that claims more is taken for damaged; of more interfaces a joint the first ones are looked at."""
+
+_LISTS = "interface_values"
+_JOINTS = "number of joints"
+_NAMES = "joint_names[*]"
+_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+
+
+class Collector(Protocol):
+    """Gathers the columns of one topic while blocks go by."""
+
+    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
+        """Add the chosen messages of a block."""
+        ...
+
+    def table(self) -> TopicTable:
+        """Return what was gathered, sorted by log time."""
+        ...
+
+
+def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
+    """Return what gathers the wanted columns of a channel.
+
+    Raises
+    ------
+    DefinitionError
+        The layout of the channel's type is not known.
+    """
+    if channel.message_type == DYNAMIC_JOINT_STATE:
+        return DynamicJointCollector(channel)
+    return TopicCollector(channel, wanted)
+
+
+class DynamicJointCollector:
+    """Gathers ``name[*]``, ``position[*]`` and ``velocity[*]`` of a topic of DynamicJointState messages."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._definitions, self._source = definitions_of(channel)
+        self._collectors: dict[int, TopicCollector] = {}
+        self._tables: list[TopicTable] = []
+        self._unreadable = 0
+        layout = self._collector(1).layout
+        kinds = {path: slot.kind for path, slot in layout.slots.items()}
+        texts = (_NAMES, "joint 0.interface_names[*]")
+        if "joint 0.values[*]" not in kinds or any(kinds.get(path) != "string" for path in texts):
+            raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
+        self._counter = compile_layout(
+            self._unrolled(0), channel.message_type, (_JOINTS,), "cdr" if layout.cdr else "ros1"
+        )
+
+    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
+        """Add the chosen messages of a block."""
+        places = np.flatnonzero(chosen)
+        table, readable = walk_messages(self._counter, block.data, block.start[places], block.end[places])
+        joints = self._counter.numbers(table, _JOINTS)
+        readable &= joints <= MOST_JOINTS
+        self._unreadable += len(readable) - int(np.count_nonzero(readable))
+        for number in np.unique(joints[readable]):
+            alike = np.zeros(len(chosen), np.bool_)
+            alike[places[readable & (joints == number)]] = True
+            collector = self._collector(int(number))
+            collector.feed(block, alike)
+            # Taken at once: the names of all interfaces of a long log are many times what is kept of them.
+            self._tables.append(_as_joint_state(collector.table(), int(number)))
+
+    def table(self) -> TopicTable:
+        """Return what was gathered, sorted by log time."""
+        topic, message_type = self._channel.topic, self._channel.message_type
+        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
+        return merge_tables([nothing, *self._tables])[0]
+
+    def _collector(self, joints: int) -> TopicCollector:
+        if joints not in self._collectors:
+            lists = [f"joint {j}.{what}[*]" for j in range(joints) for what in ("interface_names", "values")]
+            self._collectors[joints] = TopicCollector(
+                self._channel, (*_HEADER, _NAMES, *lists), self._unrolled(joints), MOST_INTERFACES
+            )
+        return self._collectors[joints]
+
+    def _unrolled(self, joints: int) -> Definitions:
+        """Return the definitions with the list of lists as a number and so many fields."""
+        name = full_name(self._channel.message_type)
+        if name not in self._definitions:
+            raise DefinitionError(self._channel.message_type, "its definition in the log is another type's")
+        constants, fields = self._definitions[name]
+        flat: list[tuple[str, tuple[int, Any]]] = []
+        for field, (node, detail) in fields:
+            if field != _LISTS:
+                flat.append((field, (node, detail)))
+            elif int(node) != SEQUENCE or int(detail[0][0]) != NAME:
+                raise DefinitionError(self._channel.message_type, f"its {_LISTS} is not a list of messages")
+            else:
+                flat.append((_JOINTS, (BASE, ("uint32", 0))))
+                flat += [(f"joint {j}", (NAME, detail[0][1])) for j in range(joints)]
+        return {**self._definitions, name: (constants, flat)}
+
+
+def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
+    """Return the table with the columns of a JointState; NaN where a joint has no such interface."""
+    columns = {path: values for path, values in table.columns.items() if path in _HEADER}
+    texts = {path: texts for path, texts in table.texts.items() if path in _HEADER}
+    if not len(table):
+        return table
+    names, texts["name[*]"] = table.words(_NAMES)
+    columns["name[*]"] = np.full((len(table), joints), -1, np.int64)
+    columns["name[*]"][:, : names.shape[1]] = names[:, :joints]
+    for quantity in ("position", "velocity"):
+        column = columns[f"{quantity}[*]"] = np.full((len(table), joints), np.nan)
+        for j in range(joints):
+            column[:, j] = _interface(table, f"joint {j}.", quantity)
+    return TopicTable(
+        table.topic, table.message_type, table.log_time_ns, columns, texts, table.unreadable, table.definition_source
+    )
+
+
+def _interface(table: TopicTable, joint: str, quantity: str) -> NDArray[np.float64]:
+    """Return the values (n,) that stand at the place of an interface's name, NaN where the name is not listed."""
+    (names, texts), values = table.words(f"{joint}interface_names[*]"), table.column(f"{joint}values[*]")
+    told = np.full(len(table), np.nan)
+    if quantity not in texts:
+        return told
+    for place in range(min(names.shape[1], values.shape[1])):
+        here = names[:, place] == texts.index(quantity)
+        told[here] = values[here, place]
+    return told

@@ -1,0 +1,277 @@
+"""Where the wanted fields of a message type are: its definition compiled to a small program for `walk`.
+
+A serialized message has no index: a field's place depends on the strings and sequences before it. The program says
+what to step over and what to take, so one compiled loop (`icrtool.logs.messages.decoder`) reads a whole topic without
+an object per message, whatever the strings' lengths do from message to message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import DefinitionError
+from icrtool.records.tables import Ints
+
+SKIP, TAKE, SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE, BEGIN_LOOP, END_LOOP = range(8)
+"""Operations. A row of the program is (operation, element size, count, column, capacity, stride, jump)."""
+
+Definitions = Mapping[str, tuple[Any, Any]]
+"""``package/msg/Name`` to (constants, fields), as rosbags parses it."""
+
+FieldDetail: TypeAlias = Any
+"""Name and length of a field's type; rosbags nests them by the kind of type."""
+
+BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
+"""Kinds of field types, the numbers of rosbags' Nodetype."""
+_SIZES = {
+    "bool": 1, "byte": 1, "char": 1, "octet": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
+    "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
+}  # fmt: skip
+_STRING_COLUMNS = 3
+LONGEST_UNROLLED = 4096
+"""A fixed array of which elements are taken is no longer than this: a covariance has 36."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Where a wanted field lands in the table that `walk` fills.
+
+    Attributes
+    ----------
+    kind : primitive type name, or ``string`` (columns: offset, length, hash)
+    column : first column; one more before it holds the count when `counted`
+    repeat : elements taken per message (1 for a plain field)
+    stride : columns from one element to the next
+    count_column : column with the number of elements in the message, -1 where it is fixed
+    """
+
+    kind: str
+    column: int
+    repeat: int
+    stride: int
+    count_column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A compiled message layout: `program` int64 (operations, 7), number of columns, slots by path."""
+
+    program: Ints
+    columns: int
+    slots: dict[str, Slot]
+    cdr: bool
+
+    @property
+    def count_columns(self) -> set[int]:
+        """The columns that hold the number of elements of a sequence."""
+        return {slot.count_column for slot in self.slots.values() if slot.count_column >= 0}
+
+    def numbers(self, table: NDArray[np.uint64], path: str) -> NDArray[Any]:
+        """Return a numeric field: (n,) or, for an array, (n, longest) with what a message lacks as NaN or 0."""
+        slot = self.slots[path]
+        if "[*]" not in path:
+            return _typed(table[:, slot.column], slot.kind)
+        counts = self.counts(table, path)
+        repeat = min(slot.repeat, int(counts.max(initial=0)))
+        values = _typed(table[:, slot.column : slot.column + repeat * slot.stride : slot.stride], slot.kind)
+        if counts.min(initial=repeat) < repeat:
+            lacking = np.arange(repeat) >= counts[:, None]
+            values[lacking] = np.nan if values.dtype.kind == "f" else 0
+        return values
+
+    def counts(self, table: NDArray[np.uint64], path: str) -> Ints:
+        """Return how many elements of an array each message holds (n,)."""
+        slot = self.slots[path]
+        if slot.count_column < 0:
+            return np.full(len(table), slot.repeat, np.int64)
+        return table[:, slot.count_column].astype(np.int64)
+
+
+def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
+    """Give raw 64-bit words their meaning: a new array of float64 or int64."""
+    if kind == "float64":
+        return raw.copy("K").view(np.float64)
+    if kind == "float32":
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
+            return raw.astype(np.uint32).view(np.float32).astype(np.float64)
+    if kind.startswith("int"):
+        width = _SIZES[kind]
+        return raw.astype(f"u{width}").view(f"i{width}").astype(np.int64)
+    return raw.astype(np.int64)
+
+
+class _Compiler:
+    """Walks a definition once and writes the program."""
+
+    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool, capacity: int) -> None:
+        self._definitions = definitions
+        self._wanted = frozenset(wanted)
+        self._cdr = cdr
+        self._capacity = capacity
+        self.rows: list[list[int]] = []
+        self.columns = 0
+        self.slots: dict[str, Slot] = {}
+        self._last_take = 0
+
+    def message(self, name: str, prefix: str, loop: tuple[int, int, int]) -> None:
+        """Write the fields of message type `name`; `loop` is (repeat, stride, count column) of the loop around it."""
+        if name not in self._definitions:
+            raise DefinitionError(name, "its definition is not in the log and not bundled")
+        for field, (node, detail) in self._definitions[name][1]:
+            self.field(f"{prefix}{field}", int(node), detail, loop)
+
+    def field(self, path: str, node: int, detail: FieldDetail, loop: tuple[int, int, int]) -> None:
+        """Write one field."""
+        if node == NAME:
+            self.message(detail, f"{path}.", loop)
+        elif node == BASE:
+            self._base(path, detail[0], loop)
+        else:
+            (element, inner), count = detail
+            fixed = count if node == ARRAY else None
+            if int(element) == BASE and inner[0] in _SIZES:
+                self._numbers(path, inner[0], fixed, loop)
+            else:
+                self._loop(f"{path}[*]", int(element), inner, fixed, loop)
+
+    def _base(self, path: str, kind: str, loop: tuple[int, int, int]) -> None:
+        if kind == "string":
+            if path in self._wanted:
+                self._place(path, kind, loop, _STRING_COLUMNS, TAKE_STRING)
+            else:
+                self._emit(SKIP_STRING)
+        elif kind in _SIZES:
+            if path in self._wanted:
+                self._place(path, kind, loop, 1, TAKE, size=_SIZES[kind])
+            else:
+                self._skip(_SIZES[kind], 1)
+        else:
+            raise DefinitionError(path, f"field type {kind} is not read", "only its message type is affected")
+
+    def _place(
+        self, path: str, kind: str, loop: tuple[int, int, int], width: int, operation: int, size: int = 0
+    ) -> None:
+        repeat, stride, count_column = loop
+        column = self._reserve(width)
+        self._emit(operation, size, 1, column)
+        self.slots[path] = Slot(kind, column, repeat, stride or 1, count_column)
+        self._last_take = len(self.rows)
+
+    def _numbers(self, path: str, kind: str, fixed: int | None, loop: tuple[int, int, int]) -> None:
+        """Write an array (fixed length) or sequence of numbers."""
+        size, starred = _SIZES[kind], f"{path}[*]"
+        elements = any(name.startswith(f"{path}[") for name in self._wanted)
+        if fixed is not None and not elements:
+            self._skip(size, fixed)
+        elif fixed is not None and starred not in self._wanted:
+            if fixed > LONGEST_UNROLLED:
+                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
+            for i in range(fixed):
+                element = f"{path}[{i}]"
+                if element in self._wanted:
+                    self._place(element, kind, loop, 1, TAKE, size=size)
+                else:
+                    self._skip(size, 1)
+        elif fixed is not None:
+            if fixed > LONGEST_UNROLLED:
+                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
+            column = self._reserve(fixed)
+            self._emit(TAKE, size, fixed, column)
+            self.slots[starred] = Slot(kind, column, fixed, 1, -1)
+            self._last_take = len(self.rows)
+        elif starred in self._wanted:
+            if loop[1]:
+                raise DefinitionError(path, "a sequence in each element of a sequence is not read")
+            count_column = self._reserve(1)
+            column = self._reserve(self._capacity)
+            self._emit(TAKE_SEQUENCE, size, 0, count_column, self._capacity)
+            self.slots[starred] = Slot(kind, column, self._capacity, 1, count_column)
+            self._last_take = len(self.rows)
+        else:
+            self._emit(SKIP_SEQUENCE, size)
+
+    def _loop(
+        self, path: str, element: int, inner: FieldDetail, fixed: int | None, outer: tuple[int, int, int]
+    ) -> None:
+        """Write a loop over the elements of an array or sequence of strings or messages."""
+        takes = not outer[1] and any(name == path or name.startswith(f"{path}.") for name in self._wanted)
+        repeat = min(fixed, self._capacity) if fixed is not None else self._capacity
+        count_column = self._reserve(1) if takes and fixed is None else -1
+        begin = len(self.rows)
+        self._emit(BEGIN_LOOP, 0, -1 if fixed is None else fixed, count_column, repeat if takes else 0)
+        first = self.columns
+        stride = self._body_width(element, inner, path) if takes else 0
+        if element == BASE:
+            self._base(path, inner[0], (repeat, stride, count_column))
+        else:
+            self.message(inner, f"{path}.", (repeat, stride, count_column))
+        self._emit(END_LOOP)
+        self.rows[begin][5] = stride
+        self.rows[begin][6] = len(self.rows)
+        if takes:
+            self.columns = first + stride * repeat
+            self._last_take = len(self.rows)
+
+    def _body_width(self, element: int, inner: FieldDetail, path: str) -> int:
+        """Return the columns one element takes, by a trial run."""
+        trial = _Compiler(self._definitions, tuple(self._wanted), cdr=self._cdr, capacity=self._capacity)
+        if element == BASE:
+            trial._base(path, inner[0], (1, 1, -1))
+        else:
+            trial.message(inner, f"{path}.", (1, 1, -1))
+        return max(trial.columns, 1)
+
+    def _reserve(self, columns: int) -> int:
+        first = self.columns
+        self.columns += columns
+        return first
+
+    def _skip(self, size: int, count: int) -> None:
+        if not self._cdr:
+            size, count = 1, size * count
+        last = self.rows[-1] if self.rows else None
+        if last is not None and last[0] == SKIP and last[1] == size:
+            last[2] += count
+        else:
+            self._emit(SKIP, size, count)
+
+    def _emit(self, operation: int, size: int = 0, count: int = 0, column: int = -1, capacity: int = 0) -> None:
+        self.rows.append([operation, size, count, column, capacity, 0, 0])
+
+    def layout(self) -> Layout:
+        """Return what was written, without the steps after the last taken field."""
+        program = np.array(self.rows[: self._last_take] or np.empty((0, 7)), np.int64).reshape(-1, 7)
+        return Layout(program, self.columns, self.slots, self._cdr)
+
+
+def compile_layout(
+    definitions: Definitions,
+    message_type: str,
+    wanted: Sequence[str],
+    encoding: Literal["cdr", "ros1"],
+    capacity: int = 8,
+) -> Layout:
+    """Compile the layout of a message type.
+
+    Parameters
+    ----------
+    definitions : of the type and all types it contains
+    message_type : ``package/Name``
+    wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
+        ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots
+    capacity : elements taken of a sequence; `counts` tells when a message held more
+
+    Raises
+    ------
+    DefinitionError
+        A type in it whose definition is missing, or a field type that cannot be stepped over.
+    """
+    package, _, name = message_type.partition("/")
+    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr", capacity=capacity)
+    compiler.message(f"{package}/msg/{name}", "", (1, 0, -1))
+    return compiler.layout()

@@ -1,0 +1,300 @@
+"""A topic as columns: raw messages in, block by block; one table out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.errors import DefinitionError
+from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.messages.decoder import empty_table, walk_into
+from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
+from icrtool.records.tables import Ints
+
+_FIRST_CAPACITY = 8
+_LARGEST_CAPACITY = 256
+
+_ROWS_AT_ONCE = 16_384 + 8
+"""Not a power of two: the columns would be such a distance apart, and fall on the same few lines of the cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicTable:
+    """All messages of one topic, in log-time order.
+
+    Attributes
+    ----------
+    log_time_ns : int64 (n,)
+    columns : by field path; float64 or int64, (n,) or, for an array field, (n, k), NaN or 0 where a message has less.
+        A text field holds indices into `texts`.
+    texts : the distinct texts of each text field
+    unreadable : messages that did not have the shape of their type
+    definition_source : where the message definition came from
+    """
+
+    topic: str
+    message_type: str
+    log_time_ns: Ints
+    columns: dict[str, NDArray[Any]]
+    texts: dict[str, list[str]]
+    unreadable: int
+    definition_source: str
+
+    def __len__(self) -> int:
+        return len(self.log_time_ns)
+
+    def find(self, *paths: str) -> NDArray[Any] | None:
+        """Return the first of these columns that the type has: drivers spell a field ``hAcc`` or ``h_acc``."""
+        return next((self.columns[path] for path in paths if path in self.columns), None)
+
+    def column(self, *paths: str) -> NDArray[Any]:
+        """Return the first of these columns of numbers that the type has.
+
+        Raises
+        ------
+        DefinitionError
+            The type, as the log defines it, has none of them.
+        """
+        values = self.find(*(path for path in paths if path not in self.texts))
+        if values is None:
+            raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
+        return values
+
+    def words(self, path: str) -> tuple[Ints, list[str]]:
+        """Return a column of texts as indices (n,) or (n, k), -1 where a message has less, and the texts.
+
+        Raises
+        ------
+        DefinitionError
+            The type, as the log defines it, has no such field.
+        """
+        if path not in self.texts:
+            raise DefinitionError(self.topic, f"its {self.message_type} has no text {path}")
+        return self.columns[path], self.texts[path]
+
+    def floats(self, *paths: str) -> NDArray[np.float64]:
+        """Return the first of these columns as float64, NaN everywhere when the type has none."""
+        values = self.find(*paths)
+        return np.full(len(self), np.nan) if values is None else values.astype(np.float64)
+
+    def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
+        """Return the table of the chosen messages."""
+        columns = {path: values[chosen] for path, values in self.columns.items()}
+        return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
+
+    def text(self, path: str) -> str:
+        """Return the first text of a text field, empty when there is none."""
+        texts = self.texts.get(path)
+        return texts[0] if texts else ""
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Walked messages of one layout, not columns yet: some thousand at a time are turned into columns.
+
+    Attributes
+    ----------
+    table : (rows, columns) as `walk` fills it; times_ns, readable, walked : (rows,)
+    filled : rows in use
+    """
+
+    table: NDArray[np.uint64] = field(default_factory=lambda: np.empty((0, 0), np.uint64))
+    times_ns: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    readable: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    walked: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    filled: int = 0
+
+    @classmethod
+    def empty(cls, layout: Layout, rows: int) -> _Rows:
+        """Return an empty table of so many rows."""
+        return cls(
+            empty_table(layout, rows), np.empty(rows, np.int64), np.empty(rows, np.bool_), np.empty(rows, np.bool_)
+        )
+
+
+@dataclass(slots=True)
+class TopicCollector:
+    """Gathers the columns of one topic while blocks go by.
+
+    Attributes
+    ----------
+    definitions : in place of the channel's own, None where those are used
+    largest_capacity : elements taken of a sequence at most
+    """
+
+    channel: Channel
+    wanted: tuple[str, ...]
+    definitions: Definitions | None = None
+    largest_capacity: int = _LARGEST_CAPACITY
+    _capacity: int = _FIRST_CAPACITY
+    _layout: Layout | None = None
+    _source: str = ""
+    _rows: _Rows = field(default_factory=_Rows)
+    _times: list[Ints] = field(default_factory=list)
+    _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _texts: dict[str, dict[int, str]] = field(default_factory=dict)
+    _unreadable: int = 0
+
+    def __post_init__(self) -> None:
+        self._compile()
+
+    def _compile(self) -> None:
+        definitions, self._source = definitions_of(self.channel)
+        definitions = self.definitions if self.definitions is not None else definitions
+        encoding = self.channel.encoding
+        if encoding not in ("cdr", "ros1"):
+            raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
+        self._layout = compile_layout(
+            definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity
+        )
+
+    @property
+    def layout(self) -> Layout:
+        """The compiled layout."""
+        if self._layout is None:
+            raise ValueError("the layout is compiled when the collector is made")
+        return self._layout
+
+    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
+        """Add the chosen messages of a block."""
+        start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
+        new = self._walk(block, start, end, times)
+        most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
+        if self._capacity < min(most, self.largest_capacity):
+            self._settle()
+            self._rows, self._capacity = _Rows(), min(most, self.largest_capacity)
+            self._compile()
+            new = self._walk(block, start, end, times)
+        for path, slot in self.layout.slots.items():
+            if slot.kind == "string":
+                self._learn_texts(path, new, block)
+        self._rows.filled += len(start)
+
+    def _walk(self, block: Block, start: Ints, end: Ints, times_ns: Ints) -> NDArray[np.uint64]:
+        """Walk messages into the rows behind the filled ones; return those rows that are not like the one before."""
+        if self._rows.filled + len(start) > len(self._rows.table):
+            self._settle()
+        if len(start) > len(self._rows.table):
+            self._rows = _Rows.empty(self.layout, max(len(start), _ROWS_AT_ONCE))
+        rows = slice(self._rows.filled, self._rows.filled + len(start))
+        table, readable, walked = self._rows.table[rows], self._rows.readable[rows], self._rows.walked[rows]
+        walk_into(self.layout, block.data, start, end, table, readable, walked)
+        self._rows.times_ns[rows] = times_ns
+        return table[readable & walked]
+
+    def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
+        """Learn the texts of a text field that are in some rows and were not seen before."""
+        slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
+        counts = self.layout.counts(new, path)
+        for i in range(min(slot.repeat, int(counts.max(initial=0)))):
+            told = new[counts > i, slot.column + i * slot.stride :]
+            codes, first = np.unique(told[:, 2], return_index=True)
+            for code, row in zip(codes.tolist(), first.tolist(), strict=True):
+                if code not in texts:
+                    place, length = int(told[row, 0]), int(told[row, 1])
+                    texts[code] = block.data[place : place + length].tobytes().decode("utf-8", "replace")
+
+    def _settle(self) -> None:
+        """Turn the filled rows into columns, and have them free again."""
+        rows, filled = self._rows, self._rows.filled
+        if not filled:
+            return
+        table, times_ns, readable = rows.table[:filled], rows.times_ns[:filled].copy(), rows.readable[:filled]
+        if not readable.all():
+            table, times_ns = table[readable], times_ns[readable]
+        self._unreadable += filled - len(table)
+        self._times.append(times_ns)
+        for path, slot in self.layout.slots.items():
+            take = self._text_numbers if slot.kind == "string" else self.layout.numbers
+            self._parts.setdefault(path, []).append(take(table, path))
+        rows.filled = 0
+
+    def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
+        """Return the numbers of a text field's texts (n,) or (n, k), in the order they were learned; -1 for none."""
+        slot, counts = self.layout.slots[path], self.layout.counts(table, path)
+        repeat = min(slot.repeat, int(counts.max(initial=0))) if "[*]" in path else 1
+        codes = table[:, slot.column + 2 :][:, : repeat * slot.stride : slot.stride]
+        lacking = np.arange(repeat) >= counts[:, None]
+        alike = bool((codes == codes[:1]).all() and (lacking == lacking[:1]).all())
+        if alike:
+            codes, lacking = codes[:1], lacking[:1]
+        known = np.fromiter(self._texts[path], np.uint64)
+        order = np.append(np.argsort(known), -1)
+        numbers = order[np.searchsorted(known, codes, sorter=order[:-1])]
+        numbers[lacking] = -1
+        if alike:
+            numbers = np.broadcast_to(numbers, (len(table), repeat))
+        return numbers if "[*]" in path else numbers[:, 0]
+
+    def table(self) -> TopicTable:
+        """Return what was gathered since the last call, sorted by log time."""
+        self._settle()
+        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
+        self._times.clear()
+        order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
+        columns: dict[str, NDArray[Any]] = {}
+        texts: dict[str, list[str]] = {}
+        unreadable, self._unreadable = self._unreadable, 0
+        gathered, self._parts = self._parts, {}
+        for path, parts in gathered.items():
+            values = _joined(parts, -1 if path in self._texts else 0)
+            parts.clear()
+            if path in self._texts:
+                texts[path] = list(self._texts[path].values())
+            columns[path] = values if order is None else values[order]
+        return TopicTable(
+            self.channel.topic,
+            self.channel.message_type,
+            times if order is None else times[order],
+            columns,
+            texts,
+            unreadable,
+            self._source,
+        )
+
+
+def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
+    """Join tables of one topic and type: a ROS 1 bag gives each publisher a connection of its own."""
+    groups: dict[tuple[str, str], list[TopicTable]] = {}
+    for table in tables:
+        groups.setdefault((table.topic, table.message_type), []).append(table)
+    return [_merged(group) if len(group) > 1 else group[0] for group in groups.values()]
+
+
+def _merged(group: list[TopicTable]) -> TopicTable:
+    """Join tables of one topic and type, sorted by log time."""
+    unreadable = sum(table.unreadable for table in group)
+    group = [table for table in group if len(table)] or group[:1]
+    times = np.concatenate([table.log_time_ns for table in group])
+    order = np.argsort(times, kind="stable")
+    columns: dict[str, NDArray[Any]] = {}
+    texts: dict[str, list[str]] = {}
+    # Publishers may have been built from different versions of the type: what all of them tell is kept.
+    for path in group[0].columns:
+        if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):
+            continue
+        parts = [table.columns[path] for table in group]
+        if path in group[0].texts:
+            texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))
+            renumber = [np.array([*(texts[path].index(t) for t in table.texts[path]), -1]) for table in group]
+            parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
+        columns[path] = _joined(parts, -1 if path in texts else 0)[order]
+    return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)
+
+
+def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
+    """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
+    if parts[0].ndim == 2:
+        width = max(part.shape[1] for part in parts)
+        lacking = np.nan if parts[0].dtype.kind == "f" else lacking
+        parts = [
+            np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
+            if part.shape[1] < width
+            else part
+            for part in parts
+        ]
+    return np.concatenate(parts)

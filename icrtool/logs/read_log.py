@@ -1,0 +1,270 @@
+"""Read a log: open, take the columns of all candidates in one pass, choose, convert to the charter's frame."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.errors import DataError, DefinitionError
+from icrtool.logs.containers.channel import Block, Channel, Container
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.messages.dynamic_joints import Collector, collector_for
+from icrtool.logs.messages.topic_table import TopicTable, merge_tables
+from icrtool.logs.streams.gyro import find_gyro
+from icrtool.logs.streams.heading_sources import Convention, HeadingSource
+from icrtool.logs.streams.joint_names import ignored_joints
+from icrtool.logs.streams.position_sources import PositionSource
+from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
+from icrtool.logs.streams.stamps import increasing, rate_and_jitter
+from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
+from icrtool.logs.streams.wheel_sources import WheelMotion
+from icrtool.logs.streams.wheel_speeds import wheel_samples
+from icrtool.records.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A log after one pass: its channels, all candidates, what was lost, its files."""
+
+    name: str
+    path: str
+    channels: tuple[Channel, ...]
+    tables: tuple[TopicTable, ...]
+    candidates: Candidates
+    problems: tuple[str, ...]
+    inputs: tuple[InputFile, ...]
+
+
+def survey_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> Survey:
+    """Read all candidate topics of a log.
+
+    Parameters
+    ----------
+    path : a log as `open_log` knows them
+    progress : called with the share of the log read so far, 0 to 1
+
+    Raises
+    ------
+    LogError
+        The log cannot be opened.
+    """
+    config = config if config is not None else Config()
+    path = Path(path)
+    container = open_log(path)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            hashes = [pool.submit(_fingerprint, file) for file in container.files]
+            tables, unread = _collect(container, config, pool, progress)
+            problems = tuple(container.problems)
+            inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+        channels = tuple(container.channels)
+    finally:
+        container.close()
+    return Survey(
+        name=log_name(path),
+        path=str(path),
+        channels=channels,
+        tables=tuple(tables),
+        candidates=find_candidates(tables, config, unread),
+        problems=problems,
+        inputs=inputs,
+    )
+
+
+def read_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> RobotLog:
+    """Read wheels, position and heading of a log into tables.
+
+    Parameters
+    ----------
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``
+    config : topics, robot and frames; default: all found by type and content
+
+    Raises
+    ------
+    LogError
+        The log cannot be read.
+    MissingStreamError
+        No wheels, no position or no heading in it.
+    ConfigError
+        A configured topic that is not there, or a width or radius that is needed.
+    DataError
+        Streams without usable samples.
+    """
+    config = config if config is not None else Config()
+    return assemble(survey_log(path, config, progress), config)
+
+
+def log_name(path: Path) -> str:
+    """Return a log's name: that of the file without its suffix, or of the directory."""
+    resolved = path.absolute()
+    return resolved.name if resolved.is_dir() else resolved.stem
+
+
+def assemble(survey: Survey, config: Config) -> RobotLog:
+    """Choose the streams of a surveyed log and convert them; errors as `read_log`."""
+    found, name = survey.candidates, survey.name
+    choice = choose_streams(found, config, survey.path, survey.channels)
+    motion, position, source = choice.wheels, choice.gnss, choice.heading
+    delays = [
+        s.delay_ns / 1e9 if s.header_ns is not None else None for s in (motion.stamps, position.stamps, source.stamps)
+    ]
+    clock = common_clock(delays)
+    warnings = list(survey.problems)
+    if clock == "log" and any(delay is not None for delay in delays):
+        warnings.append(
+            f"{name}: a stream without header stamps stands beside header stamps that are far from log time; "
+            "all go by log time"
+        )
+    for role, stamps in (("wheels", motion.stamps), ("gnss", position.stamps), ("heading", source.stamps)):
+        if stamps.note and stamps.note != "no header":
+            warnings.append(f"{name}: {role}: {stamps.note}; log time is used")
+    gnss, datum, rejected = _fixes(position, config, clock, name)
+    heading, convention = _headings(source, config, clock, name)
+    samples, how, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, gnss, name)
+    warnings += wheel_warnings
+    warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
+    if source.note:
+        warnings.append(f"{name}: {source.topic}: {source.note}")
+    antenna = antenna_place(survey.tables, position.topic)
+    streams = (
+        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
+        _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
+        _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
+    )
+    unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
+    warnings += [
+        f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
+        for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
+        if topic in unreadable
+    ]
+    gyro = find_gyro(survey.tables, motion.topic, source.topic, clock)
+    return RobotLog(
+        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro
+    )
+
+
+def _place_in_words(antenna: tuple[float, float] | None) -> str:
+    if antenna is None:
+        return ""
+    return f"; antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base (/tf_static)"
+
+
+def _collect(
+    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None
+) -> tuple[list[TopicTable], dict[str, str]]:
+    """Take the columns of all channels that some role may need, in one pass over the log."""
+    unread: dict[str, str] = {}
+    collectors: dict[int, Collector] = {}
+    by_id = {channel.id: channel for channel in container.channels}
+    wanted = fields_to_take(container.channels, config)
+    wanted |= {channel.id: FIELDS for channel in container.channels if is_static(channel)}
+    for number, paths in wanted.items():
+        try:
+            collectors[number] = collector_for(by_id[number], paths)
+        except DefinitionError as err:
+            unread[by_id[number].topic] = str(err)
+    for block in _ahead(container.blocks(frozenset(collectors)), pool):
+        for number, collector in collectors.items():
+            chosen = block.channel == number
+            if chosen.any():
+                collector.feed(block, chosen)
+        if progress is not None:
+            progress(container.share_read())
+    return merge_tables([collector.table() for collector in collectors.values()]), unread
+
+
+def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]:
+    """Read and decompress the next block while this one is decoded."""
+    pending: Future[Block | None] = pool.submit(next, blocks, None)
+    while (block := pending.result()) is not None:
+        pending = pool.submit(next, blocks, None)
+        yield block
+
+
+def _fingerprint(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _input_of(file: Path, pending: Future[str]) -> InputFile:
+    return InputFile(str(file), file.stat().st_size, pending.result())
+
+
+def _stream(
+    role: Role,
+    source: WheelMotion | PositionSource | HeadingSource,
+    stamps: Ints,
+    clock: Literal["header", "log"],
+    why: str,
+) -> StreamChoice:
+    rows = source.stamps
+    rate, jitter = rate_and_jitter(stamps)
+    used: Literal["header", "log"] = "header" if clock == "header" and rows.header_ns is not None else "log"
+    return StreamChoice(role, source.topic, source.message_type, len(stamps), rate, used, jitter, why)
+
+
+def _fixes(
+    source: PositionSource, config: Config, clock: Literal["header", "log"], name: str
+) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
+    """Bring positions to the local plane about the datum."""
+    if not source.usable.any():
+        raise DataError(
+            name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
+        )
+    stamps = source.stamps.on(clock)
+    rows = np.flatnonzero(source.usable)
+    rows = rows[np.argsort(stamps[rows], kind="stable")]
+    datum = None
+    if source.geodetic is not None:
+        from pymap3d import geodetic2ned
+
+        latitude, longitude, height = source.geodetic[rows].T
+        if config.frames.datum is not None:
+            datum = Datum(*config.frames.datum, float(height[0]))
+        else:
+            datum = Datum(float(latitude[0]), float(longitude[0]), float(height[0]))
+        north, east, _ = geodetic2ned(
+            latitude, longitude, height, datum.latitude_deg, datum.longitude_deg, datum.height_m
+        )
+    else:
+        north, east = np.asarray(source.metric, np.float64)[rows].T
+    var_north, var_east, covariance = (np.ascontiguousarray(column) for column in source.variance[rows].T)
+    fixes = PositionFixes(
+        stamps[rows],
+        np.ascontiguousarray(north, np.float64),
+        np.ascontiguousarray(east, np.float64),
+        var_north,
+        var_east,
+        covariance,
+        told_class=None if source.told_class is None else source.told_class[rows],
+    )
+    return fixes, datum, dict(source.rejected)
+
+
+def _headings(
+    source: HeadingSource, config: Config, clock: Literal["header", "log"], name: str
+) -> tuple[HeadingSamples, str]:
+    """Bring headings to clockwise from north; say how the convention is known."""
+    if not source.usable.any():
+        raise DataError(
+            name, f"{source.topic}: {source.problem or 'no usable heading'}", "choose another with topics.heading"
+        )
+    convention: Convention = source.convention
+    why = source.convention_why
+    if config.frames.heading != "auto":
+        convention, why = config.frames.heading, "configured"
+    stamps = source.stamps.on(clock)
+    rows = np.flatnonzero(source.usable)
+    order, _, _ = increasing(stamps[rows])
+    rows = rows[order]
+    samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
+    return samples, f"{convention.upper()} ({why})"

@@ -1,0 +1,81 @@
+"""How a receiver says that it solved its position: fixed, float or other, by status, flags, mode or words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bytes, Ints
+
+GBAS = 2
+"""NavSatStatus: fixed or float, the drivers do not agree; without any of these the status tells nothing."""
+
+GPSFIX_STATUS = {
+    0: OTHER_FIX, 1: OTHER_FIX, GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
+}  # fmt: skip
+"""GPSStatus of gps_msgs: 18 DGPS, 19 and 20 RTK, 33 WAAS."""
+
+UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
+"""carrSoln, bits 6 and 7 of NavPVT.flags."""
+
+SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OTHER_FIX, 7: FIXED_FIX, 8: FLOAT_FIX}
+"""Low bits of the mode: stand-alone, DGPS, RTK fixed and float, SBAS, moving-base fixed and float."""
+
+NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49: FIXED_FIX, 50: FIXED_FIX,
+                 51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
+"""Position types of NovAtel as novatel_oem7_msgs numbers them; all others do without fixed or float ambiguities."""
+
+
+def told_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -> Bytes | None:
+    """Read ``status.status`` (n,): that of NavSatFix, or by `codes`; None where it tells nothing.
+
+    Drivers of NavSatFix that know only "fix" say 0 whatever they have: without a single GBAS nothing is told.
+    """
+    values = table.find("status.status")
+    if values is None:
+        return None
+    status = values.astype(np.int64)
+    if codes is None:
+        if not (status == GBAS).any():
+            return None
+        return np.where(status == GBAS, RTK_FIX, OTHER_FIX).astype(np.uint8)
+    told = _looked_up(status, codes, NOT_TOLD)
+    informative = (told == FIXED_FIX) | (told == FLOAT_FIX) | (told == RTK_FIX)
+    return told if informative.any() else None
+
+
+def told_by_carrier(flags: Ints | None) -> Bytes | None:
+    """Read the carrier solution of u-blox flags (n,)."""
+    return None if flags is None else _looked_up((flags >> 6) & 3, UBLOX_CARRIER, NOT_TOLD)
+
+
+def told_by_mode(modes: Ints | None) -> Bytes | None:
+    """Read the mode of a Septentrio block (n,)."""
+    return None if modes is None else _looked_up(modes & 0x0F, SEPTENTRIO_MODE, OTHER_FIX)
+
+
+def told_by_type(table: TopicTable, path: str) -> Bytes | None:
+    """Read a NovAtel position type (n,), a word (``NARROW_INT``) or a number."""
+    if path in table.texts:
+        codes, texts = table.words(path)
+        by_word = [_of_word(text) for text in texts]
+        return np.array([*by_word, NOT_TOLD], np.uint8)[codes]
+    values = table.find(path)
+    return None if values is None else _looked_up(values.astype(np.int64), NOVATEL_TYPES, OTHER_FIX)
+
+
+def _of_word(text: str) -> int:
+    if not text:
+        return NOT_TOLD
+    if text.endswith(("_FLOAT", "RTKFLOAT")):
+        return FLOAT_FIX
+    return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
+
+
+def _looked_up(values: Ints, codes: Mapping[int, int], otherwise: int) -> Bytes:
+    told = np.full(len(values), otherwise, np.uint8)
+    for value, code in codes.items():
+        told[values == value] = code
+    return told

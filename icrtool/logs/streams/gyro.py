@@ -1,0 +1,56 @@
+"""The gyro of a log: the turn rate of an inertial unit, whoever tells the heading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.heading_sources import frame_convention
+from icrtool.logs.streams.stamps import increasing, stamp_rows
+from icrtool.records.tables import GyroSamples
+
+GYRO_TYPE = "sensor_msgs/Imu"
+GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "angular_velocity.z")
+
+FASTEST_RADPS = math.radians(1000.0)
+"""A rate beyond this is no robot's."""
+
+MOST_BAD = 0.01
+"""A topic with a larger share of rates that are no numbers is not used."""
+
+
+def find_gyro(
+    tables: Sequence[TopicTable], wheels_topic: str, heading_topic: str, clock: Literal["header", "log"]
+) -> GyroSamples | None:
+    """Return the turn rates of the best inertial unit, None without one.
+
+    Parameters
+    ----------
+    tables : all topics that were read
+    wheels_topic, heading_topic : a unit that also tells the heading comes first, then one in the wheels' namespace,
+        then the one with more samples
+    clock : the clock of the other streams
+    """
+    home = wheels_topic.strip("/").split("/")[0]
+    found = []
+    for table in tables:
+        if table.message_type != GYRO_TYPE or "angular_velocity.z" not in table.columns or len(table) < 2:
+            continue
+        rate = table.floats("angular_velocity.z")
+        sound = np.abs(rate) <= FASTEST_RADPS
+        if np.count_nonzero(~sound) > MOST_BAD * len(rate) or np.ptp(rate[sound]) == 0.0:
+            continue
+        near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(rate)
+        found.append((near, table.topic, rate, sound, table))
+    if not found:
+        return None
+    _, topic, rate, sound, table = max(found, key=lambda one: one[:2])
+    stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
+    order, _, _ = increasing(stamps[rows])
+    rows = rows[order]
+    sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
+    return GyroSamples(topic, stamps[rows], sign * rate[rows])

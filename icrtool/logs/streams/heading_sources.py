@@ -1,0 +1,298 @@
+"""Messages that tell where the robot points: yaw in ENU, compass headings, antenna baselines."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.orientation import nose_yaw
+from icrtool.logs.streams.position_sources import (
+    GOAL_WORDS,
+    INS_SOLVED,
+    INS_SOLVED_CODES,
+    SOLVED,
+    SOLVED_CODES,
+    pose_paths,
+    solved,
+)
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.records.tables import Bools, Floats
+
+Convention = Literal["enu", "ned"]
+
+_INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
+_RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
+_ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|xsens|mti", re.IGNORECASE)
+"""Topics of QuaternionStamped that hold an inertial unit's orientation, not a receiver's compass angle."""
+
+_RELPOS_VALID, _HEADING_VALID = 1 << 2, 1 << 8
+_HEADING = ("relPosHeading", "rel_pos_heading")
+_BASELINE = (
+    (("relPosN", "rel_pos_n"), ("relPosHPN", "rel_pos_hpn")),
+    (("relPosE", "rel_pos_e"), ("relPosHPE", "rel_pos_hpe")),
+)
+_BASELINE_ACCURACY = ("accN", "acc_n", "accE", "acc_e")
+"""u-blox fields as ROS 1 and as ROS 2 spell them."""
+
+_REFERENCES = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
+LARGEST_DEG = 720.0
+"""A heading beyond this stands for "unknown": Septentrio writes -2e10."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingSource:
+    """Headings of one topic.
+
+    Attributes
+    ----------
+    yaw_rad : (n,) as told: counter-clockwise from east where `convention` is ``enu``, else clockwise from north
+    variance : (n,) [rad^2], NaN where not told
+    usable : (n,)
+    convention_why : how the convention is known
+    yaw_rate_radps : (n,) counter-clockwise turn rate of a gyro in the same message, None without one
+    """
+
+    topic: str
+    message_type: str
+    stamps: StampedRows
+    yaw_rad: Floats
+    variance: Floats
+    usable: Bools
+    convention: Convention
+    convention_why: str
+    yaw_rate_radps: Floats | None = None
+    score: float = 0.0
+    why: str = ""
+    problem: str = ""
+    note: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to use, even when it is asked for."""
+        return not self.usable.any()
+
+    def heading_rad(self, convention: Convention) -> Floats:
+        """Return headings clockwise from north in (-pi, pi]."""
+        heading = self.yaw_rad if convention == "ned" else math.pi / 2 - self.yaw_rad
+        return np.pi - np.mod(np.pi - heading, 2 * np.pi)
+
+
+Reader = Callable[[TopicTable], HeadingSource]
+
+
+def no_heading(table: TopicTable, problem: str) -> HeadingSource:
+    """Return the source that a topic is when it cannot be read."""
+    unknown, nothing = np.full(len(table), np.nan), np.zeros(len(table), np.bool_)
+    return HeadingSource(
+        table.topic, table.message_type, stamp_rows(table), unknown, unknown, nothing, "enu", "", problem=problem
+    )
+
+
+def _quaternion(table: TopicTable, path: str) -> Floats:
+    return np.column_stack([table.column(f"{path}.{axis}") for axis in "xyzw"]).astype(np.float64)
+
+
+def frame_convention(table: TopicTable) -> tuple[Convention, str]:
+    """Return the convention of a message's frame, and how it is known."""
+    frame = table.text("header.frame_id")
+    if frame.lower().endswith("_ned") or frame.lower() == "ned":
+        return "ned", f"frame {frame} (REP-145)"
+    return "enu", "REP-103"
+
+
+def _constant(yaw: Floats, usable: Bools) -> bool:
+    return bool(usable.any()) and float(np.ptp(yaw[usable])) == 0.0
+
+
+def _orientation(path: str, covariance: str, place: int, score: float, what: str, *, stuffed: bool = False) -> Reader:
+    """Read an orientation; `place` is that of the yaw variance in the covariance.
+
+    `stuffed`: drivers of GNSS receivers put a compass angle into the quaternion as if it were a yaw.
+    """
+
+    def read(table: TopicTable) -> HeadingSource:
+        rate = table.floats("angular_velocity.z") if "angular_velocity.z" in table.columns else None
+        yaw, usable, note = nose_yaw(_quaternion(table, path), rate)
+        variance = table.floats(f"{covariance}[{place}]") if covariance else np.full(len(table), np.nan)
+        variance = np.where(variance > 0, variance, np.nan)
+        convention, why = frame_convention(table)
+        if stuffed and not _ATTITUDE_WORDS.search(table.topic):
+            convention, why = "ned", "compass angle as yaw"
+        lowered, problem = score, ""
+        if covariance and place == 8 and np.all(table.floats(f"{covariance}[0]") == -1.0):
+            problem = "tells no orientation (covariance -1, REP-145)"
+        elif not usable.any():
+            problem = "no valid quaternion"
+        elif _constant(yaw, usable):
+            problem = "its orientation never changes"
+        elif GOAL_WORDS.search(table.topic):
+            problem = "its name says that it is a goal, not a measurement"
+        if _RAW_WORDS.search(table.topic):
+            lowered -= 10.0
+        return HeadingSource(
+            table.topic, table.message_type, stamp_rows(table), yaw, variance, usable, convention, why,
+            rate, lowered, what, problem, note,
+        )  # fmt: skip
+
+    return read
+
+
+def _odometry(table: TopicTable) -> HeadingSource:
+    read = _orientation("pose.pose.orientation", "pose.covariance", 35, 60.0, "orientation of an odometry message")
+    source = read(table)
+    return source if _INS_WORDS.search(table.topic) else replace(source, score=30.0)
+
+
+def _azimuth(table: TopicTable) -> HeadingSource:
+    """Read an Azimuth of the compass stack: the message says unit, orientation and reference itself."""
+    factor = np.where(table.column("unit") == 1, np.pi / 180.0, 1.0)
+    yaw = table.column("azimuth") * factor
+    orientation = table.column("orientation")
+    ned = bool(np.median(orientation) == 1)
+    # Rows of the other orientation are turned over: pi/2 - yaw does it both ways.
+    yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
+    codes = table.floats("reference")
+    reference = _REFERENCES.get(float(np.median(codes)), "unknown") if len(codes) else "unknown"
+    variance = table.floats("variance") * factor**2
+    usable = np.isfinite(yaw)
+    return HeadingSource(
+        table.topic, table.message_type, stamp_rows(table), yaw, np.where(variance > 0, variance, np.nan), usable,
+        "ned" if ned else "enu", "the message says so", None, 95.0, f"azimuth, {reference} north",
+        "" if usable.any() else "no finite azimuth",
+    )  # fmt: skip
+
+
+def _relposned(table: TopicTable) -> HeadingSource:
+    """Read ublox_msgs/NavRELPOSNED9 (or the older NavRELPOSNED): the bearing of the antenna baseline."""
+    flags = table.column("flags")
+    if table.find(*_HEADING) is not None:
+        needed = _RELPOS_VALID | _HEADING_VALID
+        heading = np.radians(table.column(*_HEADING) * 1e-5)
+        std = np.radians(table.floats("accHeading", "acc_heading") * 1e-5)
+        usable = (flags & needed) == needed
+    else:
+        north, east = (table.column(*names) + 0.01 * np.nan_to_num(table.floats(*fine)) for names, fine in _BASELINE)
+        heading, length = np.arctan2(east, north), np.hypot(north, east)
+        # The baseline in cm, its accuracy in 0.1 mm.
+        acc = np.maximum(table.floats("accN", "acc_n"), table.floats("accE", "acc_e")) * 0.01
+        std = np.divide(acc, length, out=np.full(len(table), np.nan), where=length > 0)
+        usable = ((flags & _RELPOS_VALID) != 0) & (length > 0)
+    return HeadingSource(
+        table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
+        "ned", "u-blox: clockwise from north", None, 90.0, "u-blox moving base: bearing of the antenna baseline",
+        "" if usable.any() else "no valid heading",
+    )  # fmt: skip
+
+
+def _degrees(
+    path: str, deviation: str, score: float, what: str, status: str = "",
+    accepted: frozenset[str] | frozenset[int] = frozenset[int](),
+) -> Reader:  # fmt: skip
+    """Read a heading in degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
+
+    def read(table: TopicTable) -> HeadingSource:
+        told = table.column(path).astype(np.float64)
+        std = np.radians(table.floats(deviation))
+        usable = np.abs(told) <= LARGEST_DEG
+        if status:
+            usable = usable & solved(table, status, accepted)
+        heading = np.radians(np.where(np.abs(told) <= LARGEST_DEG, told, np.nan))
+        return HeadingSource(
+            table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
+            "ned", "degrees clockwise from north", None, score, what, "" if usable.any() else "no valid heading",
+        )  # fmt: skip
+
+    return read
+
+
+def _septentrio(deviation: str, mode: str, score: float, what: str) -> Reader:
+    """Read a Septentrio attitude: ENU unless `use_ros_axis_orientation` was turned off, which no message tells."""
+    read_degrees = _degrees("heading", deviation, score, what)
+
+    def read(table: TopicTable) -> HeadingSource:
+        source = read_degrees(table)
+        usable = source.usable
+        for path, sound in (("error", table.floats("error") == 0), (mode, table.floats(mode) != 0)):
+            usable = usable & sound if path in table.columns else usable
+        problem = "" if usable.any() else "no valid heading"
+        why = "the Septentrio driver's default, use_ros_axis_orientation"
+        return replace(source, usable=usable, problem=problem, convention="enu", convention_why=why)
+
+    return read
+
+
+_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+_ORIENTATION = tuple(f"orientation.{axis}" for axis in "xyzw")
+
+_AZIMUTH = (*_HEADER, "azimuth", "variance", "unit", "orientation", "reference")
+_DUAL = (*_HEADER, "heading", "heading_sigma", "solution_status")
+_dual_antenna = _degrees("heading", "heading_sigma", 90.0, "NovAtel dual antenna heading", "solution_status", SOLVED)
+_oem7_dual_antenna = _degrees(
+    "heading", "heading_stdev", 90.0, "NovAtel dual antenna heading", "sol_status.status", SOLVED_CODES
+)
+_INS = "NovAtel INS azimuth"
+
+HEADING_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "sensor_msgs/Imu": (
+        (*_HEADER, *_ORIENTATION, "orientation_covariance[0]", "orientation_covariance[8]", "angular_velocity.z"),
+        _orientation("orientation", "orientation_covariance", 8, 100.0, "orientation of the inertial unit"),
+    ),
+    "geometry_msgs/PoseStamped": (
+        pose_paths("pose."),
+        _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
+    ),
+    "geometry_msgs/PoseWithCovarianceStamped": (
+        pose_paths("pose.pose.", "pose.covariance"),
+        _orientation("pose.pose.orientation", "pose.covariance", 35, 50.0, "orientation of the pose"),
+    ),
+    "nav_msgs/Odometry": (pose_paths("pose.pose.", "pose.covariance"), _odometry),
+    "geometry_msgs/QuaternionStamped": (
+        (*_HEADER, *(f"quaternion.{axis}" for axis in "xyzw")),
+        _orientation("quaternion", "", 0, 80.0, "heading of the GNSS receiver (nmea_navsat_driver)", stuffed=True),
+    ),
+    "compass_msgs/Azimuth": (_AZIMUTH, _azimuth),
+    "compass_interfaces/Azimuth": (_AZIMUTH, _azimuth),
+    "ublox_msgs/NavRELPOSNED9": ((*_HEADING, "accHeading", "acc_heading", "flags"), _relposned),
+    "ublox_msgs/NavRELPOSNED": (
+        (*(name for pair in _BASELINE for names in pair for name in names), *_BASELINE_ACCURACY, "flags"),
+        _relposned,
+    ),
+    "septentrio_gnss_driver/AttEuler": (
+        (*_HEADER, "heading", "error", "mode"),
+        _septentrio("", "mode", 88.0, "Septentrio attitude"),
+    ),
+    "septentrio_gnss_driver/INSNavGeod": (
+        (*_HEADER, "heading", "heading_std_dev", "error"),
+        _septentrio("heading_std_dev", "", 89.0, "Septentrio INS attitude"),
+    ),
+    "novatel_gps_msgs/NovatelDualAntennaHeading": (_DUAL, _dual_antenna),
+    "novatel_gps_msgs/NovatelHeading2": (_DUAL, _dual_antenna),
+    "novatel_gps_msgs/Gphdt": ((*_HEADER, "heading"), _degrees("heading", "", 88.0, "NovAtel true heading (HDT)")),
+    "novatel_gps_msgs/Inspva": (
+        (*_HEADER, "azimuth", "status"),
+        _degrees("azimuth", "", 90.0, _INS, "status", INS_SOLVED),
+    ),
+    "novatel_gps_msgs/Inspvax": (
+        (*_HEADER, "azimuth", "azimuth_std", "ins_status"),
+        _degrees("azimuth", "azimuth_std", 92.0, _INS, "ins_status", INS_SOLVED),
+    ),
+    "novatel_oem7_msgs/HEADING2": (
+        (*_HEADER, "heading", "heading_stdev", "sol_status.status"),
+        _oem7_dual_antenna,
+    ),
+    "novatel_oem7_msgs/INSPVA": (
+        (*_HEADER, "azimuth", "status.status"),
+        _degrees("azimuth", "", 90.0, _INS, "status.status", INS_SOLVED_CODES),
+    ),
+    "novatel_oem7_msgs/INSPVAX": (
+        (*_HEADER, "azimuth", "azimuth_stdev", "ins_status.status"),
+        _degrees("azimuth", "azimuth_stdev", 92.0, _INS, "ins_status.status", INS_SOLVED_CODES),
+    ),
+}
+"""By message type: the fields to take, and how to read them."""

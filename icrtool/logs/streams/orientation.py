@@ -1,0 +1,107 @@
+"""From a quaternion to the yaw of a robot's nose: level sensors, sensors on their side, components in another order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from icrtool.records.tables import Bools, Floats
+
+QUATERNION_NORM_TOLERANCE = 0.1
+UPRIGHT_COSINE = math.cos(math.radians(45.0))
+"""A sensor whose z axis is further than 45 deg from vertical is mounted on its side; its yaw is no heading."""
+
+LEVEL_COSINE = math.cos(math.radians(30.0))
+TILTED_SHARE = 0.01
+"""A robot on the ground keeps some axis of its sensor upright but for this share of the time."""
+
+CLEAR_CORRELATION = 0.5
+STRETCHES = 200
+MOST_LOOKED_AT = 5000
+
+ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
+    ((1, 2, 3, 0), "its quaternion is written w first: read as w, x, y, z"),
+    ((3, 1, 2, 0), "its quaternion has x and w swapped: swapped back"),
+)
+"""Places of x, y, z, w among the four fields, where a driver filled them in another order."""
+
+
+def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
+    """Return yaw [rad], which rows are rotations, and a note where the sensor is not mounted upright.
+
+    Yaw is that of the sensor's x axis seen from above. A sensor on its side has another axis level all the time: that
+    axis is used then, and points somewhere at a fixed angle to the robot's nose.
+
+    Parameters
+    ----------
+    q : (n, 4) the fields x, y, z, w
+    yaw_rate_radps : (n,) of a gyro in the same message; a quaternion in another order must turn with it
+    """
+    with np.errstate(over="ignore"):
+        norm = np.sqrt(np.einsum("ij,ij->i", q, q))
+    usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
+    unit = np.where(usable[:, None], q, np.nan) / np.where(usable, norm, 1.0)[:, None]
+    order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
+    x, y, z, w = unit[:, order].T
+    upright = float(np.median(np.abs(1 - 2 * (x * x + y * y))[usable])) if usable.any() else 1.0
+    if upright >= UPRIGHT_COSINE:
+        return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), usable, note
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x)],
+        ]
+    )
+    vertical = _vertical(x, y, z, w)
+    level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
+    note = (
+        f"mounted on its side: its {'xyz'[level]} axis is level and stands for the nose, at an angle still to be found"
+    )
+    return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
+
+
+def _written_order(unit: Floats, yaw_rate_radps: Floats | None) -> tuple[Sequence[int], str]:
+    """Return where x, y, z, w stand, and a note where that is not their place.
+
+    A robot on the ground keeps one axis of its sensor upright, whatever the mounting. Where none is, and another order
+    of the components has a level sensor all the time, that order is meant.
+    """
+    as_named = (0, 1, 2, 3)
+    some = unit[:: max(1, len(unit) // MOST_LOOKED_AT)]
+    if len(some) < 2 or (_tilted_share(some, UPRIGHT_COSINE) < TILTED_SHARE).any():
+        return as_named, ""
+    for order, note in ORDERS:
+        meant = unit[:, order]
+        if _tilted_share(meant[:: max(1, len(unit) // MOST_LOOKED_AT)], LEVEL_COSINE)[2] < TILTED_SHARE and _turns_with(
+            meant, yaw_rate_radps
+        ):
+            return order, note
+    return as_named, ""
+
+
+def _tilted_share(unit: Floats, cosine: float) -> Floats:
+    """Return, for each axis of the sensor (3,), the share of the time in which it is not upright."""
+    share: Floats = (np.abs(_vertical(*unit.T)) < cosine).mean(axis=1)
+    return share
+
+
+def _vertical(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
+    """Return the vertical component of the sensor's axes (3, n)."""
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
+    """Say whether yaw turns the way the gyro does; True without a gyro that turns."""
+    if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
+        return True
+    x, y, z, w = unit.T
+    yaw = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+    # Over many samples: from one to the next there is more noise than turning.
+    edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
+    turned, told = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
+    if len(turned) < 3 or float(np.ptp(turned)) == 0 or float(np.ptp(told)) == 0:
+        return False
+    return float(np.corrcoef(turned, told)[0, 1]) > CLEAR_CORRELATION

@@ -1,0 +1,371 @@
+"""Messages that tell where the robot is: geodetic fixes, or positions that are metric already."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.fix_class import GPSFIX_STATUS, told_by_carrier, told_by_mode, told_by_status, told_by_type
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.records.tables import Bools, Bytes, Floats, Ints
+
+REFERENCE_WORDS = re.compile(
+    r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
+    r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
+    re.IGNORECASE,
+)
+"""Names of odometry and pose topics that are a reference, not the robot's own dead reckoning."""
+
+REFERENCE_FRAMES = {"map", "world", "utm", "earth", "ecef", "gps", "local_enu", "enu", "mocap", "vicon"}
+
+GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
+
+RADIUS_95_IN_STD = 2.45
+"""err_horz is a 95 % radius: this many standard deviations of a circular normal distribution."""
+
+DEGREES = 180.0 / math.pi
+STATUS_UNKNOWN = -2
+SEPTENTRIO_UNKNOWN = 65535
+HIGHEST_M = 20_000.0
+"""A height beyond this stands for "unknown"; the median of the others is taken then."""
+
+SOLVED, SOLVED_CODES = frozenset({"SOL_COMPUTED"}), frozenset({0})
+INS_SOLVED = frozenset({"INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE"})
+INS_SOLVED_CODES = frozenset({3, 6, 7})
+"""What NovAtel calls a solution, in words (novatel_gps_msgs) and as numbers (novatel_oem7_msgs)."""
+
+H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
+    ("hAcc", "h_acc"),
+    ("latHp", "lat_hp"),
+    ("lonHp", "lon_hp"),
+    ("heightHp", "height_hp"),
+)
+"""u-blox fields as ROS 1 and as ROS 2 spell them."""
+
+GOOD_STD_M = 0.3
+"""Better than this a fix is RTK or nearly so, and the first choice as reference."""
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSource:
+    """Positions of one topic.
+
+    Attributes
+    ----------
+    geodetic : (n, 3) latitude, longitude [deg], ellipsoidal height [m]; None where metric
+    metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
+    variance : (n, 3) north, east, covariance of both [m^2]; NaN where not told
+    usable : (n,) rows to use; `rejected` counts the others by reason
+    has_orientation : the same message tells the heading in the same frame
+    told_class : uint8 (n,) how the position was solved, None where no message says
+    """
+
+    topic: str
+    message_type: str
+    stamps: StampedRows
+    geodetic: Floats | None
+    metric: Floats | None
+    variance: Floats
+    usable: Bools
+    rejected: dict[str, int] = field(default_factory=dict)
+    has_orientation: bool = False
+    score: float = 0.0
+    why: str = ""
+    problem: str = ""
+    told_class: Bytes | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to use, even when it is asked for."""
+        return not self.usable.any()
+
+
+Reader = Callable[[TopicTable], PositionSource]
+
+
+def no_position(table: TopicTable, problem: str) -> PositionSource:
+    """Return the source that a topic is when it cannot be read."""
+    nothing = np.zeros(len(table), np.bool_)
+    return PositionSource(
+        table.topic, table.message_type, stamp_rows(table), None, None, _no_variance(table), nothing, problem=problem
+    )
+
+
+def _geodetic(
+    table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
+    told_class: Bytes | None = None,
+) -> PositionSource:  # fmt: skip
+    """Build a source from latitude, longitude, height; drop rows without a fix, not finite, or at 0, 0."""
+    rejected: dict[str, int] = {}
+    usable = np.ones(len(table), np.bool_)
+    latitude, longitude = geodetic[:, 0], geodetic[:, 1]
+    with np.errstate(invalid="ignore"):
+        possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 360.0)
+    reasons = (
+        ("no fix", no_fix),
+        ("not finite", ~np.isfinite(latitude) | ~np.isfinite(longitude)),
+        ("not a place on earth", ~possible),
+        ("at 0, 0", (latitude == 0) & (longitude == 0)),
+    )
+    for reason, bad in reasons:
+        count = int(np.count_nonzero(bad & usable))
+        if count:
+            rejected[reason] = count
+        usable &= ~bad
+    height = geodetic[:, 2]
+    told = np.abs(height) < HIGHEST_M
+    known = told & usable
+    filled = np.where(told, height, float(np.median(height[known])) if known.any() else 0.0)
+    std = (
+        float(np.sqrt(np.nanmedian(variance[usable, :2]))) if np.isfinite(variance[usable, :2]).any() else float("nan")
+    )
+    if std > GOOD_STD_M:
+        score -= 35.0
+    stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
+    return PositionSource(
+        table.topic, table.message_type, stamp_rows(table),
+        np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
+        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", told_class=told_class,
+    )  # fmt: skip
+
+
+def _no_variance(table: TopicTable) -> Floats:
+    return np.full((len(table), 3), np.nan)
+
+
+def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
+    """Return latitude and longitude, which the type must have, and height, as told (n, 3)."""
+    return np.column_stack([table.column(latitude), table.column(longitude), table.floats(height)]).astype(np.float64)
+
+
+def _enu_variance(table: TopicTable) -> Floats:
+    """Return north, east, covariance of the row-major 3 x 3 ENU covariance; NaN where it is not told."""
+    variance = np.column_stack([table.floats(f"position_covariance[{i}]") for i in (4, 0, 1)])
+    # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or put any there.
+    unknown = table.floats("position_covariance_type") == 0
+    variance[unknown | ~(variance[:, 0] > 0) | ~(variance[:, 1] > 0)] = np.nan
+    return variance
+
+
+def _without_fix(table: TopicTable) -> Bools:
+    """Return the rows (n,) with a negative status: -1 no fix, -2 unknown (the default of ROS 2).
+
+    A driver that never leaves the default tells no status at all.
+    """
+    status = table.floats("status.status")
+    return np.zeros(len(table), np.bool_) if np.all(status == STATUS_UNKNOWN) else np.asarray(status < 0)
+
+
+def _navsatfix(table: TopicTable) -> PositionSource:
+    geodetic = _place(table, "latitude", "longitude", "altitude")
+    told = told_by_status(table)
+    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", told)
+
+
+def _gpsfix(table: TopicTable) -> PositionSource:
+    variance = _enu_variance(table)
+    unknown = ~np.isfinite(variance[:, 0])
+    radius = table.floats("err_horz")
+    with np.errstate(over="ignore"):
+        from_radius = np.where(radius > 0, (radius / RADIUS_95_IN_STD) ** 2, np.nan)
+    for column in (0, 1):
+        variance[:, column] = np.where(unknown, from_radius, variance[:, column])
+    variance[unknown, 2] = np.where(np.isfinite(from_radius[unknown]), 0.0, np.nan)
+    geodetic = _place(table, "latitude", "longitude", "altitude")
+    told = told_by_status(table, GPSFIX_STATUS)
+    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", told)
+
+
+def _accuracy(std: Floats) -> Floats:
+    """Return the variance of an accuracy that is the same to all sides (n, 3)."""
+    return _deviations(std, std)
+
+
+def _deviations(north: Floats, east: Floats) -> Floats:
+    told = (north > 0) & (east > 0)
+    with np.errstate(over="ignore"):
+        return np.where(told[:, None], np.column_stack([north**2, east**2, np.zeros(len(north))]), np.nan)
+
+
+def _bits(table: TopicTable, *paths: str) -> Ints | None:
+    """Return a field of flags (n,), None where the type has none."""
+    values = table.find(*paths)
+    return None if values is None else values.astype(np.int64)
+
+
+def _nowhere(table: TopicTable) -> Bools:
+    return np.zeros(len(table), np.bool_)
+
+
+def _navpvt(table: TopicTable) -> PositionSource:
+    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    flags = _bits(table, "flags")
+    no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
+    variance, told = _accuracy(table.floats(*H_ACC) * 1e-3), told_by_carrier(flags)
+    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", told)
+
+
+def _navhpposllh(table: TopicTable) -> PositionSource:
+    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    for column, (names, unit) in enumerate(((LAT_HP, 1e-9), (LON_HP, 1e-9), (HEIGHT_HP, 1e-4))):
+        geodetic[:, column] += np.nan_to_num(table.floats(*names)) * unit
+    flags = _bits(table, "invalid_llh", "invalidLlh", "flags")
+    invalid = _nowhere(table) if flags is None else (flags & 1) == 1
+    variance = _accuracy(table.floats(*H_ACC) * 1e-4)
+    return _geodetic(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
+
+
+def _septentrio(mode: str, what: str, score: float) -> Reader:
+    """Read a Septentrio block: latitude and longitude in rad; the low bits of the mode are 0 without a solution."""
+
+    def read(table: TopicTable) -> PositionSource:
+        geodetic = _place(table, "latitude", "longitude", "height")
+        geodetic[:, :2] *= DEGREES
+        modes, error = _bits(table, mode), _bits(table, "error")
+        no_fix = _nowhere(table) if modes is None else (modes & 0x0F) == 0
+        if error is not None:
+            no_fix = no_fix | (error != 0)
+        # PVTGeodetic: one number in 0.01 m, 65535 for unknown. INSNavGeod: metres by axis, hugely negative for unknown.
+        accuracy = table.floats("h_accuracy")
+        variance = _accuracy(np.where(accuracy < SEPTENTRIO_UNKNOWN, accuracy * 0.01, np.nan))
+        if "latitude_std_dev" in table.columns:
+            variance = _deviations(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
+        return _geodetic(table, geodetic, variance, no_fix, score, what, told_by_mode(modes))
+
+    return read
+
+
+def solved(table: TopicTable, path: str, accepted: frozenset[str] | frozenset[int]) -> Bools:
+    """Return the rows (n,) whose status, a word or a number, is an accepted one; all where the type has none."""
+    if path in table.texts:
+        codes, texts = table.words(path)
+        return np.array([*(text in accepted for text in texts), False])[codes]
+    values = table.find(path)
+    return np.ones(len(table), np.bool_) if values is None else np.isin(values, sorted(accepted))
+
+
+def _novatel(
+    place: tuple[str, str, str], deviations: tuple[str, str], status: str, accepted: frozenset[str] | frozenset[int],
+    kind: str, what: str, score: float,
+) -> Reader:  # fmt: skip
+    """Read a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
+
+    def read(table: TopicTable) -> PositionSource:
+        geodetic = _place(table, *place)
+        geodetic[:, 2] += np.nan_to_num(table.floats("undulation"))
+        variance = _deviations(*(table.floats(name) for name in deviations))
+        told = told_by_type(table, kind)
+        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, told)
+
+    return read
+
+
+def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> Reader:
+    """Read a pose: x is east and y north of the topic's own frame, wherever that points."""
+
+    def read(table: TopicTable) -> PositionSource:
+        x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
+        variance = _no_variance(table)
+        if covariance:
+            var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
+            told = (var_x > 0) & (var_y > 0)
+            variance[told] = np.column_stack([var_y, var_x, cov])[told]
+        usable = np.isfinite(x) & np.isfinite(y)
+        named = (
+            bool(REFERENCE_WORDS.search(table.topic)) or table.text("header.frame_id").lstrip("/") in REFERENCE_FRAMES
+        )
+        problem = "" if usable.any() else "no finite position"
+        if GOAL_WORDS.search(table.topic):
+            problem = problem or "its name says that it is a goal, not a measurement"
+        elif not named and (odometry or "odom" in table.topic.lower()):
+            problem = (
+                problem or "its name and frame do not say that it is a reference, not the wheels' own dead reckoning"
+            )
+        count = int(np.count_nonzero(~usable))
+        return PositionSource(
+            table.topic, table.message_type, stamp_rows(table), None, np.column_stack([y, x]), variance, usable,
+            {"not finite": count} if count else {}, has_orientation=True, score=score, why=what, problem=problem,
+        )  # fmt: skip
+
+    return read
+
+
+def pose_paths(pose: str, covariance: str = "") -> tuple[str, ...]:
+    """Return the fields of a pose message that position and heading need."""
+    paths = [
+        "header.stamp.sec", "header.stamp.nanosec", "header.frame_id",
+        *(f"{pose}position.{axis}" for axis in "xy"), *(f"{pose}orientation.{axis}" for axis in "xyzw"),
+    ]  # fmt: skip
+    return (*paths, *(f"{covariance}[{i}]" for i in (0, 1, 7, 35) if covariance))
+
+
+_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+_COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))
+_FIX = (*_HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
+
+_WORD, _NUMBER = "position_type", "pos_type.type"
+_NOVATEL = (*_HEADER, "solution_status", _WORD, "lat", "lon", "height", "undulation", "lat_sigma", "lon_sigma")
+_OEM7 = (*_HEADER, "sol_status.status", _NUMBER, "lat", "lon", "hgt", "undulation", "lat_stdev", "lon_stdev")
+_INS = (*_HEADER, "latitude", "longitude")
+_NOVATEL_INS_SIGMA = ("latitude_std", "longitude_std")
+_OEM7_INS_SIGMA = ("latitude_stdev", "longitude_stdev")
+
+_bestpos = _novatel(
+    ("lat", "lon", "height"), ("lat_sigma", "lon_sigma"), "solution_status", SOLVED, _WORD,
+    "NovAtel position", 85.0,
+)  # fmt: skip
+_oem7_bestpos = _novatel(
+    ("lat", "lon", "hgt"), ("lat_stdev", "lon_stdev"), "sol_status.status", SOLVED_CODES, _NUMBER,
+    "NovAtel position", 85.0,
+)  # fmt: skip
+_inspvax = _novatel(
+    ("latitude", "longitude", "altitude"), _NOVATEL_INS_SIGMA, "ins_status", INS_SOLVED, _WORD,
+    "NovAtel INS position", 84.0,
+)  # fmt: skip
+_oem7_inspvax = _novatel(
+    ("latitude", "longitude", "height"), _OEM7_INS_SIGMA, "ins_status.status", INS_SOLVED_CODES, _NUMBER,
+    "NovAtel INS position", 84.0,
+)  # fmt: skip
+_odometry = _metric("pose.pose.", "pose.covariance", 60.0, "metric position of an odometry message", odometry=True)
+
+POSITION_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "sensor_msgs/NavSatFix": (_FIX, _navsatfix),
+    "gps_common/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
+    "gps_msgs/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
+    "ublox_msgs/NavPVT": (("lat", "lon", "height", *H_ACC, "flags"), _navpvt),
+    "ublox_msgs/NavHPPOSLLH": (
+        ("lat", "lon", "height", *LAT_HP, *LON_HP, *HEIGHT_HP, *H_ACC, "invalid_llh", "invalidLlh", "flags"),
+        _navhpposllh,
+    ),
+    "septentrio_gnss_driver/PVTGeodetic": (
+        (*_HEADER, "latitude", "longitude", "height", "mode", "error", "h_accuracy"),
+        _septentrio("mode", "Septentrio position", 85.0),
+    ),
+    "septentrio_gnss_driver/INSNavGeod": (
+        (*_INS, "height", "gnss_mode", "error", "latitude_std_dev", "longitude_std_dev"),
+        _septentrio("gnss_mode", "Septentrio INS position", 84.0),
+    ),
+    "novatel_gps_msgs/NovatelPosition": (_NOVATEL, _bestpos),
+    "novatel_gps_msgs/Inspvax": (
+        (*_INS, "altitude", "undulation", "ins_status", _WORD, *_NOVATEL_INS_SIGMA),
+        _inspvax,
+    ),
+    "novatel_oem7_msgs/BESTPOS": (_OEM7, _oem7_bestpos),
+    "novatel_oem7_msgs/BESTGNSSPOS": (_OEM7, _oem7_bestpos),
+    "novatel_oem7_msgs/INSPVAX": (
+        (*_INS, "height", "undulation", "ins_status.status", _NUMBER, *_OEM7_INS_SIGMA),
+        _oem7_inspvax,
+    ),
+    "geometry_msgs/PoseStamped": (pose_paths("pose."), _metric("pose.", "", 70.0, "metric pose")),
+    "geometry_msgs/PoseWithCovarianceStamped": (
+        pose_paths("pose.pose.", "pose.covariance"),
+        _metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
+    ),
+    "nav_msgs/Odometry": (pose_paths("pose.pose.", "pose.covariance"), _odometry),
+}
+"""By message type: the fields to take, and how to read them."""

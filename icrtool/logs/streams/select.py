@@ -1,0 +1,347 @@
+"""Which topic feeds which role: every candidate with its reasons, and the choice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
+
+from icrtool.config import Config, TopicsConfig
+from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
+from icrtool.logs.containers.channel import Channel
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE
+from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource, no_heading
+from icrtool.logs.streams.joint_names import check_joints
+from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource, no_position
+from icrtool.logs.streams.wheel_names import right_twin
+from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_motion
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, no_motion
+from icrtool.records.tables import Role
+
+Source = TypeVar("Source", WheelMotion, PositionSource, HeadingSource)
+
+NEEDS: dict[Role, str] = {
+    "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist",
+    "gnss": "a GNSS fix, or a pose of a reference (total station, lidar, motion capture)",
+    "heading": "an orientation (AHRS), a compass or a dual antenna heading",
+}
+ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}
+
+SAME_NAMESPACE = 8.0
+"""A candidate in the namespace of the wheels is the same robot's."""
+
+COMPLETE = 5.0
+"""For each other role that the wheels' own namespace can fill: of two robots, the one with all it takes."""
+
+WORTHY = 40.0
+"""Wheels of this score are a robot's; below, they are commands and other sensors' velocities."""
+
+SAME_MESSAGE = 100.0
+"""Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
+
+MOST_LISTED = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """All sources found, best first by role; `unread` says of other topics of known types why they are none."""
+
+    wheels: tuple[WheelMotion, ...]
+    gnss: tuple[PositionSource, ...]
+    heading: tuple[HeadingSource, ...]
+    unread: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The source of each role, and in words why it was chosen."""
+
+    wheels: WheelMotion
+    gnss: PositionSource
+    heading: HeadingSource
+    why: dict[Role, str]
+
+
+def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
+    """Return, by channel id, the fields that some role may need; channels of no use are absent."""
+    topics, wanted = config.topics, {}
+    pairs = _pairs(channels, topics)
+    for channel in channels:
+        kind = channel.message_type
+        paths: list[str] = []
+        if kind in WHEEL_TYPES and topics.wheel_left is None and topics.wheels in (None, channel.topic):
+            paths += WHEEL_TYPES[kind][0]
+        if kind in POSITION_TYPES and topics.gnss in (None, channel.topic):
+            paths += POSITION_TYPES[kind][0]
+        if kind in HEADING_TYPES and topics.heading in (None, channel.topic):
+            paths += HEADING_TYPES[kind][0]
+        if kind == GYRO_TYPE:
+            paths += GYRO_FIELDS
+        if kind in PAIR_TYPES and channel.topic in pairs:
+            paths.append("data")
+        if paths:
+            wanted[channel.id] = tuple(dict.fromkeys(paths))
+    return wanted
+
+
+def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
+    """Return the topics that may be one side of a pair."""
+    if topics.wheels is not None:
+        return set()
+    if topics.wheel_left is not None and topics.wheel_right is not None:
+        return {topics.wheel_left, topics.wheel_right}
+    names = [channel.topic for channel in channels if channel.message_type in PAIR_TYPES]
+    found: set[str] = set()
+    for left in names:
+        right = right_twin(left, names)
+        found |= {left, right} if right is not None else set()
+    return found
+
+
+def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
+    """Read every decoded topic in each role it may have; rank by type, content and namespace."""
+    topics = config.topics
+    gnss = _read_all(tables, POSITION_TYPES, topics.gnss, no_position)
+    heading = _read_all(tables, HEADING_TYPES, topics.heading, no_heading)
+    wheels = _wheel_candidates(tables, config)
+    filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
+
+    def completeness(topic: str) -> float:
+        return sum(COMPLETE for names in filled if _namespace(topic) and _namespace(topic) in names)
+
+    wheels = _ranked(wheels, topics.wheels, completeness)
+    home = _namespace(wheels[0].topic) if wheels else ""
+    others = _other_robots(wheels)
+
+    def kinship(topic: str) -> float:
+        return SAME_NAMESPACE if home and _namespace(topic) == home else 0.0
+
+    gnss = [_independent(source, wheels, topics) for source in gnss]
+    gnss = _ranked(gnss, topics.gnss, kinship, others)
+    best = gnss[0] if gnss and not gnss[0].problem else None
+    metric = best.topic if best is not None and best.metric is not None else ""
+
+    def companionship(topic: str) -> float:
+        return kinship(topic) + (SAME_MESSAGE if topic == metric else 0.0)
+
+    heading = _ranked(heading, topics.heading, companionship, others - ({_namespace(metric)} if metric else set()))
+    return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | _empty_topics(tables))
+
+
+def _read_all(
+    tables: Sequence[TopicTable],
+    types: Mapping[str, tuple[tuple[str, ...], Callable[[TopicTable], Source]]],
+    configured: str | None,
+    unusable: Callable[[TopicTable, str], Source],
+) -> list[Source]:
+    """Read the topics of one role; one whose type in this log lacks a field that is needed becomes unusable."""
+    sources = []
+    for table in tables:
+        if table.message_type in types and configured in (None, table.topic) and len(table):
+            try:
+                sources.append(types[table.message_type][1](table))
+            except DefinitionError as err:
+                sources.append(unusable(table, err.why))
+    return sources
+
+
+def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
+    topics = config.topics
+    by_topic = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
+    if topics.wheel_left is not None and topics.wheel_right is not None:
+        left, right = by_topic.get(topics.wheel_left), by_topic.get(topics.wheel_right)
+        return [pair_motion(left, right, config)] if left is not None and right is not None else []
+
+    def bound(read: Callable[[TopicTable, Config], WheelMotion]) -> Callable[[TopicTable], WheelMotion]:
+        return lambda table: read(table, config)
+
+    readers = {name: (paths, bound(read)) for name, (paths, read) in WHEEL_TYPES.items()}
+    found = _read_all(tables, readers, topics.wheels, no_motion)
+    for name, left in by_topic.items() if topics.wheels is None else ():
+        right = by_topic.get(right_twin(name, by_topic) or "")
+        if right is not None and right.message_type == left.message_type:
+            found.append(pair_motion(left, right, config))
+    return found
+
+
+def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:
+    """Say of topics without a message to use whether there were any."""
+    return {
+        table.topic: f"none of its {table.unreadable} messages has its type's shape"
+        if table.unreadable
+        else "no message"
+        for table in tables
+        if not len(table)
+    }
+
+
+def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: TopicsConfig) -> PositionSource:
+    """Refuse the position of the message whose twist stands for the wheels: a reference knows more than they do."""
+    own = bool(wheels) and not wheels[0].problem and wheels[0].twist is not None and wheels[0].topic == source.topic
+    if not own or topics.gnss == source.topic or source.problem:
+        return source
+    return replace(source, problem="its twist stands for the wheels; a reference is independent of them")
+
+
+def _ranked(
+    sources: Sequence[Source],
+    configured: str | None,
+    bonus: Callable[[str], float],
+    others: frozenset[str] = frozenset(),
+) -> list[Source]:
+    """Sort: usable before not, this robot's before others', then by score and bonus."""
+
+    def rank(source: Source) -> tuple[bool, bool, float]:
+        forced = configured is not None and source.topic == configured
+        elsewhere = _namespace(source.topic) in others
+        return (bool(source.problem) and not forced, elsewhere, -(source.score + bonus(source.topic)))
+
+    return sorted(sources, key=rank)
+
+
+def _namespace(topic: str) -> str:
+    """Return the first name of a topic with more than one."""
+    parts = topic.strip("/").split("/")
+    return parts[0] if len(parts) > 1 else ""
+
+
+def _other_robots(wheels: Sequence[WheelMotion]) -> frozenset[str]:
+    """Return the namespaces in which another robot's wheels of the same type turn."""
+    if not wheels:
+        return frozenset()
+    best = wheels[0]
+    alike = (w for w in wheels if not w.problem and w.score >= WORTHY and w.message_type == best.message_type)
+    return frozenset(_namespace(w.topic) for w in alike) - {_namespace(best.topic), ""}
+
+
+def choose_streams(found: Candidates, config: Config, log: str, channels: Sequence[Channel]) -> Choice:
+    """Return the source of each role.
+
+    Raises
+    ------
+    ConfigError
+        A configured topic is not in the log, or cannot feed its role; a configured joint is not among the wheels'.
+    MissingStreamError
+        No candidate for one role or more; the error names them all and lists what the log holds.
+    """
+    topics = config.topics
+    _check_sides(topics, found, log, channels)
+    wheels = _best(found.wheels, topics.wheels or _pair_name(topics))
+    check_joints(wheels, found.wheels, config)
+    _check_configured("wheels", found.wheels, topics.wheels, found.unread, log, channels)
+    _check_configured("gnss", found.gnss, topics.gnss, found.unread, log, channels)
+    _check_configured("heading", found.heading, topics.heading, found.unread, log, channels)
+    gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
+    if wheels is None or gnss is None or heading is None:
+        by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
+        missing = [role for role, source in by_role.items() if source is None]
+        needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
+        raise MissingStreamError(log, needs, _listing(channels, found.unread | _refused(found, missing)))
+    return Choice(
+        wheels,
+        gnss,
+        heading,
+        {
+            "wheels": _reason(wheels, found.wheels, topics.wheels or _pair_name(topics)),
+            "gnss": _reason(gnss, found.gnss, topics.gnss),
+            "heading": _reason(heading, found.heading, topics.heading),
+        },
+    )
+
+
+def _pair_name(topics: TopicsConfig) -> str | None:
+    return f"{topics.wheel_left} + {topics.wheel_right}" if topics.wheel_left is not None else None
+
+
+def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
+    """Hold a configured pair against the log."""
+    types = {channel.topic: channel.message_type for channel in channels}
+    for side in ("left", "right"):
+        topic = getattr(topics, f"wheel_{side}")
+        if topic is None:
+            continue
+        key, needed = f"topics.wheel_{side}", f"a side's topic is one of {', '.join(sorted(PAIR_TYPES))}"
+        if topic not in types:
+            raise ConfigError(key, f"{topic} is not in {log}", f"it holds {', '.join(_listing(channels, {}))}")
+        if types[topic] not in PAIR_TYPES:
+            raise ConfigError(key, f"{topic}: {types[topic]} is not the number of one side", needed)
+        if topic in found.unread:
+            raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
+    if topics.wheel_left is not None and found.wheels and found.wheels[0].is_empty:
+        raise ConfigError(
+            "topics.wheel_left", f"{found.wheels[0].topic}: {found.wheels[0].problem}", "name another pair"
+        )
+
+
+def _check_configured(
+    role: Role,
+    sources: Sequence[WheelMotion | PositionSource | HeadingSource],
+    configured: str | None,
+    unread: dict[str, str],
+    log: str,
+    channels: Sequence[Channel],
+) -> None:
+    """Hold a configured topic against the log. One with a mere doubt about it is used, as it was asked for."""
+    if configured is None:
+        return
+    types = {channel.topic: channel.message_type for channel in channels}
+    key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
+    if configured not in types:
+        raise ConfigError(key, f"{configured} is not in {log}", f"it holds {', '.join(_listing(channels, unread))}")
+    if not sources:
+        if role == "wheels" and types[configured] in PAIR_TYPES:
+            needed = "name both sides in topics.wheel_left and topics.wheel_right"
+        raise ConfigError(key, f"{configured}: {unread.get(configured, f'{types[configured]} cannot feed it')}", needed)
+    if sources[0].is_empty:
+        raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
+
+
+def _best(sources: Sequence[Source], configured: str | None) -> Source | None:
+    usable = (source for source in sources if not source.problem or source.topic == configured)
+    return next(usable, None)
+
+
+def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> str:
+    if configured is not None:
+        return f"{best.why}; configured"
+    rest = [source.topic for source in sources if source is not best]
+    return f"{best.why}; chosen over {', '.join(rest[:3])}" if rest else best.why
+
+
+def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
+    """Say of the candidates for some roles why they were refused."""
+    by_role: dict[Role, Sequence[WheelMotion | PositionSource | HeadingSource]] = {
+        "wheels": found.wheels,
+        "gnss": found.gnss,
+        "heading": found.heading,
+    }
+    problems: dict[str, dict[str, None]] = {}
+    for role in roles:
+        for source in by_role[role]:
+            for topic in source.topic.split(" + "):
+                problems.setdefault(topic, {})[source.problem] = None
+    return {topic: ", ".join(reasons) for topic, reasons in problems.items()}
+
+
+def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[str]:
+    """Return the log's topics with their types, those that came into question first."""
+    entries: dict[str, str] = {}
+    for channel in channels:
+        reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
+        entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
+    ordered = [*(entries[t] for t in entries if t in reasons), *(entries[t] for t in entries if t not in reasons)]
+    more = len(ordered) - MOST_LISTED
+    return ([*ordered[:MOST_LISTED], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
+
+
+def common_clock(delays_s: Sequence[float | None]) -> Literal["header", "log"]:
+    """Choose one clock for streams that are used together.
+
+    `delays_s` holds, by stream, log time minus header stamp, None where there are no header stamps. Where some
+    stream has only log times and another's header is far from them, all go by log time.
+    """
+    told = [delay for delay in delays_s if delay is not None]
+    if len(told) == len(delays_s):
+        return "header"
+    return "log" if any(abs(delay) > 0.1 for delay in told) else "header"

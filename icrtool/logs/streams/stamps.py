@@ -1,0 +1,80 @@
+"""Which clock to believe: the stamp in a message's header, or the time it was logged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.records.tables import Ints
+
+NEAR_NS = 2_000_000_000
+"""A header stamp this far from the log time (median) is another clock's: GPS time is 18 s off, a dead RTC years."""
+
+LARGEST_SHARE_BACKWARDS = 0.01
+LARGEST_SHARE_ZERO = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class StampedRows:
+    """The stamps of a topic's messages.
+
+    Attributes
+    ----------
+    header_ns : (n,) header stamps, None where they are absent or not sane
+    log_ns : (n,) log times
+    note : why the header's are not used, empty when they are
+    delay_ns : median of log time minus header stamp, 0 without header stamps
+    """
+
+    header_ns: Ints | None
+    log_ns: Ints
+    note: str
+    delay_ns: int
+
+    def on(self, clock: Literal["header", "log"]) -> Ints:
+        """Return the stamps on a clock; the log's where the header's cannot be used."""
+        return self.header_ns if clock == "header" and self.header_ns is not None else self.log_ns
+
+
+def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
+    """Judge the header stamps of a topic: non-zero, near log time, increasing."""
+    log_ns = table.log_time_ns
+    if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
+        return StampedRows(None, log_ns, "no header", 0)
+    header = table.columns[f"{path}.sec"] * 1_000_000_000 + table.columns[f"{path}.nanosec"]
+    zeros = np.count_nonzero(header == 0)
+    if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
+        return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
+    delay = int(np.median(log_ns - header))
+    if abs(delay) > NEAR_NS:
+        return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
+    # A few stamps of another clock (a first message at 0) are put where their log times say.
+    header = np.where(np.abs(log_ns - header - delay) > NEAR_NS, log_ns - delay, header)
+    backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
+    if backwards > LARGEST_SHARE_BACKWARDS:
+        return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
+    return StampedRows(header, log_ns, "", delay)
+
+
+def increasing(stamps: Ints) -> tuple[Ints, int, int]:
+    """Return the rows that make stamps strictly increasing, and how many went back or stood still.
+
+    Rows are sorted by stamp; of rows with the same stamp the last one stays.
+    """
+    backwards = int(np.count_nonzero(np.diff(stamps) < 0))
+    order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
+    ordered = stamps[order]
+    keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
+    return order[keep], backwards, len(stamps) - int(np.count_nonzero(keep))
+
+
+def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
+    """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""
+    if len(stamps) < 2:
+        return float("nan"), float("nan")
+    interval = np.diff(stamps)
+    median = float(np.median(interval))
+    return (1e9 / median if median > 0 else float("inf")), float(interval.std()) / 1e6

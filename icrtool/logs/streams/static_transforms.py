@@ -1,0 +1,100 @@
+"""Where the antenna sits, from the transforms a robot publishes on ``/tf_static``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icrtool.logs.containers.channel import Channel
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.records.tables import Floats
+
+TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
+LARGEST_LEVER_ARM_M = 5.0
+"""A transform that puts an antenna further away than this is not that of a robot."""
+
+_PREFIX = "transforms[*]."
+_TRANSLATION = tuple(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz")
+_ROTATION = tuple(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw")
+FIELDS = (f"{_PREFIX}header.frame_id", f"{_PREFIX}child_frame_id", *_TRANSLATION, *_ROTATION)
+
+Transforms = dict[str, tuple[str, Floats, Floats]]
+"""Child frame to (parent frame, translation (3,) [m], rotation (3, 3)); parent coordinates = R child + t."""
+
+
+def is_static(channel: Channel) -> bool:
+    """Say whether a channel carries static transforms."""
+    return channel.message_type in TYPES and channel.topic.rstrip("/").endswith("tf_static")
+
+
+def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[float, float] | None:
+    """Return the antenna's place in the body frame, forward and right [m]; None where the log does not say.
+
+    Parameters
+    ----------
+    antenna_topic : topic of the fixes; its header names the antenna's frame
+    """
+    frame = next((_plain(t.text("header.frame_id")) for t in tables if t.topic == antenna_topic), "")
+    transforms = _transforms([t for t in tables if t.message_type in TYPES])
+    if not frame or frame not in transforms:
+        return None
+    root, place, _ = _to_root(frame, transforms)
+    names = sorted({name for child, (parent, _, _) in transforms.items() for name in (child, parent)})
+    bases = [name for last in BASE_FRAMES for name in names if name.rsplit("/", 1)[-1] == last]
+    for base in bases:
+        base_root, origin, rotation = _to_root(base, transforms)
+        if base_root == root:
+            forward, left, _up = rotation.T @ (place - origin)
+            if np.hypot(forward, left) <= LARGEST_LEVER_ARM_M:
+                return float(forward), -float(left)
+    return None
+
+
+def _plain(frame: str) -> str:
+    return frame.strip("/")
+
+
+def _transforms(tables: Sequence[TopicTable]) -> Transforms:
+    """Collect the transforms of all messages; the last one of a child counts."""
+    found: Transforms = {}
+    for table in tables:
+        if not all(path in table.columns for path in FIELDS):
+            continue
+        parents, parent_names = table.words(FIELDS[0])
+        children, child_names = table.words(FIELDS[1])
+        translation = np.stack([table.floats(path) for path in _TRANSLATION], axis=-1)
+        rotation = np.stack([table.floats(path) for path in _ROTATION], axis=-1)
+        for row, place in zip(*np.nonzero(children >= 0), strict=True):
+            q = rotation[row, place]
+            if np.isfinite(q).all() and np.isfinite(translation[row, place]).all() and np.linalg.norm(q) > 0:
+                child = _plain(child_names[children[row, place]])
+                parent = _plain(parent_names[parents[row, place]])
+                found[child] = (parent, translation[row, place], _matrix(q))
+    return found
+
+
+def _matrix(q: Floats) -> Floats:
+    """Return the rotation matrix of a quaternion x, y, z, w."""
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _to_root(frame: str, transforms: Transforms) -> tuple[str, Floats, Floats]:
+    """Return the root of a frame's tree, and the frame's origin and axes in it."""
+    origin, rotation, seen = np.zeros(3), np.eye(3), {frame}
+    while frame in transforms:
+        parent, translation, turn = transforms[frame]
+        origin, rotation = turn @ origin + translation, turn @ rotation
+        if parent in seen:
+            break
+        seen.add(parent)
+        frame = parent
+    return frame, origin, rotation

@@ -1,0 +1,96 @@
+"""Wheels that come as one topic a side: numbers without a header, two messages to pair."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.config import Config
+from icrtool.errors import DefinitionError
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.stamps import StampedRows
+from icrtool.logs.streams.wheel_sources import COMMANDED, Unit, WheelMotion, motion_of
+from icrtool.records.tables import Bools, Floats
+
+PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
+"""Types that come as one topic a side."""
+
+_SPEED_WORDS = re.compile(r"vel|speed|rate|rpm|twist", re.IGNORECASE)
+_PLACE_WORDS = re.compile(r"tick|count|enc|pos|angle|travel|dist|odo", re.IGNORECASE)
+_BITS = {"std_msgs/Int16": 16, "std_msgs/Int32": 32, "std_msgs/UInt32": 32, "std_msgs/Int64": 64}
+_HOLD_NS = 500_000_000
+"""A side that ends earlier than the other is held for this long at most."""
+
+
+def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMotion:
+    """Join a left and a right topic without headers: the right one is taken at the left one's stamps.
+
+    Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
+    """
+    kind = " + ".join(dict.fromkeys((left.message_type, right.message_type)))
+    topic = f"{left.topic} + {right.topic}"
+    commanded = bool(COMMANDED.search(left.topic))
+    score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
+
+    def unusable(problem: str) -> WheelMotion:
+        stamps = StampedRows(None, left.log_time_ns, "no header", 0)
+        return motion_of(topic, kind, stamps, score=score, problem=problem)
+
+    if not (len(left) and len(right)):
+        return unusable(f"{(right if len(left) else left).topic} holds no message")
+    try:
+        values = [_unwrapped(table.column("data"), _BITS.get(table.message_type)) for table in (left, right)]
+    except DefinitionError as err:
+        return unusable(err.why)
+    both = _while_both(left, right)
+    if not both.any():
+        return unusable("the two sides were not recorded at the same time")
+    moments, stamps = left.log_time_ns[both], StampedRows(None, left.log_time_ns[both], "no header", 0)
+    integer = left.message_type in _BITS
+    if _tells_position(left.topic, values[0], config, integer=integer):
+        unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
+        other = np.interp(moments, right.log_time_ns, values[1])
+        why = f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}"
+        return motion_of(topic, kind, stamps, (values[0][both], other), units=(unit, unit), score=score, why=why)
+    place = np.clip(np.searchsorted(right.log_time_ns, moments + _half_interval(left), side="right") - 1, 0, None)
+    speed = (values[0][both], values[1][place])
+    return motion_of(topic, kind, stamps, speed=speed, units=("unknown", "unknown"), score=score, why=f"{why}: speeds")
+
+
+def _half_interval(table: TopicTable) -> int:
+    """Two messages of one control cycle are logged one after the other: half an interval joins them."""
+    return int(np.median(np.diff(table.log_time_ns))) // 2 if len(table) > 1 else 0
+
+
+def _while_both(left: TopicTable, right: TopicTable) -> Bools:
+    """Return the left rows (n,) recorded while the right side was: a side held for longer would feign a turn."""
+    slack = max(_half_interval(left), _half_interval(right))
+    first, last = right.log_time_ns[0] - slack, right.log_time_ns[-1] + max(slack, _HOLD_NS)
+    both: Bools = np.logical_and(left.log_time_ns >= first, left.log_time_ns <= last)
+    return both
+
+
+def _unwrapped(values: NDArray[Any], bits: int | None) -> Floats:
+    if bits is None or bits == 64 or not len(values):
+        return values.astype(np.float64)
+    span = 1 << bits
+    steps = np.mod(np.diff(values.astype(np.int64)) + span // 2, span) - span // 2
+    return np.concatenate([[0], np.cumsum(steps)]).astype(np.float64) + float(values[0])
+
+
+def _tells_position(topic: str, values: Floats, config: Config, *, integer: bool) -> bool:
+    """Say whether a pair's numbers are travelled positions (ticks, angles), not speeds."""
+    if config.wheels.quantity != "auto":
+        return config.wheels.quantity in ("position", "counts")
+    if _SPEED_WORDS.search(topic):
+        return False
+    if _PLACE_WORDS.search(topic):
+        return True
+    finite = values[np.isfinite(values)]
+    if len(finite) < 3 or np.ptp(finite) == 0:
+        return integer
+    # A position's steps add up to about its range; a speed goes up and down around few values.
+    return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)

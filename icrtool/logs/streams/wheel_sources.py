@@ -1,0 +1,337 @@
+"""Messages that tell how the wheels move, each brought to one form: two sides, position or speed, or a body twist."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.config import Config
+from icrtool.errors import DefinitionError
+from icrtool.logs.containers.channel import some_of
+from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.position_sources import REFERENCE_WORDS
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.wheel_names import wheel_joints
+from icrtool.records.tables import Bools, Floats, Ints
+
+Unit = Literal["rad", "m", "counts", "unknown"]
+
+COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
+_FUSED = re.compile(
+    r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
+    re.IGNORECASE,
+)
+"""Odometry and twists that other sensors have a part in: better than nothing."""
+
+ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
+"""Positions that stay within a turn, and step over nearly all of it this often, are told modulo a turn."""
+
+NEVER_MOVES = 60.0
+"""Taken off the score of wheels that stand still all the time: another topic that moves is the robot's."""
+
+SIDEWAYS_SHARE = 0.2
+"""A twist that goes this much sideways and never turns is a velocity east and north, not the body's."""
+
+
+@dataclass(frozen=True, slots=True)
+class WheelMotion:
+    """What a topic, or a pair of topics, says of the wheels.
+
+    Attributes
+    ----------
+    position_left, position_right : (n,) travelled since some start, in `position_unit`; None where not told
+    speed_left, speed_right : (n,) in `speed_unit` per second; None where not told
+    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only the body's is told
+    score : how well the type suits; `why` says it in words
+    problem : why it cannot be used, empty when it can
+    joints : the joints that its messages list by name, where they do
+    """
+
+    topic: str
+    message_type: str
+    stamps: StampedRows
+    position_left: Floats | None = None
+    position_right: Floats | None = None
+    position_unit: Unit = "rad"
+    speed_left: Floats | None = None
+    speed_right: Floats | None = None
+    speed_unit: Unit = "rad"
+    twist: Floats | None = None
+    score: float = 0.0
+    why: str = ""
+    problem: str = ""
+    joints: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to use, even when it is asked for."""
+        return self.twist is None and self.position_left is None and self.speed_left is None
+
+
+_Paths = tuple[str, str, str]
+"""Of the joints' names, positions and speeds."""
+
+Sides = tuple[Floats | None, Floats | None]
+Reader = Callable[[TopicTable, Config], WheelMotion]
+_UNTOLD: Sides = (None, None)
+
+
+def no_motion(table: TopicTable, problem: str) -> WheelMotion:
+    """Return the motion that a topic is when it cannot be read."""
+    return WheelMotion(table.topic, table.message_type, stamp_rows(table), problem=problem)
+
+
+def motion_of(
+    topic: str, message_type: str, stamps: StampedRows, position: Sides = _UNTOLD, speed: Sides = _UNTOLD,
+    twist: Floats | None = None, units: tuple[Unit, Unit] = ("rad", "rad"), score: float = 0.0, why: str = "",
+    problem: str = "",
+) -> WheelMotion:  # fmt: skip
+    """Build a motion from left and right; what is told of one side only, or nowhere finite, is left out."""
+    told = [pair if all(side is not None and bool(np.isfinite(side).any()) for side in pair) else _UNTOLD
+            for pair in (position, speed)]  # fmt: skip
+    values = [side for pair in told for side in pair if side is not None] + ([twist] if twist is not None else [])
+    if not values and not problem:
+        problem = "tells neither position nor speed of both sides"
+    if values and not any(_changes(side) for side in told[0]) and not any(_nonzero(v) for v in (*told[1], twist)):
+        score, why = score - NEVER_MOVES, f"{why}, never moves"
+    return WheelMotion(topic, message_type, stamps, *told[0], units[0], *told[1], units[1], twist, score, why, problem)
+
+
+def _changes(side: Floats | None) -> bool:
+    return side is not None and float(np.ptp(side[np.isfinite(side)])) > 0.0
+
+
+def _nonzero(values: Floats | None) -> bool:
+    return values is not None and bool(np.any(values[np.isfinite(values)] != 0.0))
+
+
+def _header(*paths: str) -> tuple[str, ...]:
+    return ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *paths)
+
+
+def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
+    """Return the mean over the joints of each side that ever say something; None where none does."""
+    means: list[Floats | None] = []
+    for places in (left, right):
+        told = [place for place in places if np.isfinite(values[:, place]).any()]
+        means.append(values.T[told].astype(np.float64).mean(axis=0) if told else None)
+    return means[0], means[1]
+
+
+def _unwound(positions: Floats) -> Floats:
+    """Return joint positions [rad] (n, k); those told within one turn, as angles that go on.
+
+    Before sides are averaged: a front and a rear wheel do not begin a turn at the same time.
+    """
+    unwound = positions
+    for place, column in enumerate(positions.T):
+        if not float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf)) <= ONE_TURN_RAD:
+            continue
+        told = np.flatnonzero(np.isfinite(column))
+        steps = np.abs(np.diff(column[told]))
+        wraps = steps > np.pi
+        if np.count_nonzero(wraps) >= FEWEST_WRAPS and float(steps[wraps].min()) > LEAST_WRAP_RAD:
+            unwound = unwound.copy("K") if unwound is positions else unwound
+            unwound[told, place] = np.unwrap(column[told])
+    return unwound
+
+
+def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what: str) -> WheelMotion:
+    """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
+    codes, texts = table.words(paths[0])
+    left, right = _wheels_among(texts, config)
+    if not (left and right):
+        advice = "name them in wheels.{left,right}_joints"
+        named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
+        return no_motion(table, named if texts else "lists no joints")
+    lefts, rights = len(left), len(right)
+    # Joints by their place among the wheels, left ones first; -1 for all others.
+    wheel = np.full(len(texts) + 1, -1)
+    wheel[left + right] = np.arange(lefts + rights)
+    wheels = wheel[codes]
+    alike = _rows_alike(wheels, lefts, rights)
+    if not alike.any():
+        return no_motion(table, "left and right wheels come in different messages")
+    if not alike.all():
+        table, wheels = table.rows(alike), wheels[alike]
+    told, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
+    position, speed = (
+        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)]) for values in (_unwound(told), speeds)
+    )
+    why = f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}"
+    return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
+
+
+def _wheels_among(texts: list[str], config: Config) -> tuple[list[int], list[int]]:
+    left, right = wheel_joints(texts)
+    given = config.wheels
+    if given.left_joints:
+        left = [i for i, name in enumerate(texts) if name in given.left_joints]
+    if given.right_joints:
+        right = [i for i, name in enumerate(texts) if name in given.right_joints]
+    return left, right
+
+
+def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
+    """Return the rows (n,) that list the set of wheels most rows list, of those sets with both sides.
+
+    A mean over wheels that changes its members would jump.
+    """
+    listed = np.zeros((lefts + rights, len(wheels)), np.bool_).T
+    for rows, wheel, _ in _told_wheels(wheels):
+        listed[rows, wheel] = True
+    both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
+    sets = listed[both]
+    if len(sets) and np.any(sets != sets[0]):
+        _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
+        both[both] = which.reshape(-1) == int(np.argmax(count))
+    return both
+
+
+def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats:
+    """Return what each message tells of each wheel (n, count), NaN where nothing."""
+    told = np.full((count, len(wheels)), np.nan).T
+    if values is not None:
+        for rows, wheel, place in _told_wheels(wheels[:, : values.shape[1]]):
+            told[rows, wheel] = values[rows, place]
+    return told
+
+
+def _told_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
+    """Yield rows, and the wheel, or that of each row, which they list at a place."""
+    for place, listed in enumerate(wheels.T):
+        if len(listed) and (listed == listed[0]).all():
+            if listed[0] >= 0:
+                yield slice(None), int(listed[0]), place
+        else:
+            rows = np.flatnonzero(listed >= 0)
+            yield rows, listed[rows], place
+
+
+def _by_name(paths: _Paths, score: float, what: str) -> Reader:
+    def read(table: TopicTable, config: Config) -> WheelMotion:
+        return replace(_joints(table, config, paths, score, what), joints=tuple(table.words(paths[0])[1]))
+
+    return read
+
+
+def _by_place(
+    paths: tuple[str, str], left: list[int], right: list[int], why: str, stamp: str = "header.stamp"
+) -> Reader:
+    """Read messages whose lists of positions and of speeds have the sides at fixed places."""
+    length = max(left + right) + 1
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        position, speed = (table.column(path) for path in paths)
+        if min(position.shape[1], speed.shape[1]) < length:
+            raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
+        return motion_of(
+            table.topic, table.message_type, stamp_rows(table, stamp),
+            _side_means(_unwound(position.astype(np.float64)), left, right),
+            _side_means(speed, left, right), score=90.0, why=why,
+        )  # fmt: skip
+
+    return read
+
+
+def _segway(prefix: str) -> Reader:
+    """Read the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        def sides(quantity: str) -> Sides:
+            left, right = (table.floats(f"{prefix}{side}_wheel_{quantity}") for side in ("left", "right"))
+            return left, right
+
+        return motion_of(
+            table.topic, table.message_type, stamp_rows(table), sides("displacement"), sides("velocity"),
+            units=("m", "m"), score=90.0, why="the base's wheel displacement and speed",
+        )  # fmt: skip
+
+    return read
+
+
+def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
+    twist = np.column_stack([table.column(speed), table.column(turn)]).astype(np.float64)
+    if COMMANDED.search(table.topic):
+        score, why = score - 40.0, f"{why} (commanded)"
+    across = table.floats(sideways)
+    forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
+    problem = ""
+    if not _nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
+        problem = "goes sideways and never turns: a velocity east and north, not the body's"
+    return motion_of(
+        table.topic, table.message_type, stamp_rows(table), twist=twist, score=score, why=why, problem=problem
+    )
+
+
+def _scout(table: TopicTable, _: Config) -> WheelMotion:
+    """Read scout_msgs/ScoutStatus: the body twist the base reports (its motor rpm is integer, before the gearbox)."""
+    why = "the base's own speed and turn rate, undone with the track width"
+    return _twist_motion(table, "linear_velocity", "lateral_velocity", "angular_velocity", 70.0, why)
+
+
+def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Reader:
+    """Read a body twist; `fused` is taken off where the topic's name says that other sensors have a part in it."""
+
+    def read(table: TopicTable, _: Config) -> WheelMotion:
+        lowered = score - (fused if _FUSED.search(table.topic) else 0.0)
+        why = f"{what}, undone with the track width"
+        motion = _twist_motion(table, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", lowered, why)
+        if REFERENCE_WORDS.search(table.topic) and not motion.problem:
+            return replace(motion, problem="its name says that it is a reference's, not the wheels'")
+        return motion
+
+    return read
+
+
+def _twist_paths(prefix: str) -> tuple[str, ...]:
+    return (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
+
+
+_JOINTS = ("name[*]", "position[*]", "velocity[*]")
+_DRIVERS = ("drivers[*].measured_travel", "drivers[*].measured_velocity")
+_LYNX = ("drivers[*].joint_name", "drivers[*].travel", "drivers[*].velocity")
+_PUMA = ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed")
+_FOUR = ("position[*]", "velocity[*]")
+_SEGWAY = tuple(f"{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
+
+_joint_state = _by_name(_JOINTS, 100.0, "wheel joints by name")
+_dynamic_joint_state = _by_name(_JOINTS, 95.0, "wheel joints by name")
+_lynx = _by_name(_LYNX, 90.0, "motor driver feedback by joint name")
+_puma = _by_name(_PUMA, 90.0, "motor driver feedback by device name")
+# Drive.msg of jackal_msgs and of clearpath_platform_msgs: 0 is left, 1 is right.
+_two_drivers = _by_place(_DRIVERS, [0], [1], "motor driver feedback: driver 0 left, 1 right")
+_four_wheels = _by_place(
+    _FOUR, [0, 1], [2, 3], "four wheels: front left, rear left, front right, rear right", stamp="stamp"
+)
+_odometry = _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0)
+
+_SEGWAY_BARE = (_SEGWAY, _segway(""))
+_SEGWAY_STAMPED = (_header(*(f"segway.{field}" for field in _SEGWAY)), _segway("segway."))
+
+WHEEL_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "sensor_msgs/JointState": (_header(*_JOINTS), _joint_state),
+    DYNAMIC_JOINT_STATE: (_header(*_JOINTS), _dynamic_joint_state),
+    "jackal_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
+    "clearpath_platform_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
+    "clearpath_motor_msgs/LynxMultiFeedback": (_header(*_LYNX), _lynx),
+    "clearpath_motor_msgs/PumaMultiFeedback": (_header(*_PUMA), _puma),
+    "puma_motor_msgs/MultiFeedback": (_header(*_PUMA), _puma),
+    "leo_msgs/WheelStates": (("stamp.sec", "stamp.nanosec", *_FOUR), _four_wheels),
+    "scout_msgs/ScoutStatus": (_header("linear_velocity", "lateral_velocity", "angular_velocity"), _scout),
+    **dict.fromkeys(("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped"), _SEGWAY_STAMPED),
+    "segway_interfaces/Stamped": _SEGWAY_STAMPED,
+    **dict.fromkeys(("segway_rmp/SegwayStatus", "segway_rmp_ros2/SegwayStatus"), _SEGWAY_BARE),
+    "segway_interfaces/Segwaystatus": _SEGWAY_BARE,
+    "nav_msgs/Odometry": (_header(*_twist_paths("twist.twist.")), _odometry),
+    "geometry_msgs/TwistStamped": (_header(*_twist_paths("twist.")), _twist("twist.", 50.0)),
+    "geometry_msgs/TwistWithCovarianceStamped": (_header(*_twist_paths("twist.twist.")), _twist("twist.twist.", 50.0)),
+    "geometry_msgs/Twist": (_twist_paths(""), _twist("", 40.0)),
+}
+"""By message type: the fields to take, and how to read them."""

@@ -1,0 +1,1 @@
+"""Write logs: columns to messages, messages to containers."""

@@ -1,0 +1,277 @@
+"""Columns to serialised messages: one template a topic, its changing bytes overwritten for all messages at once.
+
+Serialising 800,000 messages one by one takes minutes. The layout of these types is fixed once the lengths of their
+strings are, so a topic is one byte matrix. Where a field stands is found by changing it in the template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from rosbags.typesys.store import Typestore
+
+    from icrtool.logs.writing.records import SensorColumns, WriteOptions
+    from icrtool.records.tables import Ints
+
+GRAVITY_MPS2 = 9.81
+HEIGHT_STD_RATIO = 2.0
+"""Vertical over horizontal GNSS noise, a rule of thumb of GNSS geometry."""
+
+FRONT_AND_REAR_JOINTS = (
+    "front_left_wheel_joint",
+    "front_right_wheel_joint",
+    "rear_left_wheel_joint",
+    "rear_right_wheel_joint",
+)
+
+JACKAL_DEFINITIONS = {
+    "jackal_msgs/msg/DriveFeedback": (
+        "float32 current\nfloat32 duty_cycle\nfloat32 bridge_temperature\nfloat32 motor_temperature\n"
+        "float32 measured_velocity\nfloat32 measured_travel\nbool driver_fault\n"
+    ),
+    "jackal_msgs/msg/Feedback": (
+        "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
+        "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessages:
+    """All messages of a topic, serialised.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,)
+    payload : uint8 (n, size), one message a row
+    """
+
+    topic: str
+    message_type: str
+    stamp_ns: Ints
+    payload: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``)."""
+
+    topic: str
+    message_type: str
+    stamp_ns: Ints
+    fixed: dict[str, object]
+    columns: dict[str, NDArray[Any]]
+
+
+@cache
+def load_typestore(*, ros1: bool) -> Typestore:
+    """Return the message types of ROS Noetic or of ROS 2 Jazzy, jackal_msgs included."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    for name, text in JACKAL_DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def serialise_topics(columns: SensorColumns, options: WriteOptions, store: Typestore) -> tuple[TopicMessages, ...]:
+    """Turn the columns into the messages of every topic that has any.
+
+    Returns
+    -------
+    topics, in the order wheels, position, heading: the order of messages with equal stamps
+    """
+    plans = (*_plan_wheels(columns, options), _plan_position(columns), _plan_heading(columns, options))
+    prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
+    ros1 = options.container == "bag"
+    return tuple(_serialise(plan, prefix, store, ros1=ros1) for plan in plans if len(plan.stamp_ns))
+
+
+def _plan_wheels(columns: SensorColumns, options: WriteOptions) -> tuple[_Plan, ...]:
+    match options.wheels:
+        case "joint_states":
+            return (_plan_joint_states(columns, options),)
+        case "odometry":
+            return (_plan_odometry(columns, options),)
+        case "twist_stamped":
+            return (_plan_twist_stamped(columns, options),)
+        case "jackal_feedback":
+            return (_plan_jackal_feedback(columns, options),)
+        case "ticks":
+            return _plan_ticks(columns, options)
+        case "float64_pair":
+            return _plan_float64_pair(columns)
+
+
+def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> _Plan:
+    radius = options.wheel_radius_m
+    changing = _header_stamp(columns.wheel_stamp_ns)
+    for joint, name in enumerate(FRONT_AND_REAR_JOINTS):
+        left = "left" in name
+        travel = columns.wheel_position_left_m if left else columns.wheel_position_right_m
+        speed = columns.wheel_v_left_mps if left else columns.wheel_v_right_mps
+        changing[f"position.{joint}"] = travel / radius
+        changing[f"velocity.{joint}"] = speed / radius
+    fixed: dict[str, object] = {"name": list(FRONT_AND_REAR_JOINTS), "position": np.zeros(4), "velocity": np.zeros(4)}
+    return _Plan("/joint_states", "sensor_msgs/msg/JointState", columns.wheel_stamp_ns, fixed, changing)
+
+
+def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where: str) -> dict[str, NDArray[Any]]:
+    """Return the body twist as wheel controllers report it: no slip, body x forward and y left (REP-103)."""
+    right, left = columns.wheel_v_right_mps, columns.wheel_v_left_mps
+    return {
+        f"{where}.linear.x": (right + left) / 2,
+        f"{where}.angular.z": (right - left) / options.track_width_m,
+    }
+
+
+def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> _Plan:
+    changing = _header_stamp(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist.twist")
+    fixed: dict[str, object] = {
+        "header.frame_id": "odom",
+        "child_frame_id": "base_link",
+        "pose.pose.orientation.w": 1.0,
+    }
+    return _Plan("/wheel_controller/odom", "nav_msgs/msg/Odometry", columns.wheel_stamp_ns, fixed, changing)
+
+
+def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> _Plan:
+    changing = _header_stamp(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist")
+    topic, message_type = "/wheel_controller/twist", "geometry_msgs/msg/TwistStamped"
+    return _Plan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing)
+
+
+def _plan_float64_pair(columns: SensorColumns) -> tuple[_Plan, ...]:
+    sides = (("/left_drive/velocity", columns.wheel_v_left_mps), ("/right_drive/velocity", columns.wheel_v_right_mps))
+    return tuple(_Plan(topic, "std_msgs/msg/Float64", columns.wheel_stamp_ns, {}, {"data": v}) for topic, v in sides)
+
+
+def _plan_ticks(columns: SensorColumns, options: WriteOptions) -> tuple[_Plan, ...]:
+    per_metre = options.counts_per_rev / (2 * np.pi * options.wheel_radius_m)
+    sides = (("/lwheel_ticks", columns.wheel_position_left_m), ("/rwheel_ticks", columns.wheel_position_right_m))
+    plans = []
+    for topic, travel in sides:
+        # An Int32 counter wraps around, as numpy's narrowing cast of an integer does.
+        counts = np.rint(travel * per_metre).astype(np.int64).astype(np.int32)
+        plans.append(_Plan(topic, "std_msgs/msg/Int32", columns.wheel_stamp_ns, {}, {"data": counts}))
+    return tuple(plans)
+
+
+def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> _Plan:
+    changing = _header_stamp(columns.wheel_stamp_ns)
+    sides = (
+        (columns.wheel_position_left_m, columns.wheel_v_left_mps),
+        (columns.wheel_position_right_m, columns.wheel_v_right_mps),
+    )
+    for driver, (travel, speed) in enumerate(sides):
+        changing[f"drivers.{driver}.measured_travel"] = (travel / options.wheel_radius_m).astype(np.float32)
+        changing[f"drivers.{driver}.measured_velocity"] = (speed / options.wheel_radius_m).astype(np.float32)
+    return _Plan("/feedback", "jackal_msgs/msg/Feedback", columns.wheel_stamp_ns, {}, changing)
+
+
+def _plan_position(columns: SensorColumns) -> _Plan:
+    known = np.isfinite(columns.gnss_std_m)
+    variance = np.where(known, columns.gnss_std_m, 0.0) ** 2
+    changing = _header_stamp(columns.gnss_stamp_ns) | {
+        "status.status": columns.gnss_status.astype(np.int8),
+        "latitude": columns.latitude_deg,
+        "longitude": columns.longitude_deg,
+        "altitude": columns.height_m,
+        "position_covariance.0": variance,
+        "position_covariance.4": variance,
+        "position_covariance.8": variance * HEIGHT_STD_RATIO**2,
+        "position_covariance_type": np.where(known, 2, 0).astype(np.uint8),
+    }
+    fixed: dict[str, object] = {"header.frame_id": "gps_link", "status.service": 1}
+    return _Plan("/gps/fix", "sensor_msgs/msg/NavSatFix", columns.gnss_stamp_ns, fixed, changing)
+
+
+def _plan_heading(columns: SensorColumns, options: WriteOptions) -> _Plan:
+    # World and body turn over together: in ENU the body's z is up, in NED it is down (REP-145).
+    enu = options.heading == "enu"
+    yaw = np.pi / 2 - columns.heading_rad if enu else columns.heading_rad
+    changing = _header_stamp(columns.heading_stamp_ns) | {
+        "orientation.z": np.sin(yaw / 2),
+        "orientation.w": np.cos(yaw / 2),
+        "angular_velocity.z": -columns.yaw_rate_radps if enu else columns.yaw_rate_radps,
+    }
+    variance = np.radians(options.heading_std_deg) ** 2
+    fixed: dict[str, object] = {
+        "header.frame_id": "imu_link" if enu else "imu_link_ned",
+        "orientation_covariance": np.diag([variance] * 3).ravel(),
+        "linear_acceleration.z": GRAVITY_MPS2 if enu else -GRAVITY_MPS2,
+    }
+    return _Plan("/imu/data", "sensor_msgs/msg/Imu", columns.heading_stamp_ns, fixed, changing)
+
+
+def _header_stamp(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+    return {
+        "header.stamp.sec": (stamp_ns // 1_000_000_000).astype(np.uint32),
+        "header.stamp.nanosec": (stamp_ns % 1_000_000_000).astype(np.uint32),
+    }
+
+
+def _serialise(plan: _Plan, prefix: str, store: Typestore, *, ros1: bool) -> TopicMessages:
+    message = _blank(store, plan.message_type)
+    for path, value in plan.fixed.items():
+        _put(message, path, value)
+
+    def encode() -> NDArray[np.uint8]:
+        encoder = store.serialize_ros1 if ros1 else store.serialize_cdr
+        return np.frombuffer(encoder(message, plan.message_type), dtype=np.uint8).copy()
+
+    slots = {path: _find_slot(encode, message, path, values.dtype) for path, values in plan.columns.items()}
+    payload = np.tile(encode(), (len(plan.stamp_ns), 1))
+    for path, slot in slots.items():
+        values = plan.columns[path]
+        little_endian = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+        payload[:, slot] = little_endian.view(np.uint8).reshape(len(values), -1)
+    return TopicMessages(prefix + plan.topic, plan.message_type, plan.stamp_ns, payload)
+
+
+def _blank(store: Typestore, message_type: str) -> object:
+    """Return a message of zeros, empty strings and empty sequences."""
+    from rosbags.interfaces import Nodetype
+
+    values: dict[str, Any] = {}
+    for name, (kind, detail) in cast("list[tuple[str, tuple[Any, Any]]]", store.fielddefs[message_type][1]):
+        if kind == Nodetype.NAME:
+            values[name] = _blank(store, detail)
+        elif kind == Nodetype.BASE:
+            values[name] = "" if detail[0] == "string" else np.zeros((), dtype=detail[0])[()]
+        else:
+            (element_kind, element), length = detail
+            length = length if kind == Nodetype.ARRAY else 0
+            if element_kind == Nodetype.NAME:
+                values[name] = [_blank(store, element) for _ in range(length)]
+            else:
+                values[name] = [""] * length if element[0] == "string" else np.zeros(length, dtype=element[0])
+    return store.types[message_type](**values)
+
+
+def _put(message: object, path: str, value: object) -> None:
+    *parents, last = path.split(".")
+    for step in parents:
+        message = message[int(step)] if isinstance(message, list) else getattr(message, step)
+    if isinstance(message, np.ndarray):
+        message[int(last)] = value
+    else:
+        setattr(message, last, value)
+
+
+def _find_slot(encode: Callable[[], NDArray[np.uint8]], message: object, path: str, dtype: np.dtype[Any]) -> slice:
+    """Return the bytes of the scalar at `path`: those that change when it does. It is zero before and after."""
+    blank = encode()
+    _put(message, path, np.frombuffer(b"\x11" * dtype.itemsize, dtype=dtype)[0])
+    changed = np.flatnonzero(encode() != blank)
+    _put(message, path, dtype.type(0))
+    if len(changed) != dtype.itemsize or changed[-1] - changed[0] != dtype.itemsize - 1:
+        raise ValueError(f"{path} is not a {dtype} field of {type(message).__name__}")
+    return slice(int(changed[0]), int(changed[-1]) + 1)

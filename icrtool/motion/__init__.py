@@ -1,0 +1,1 @@
+"""Motion models and their robust fit to windows of driven distance."""

@@ -1,0 +1,1 @@
+"""Results to files: run directory, tables, figures, exports. No metric is computed here."""

@@ -1,0 +1,214 @@
+"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrtool import __version__
+from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES
+from icrtool.kernels.open_loop_fast import TOLERANCE_M
+from icrtool.output.atomic_directory import whole_directory
+from icrtool.output.dropout_content import DropoutContent
+from icrtool.output.run_directory import json_bytes
+from icrtool.output.tables.model_comparison import LADDER_COLUMNS, ladder_document, ladder_rows
+from icrtool.records.dropout import BlindDrive, DropoutReport, ModelResult
+
+REPORT_FILE = "report.json"
+DROPOUT_DIRECTORY = "dropout"
+DROPOUT_SCHEMA = "icrtool/dropout/1"
+SCHEMA_FAMILY = "icrtool/dropout/"
+
+KNOWS = {
+    "icr": "the way up to each start",
+    "no_slip": "the track width",
+    "icr_final": "all of the way (in sample)",
+}
+"""What the ICRs of a model were learned from."""
+
+ERROR_COLUMNS = ("icr", "no_slip")
+
+Cell = str | int | float | None
+
+
+def dropout_directory(run_directory: Path) -> AbstractContextManager[Path]:
+    """Give a hidden directory to write a report into; it becomes ``RUN/dropout`` when the block ends well.
+
+    Raises
+    ------
+    OutputError
+        Something that is not a dropout report stands in its place, or the disk does not take it.
+    """
+    place = run_directory / DROPOUT_DIRECTORY
+    return whole_directory(place, is_dropout_directory, kind="dropout report")
+
+
+def is_dropout_directory(directory: Path) -> bool:
+    """Say whether a directory is a dropout report of ours, of whatever version."""
+    try:
+        schema = json.loads((directory / REPORT_FILE).read_bytes())["schema"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+
+
+def write_content(content: DropoutContent, directory: Path) -> None:
+    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory, and ladder.csv where there is one.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
+    summary = content.report.summary_columns()
+    (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
+    (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(content.report)))
+    (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(content.worst)))
+    if content.ladder is not None:
+        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(content.ladder)))
+    (directory / REPORT_FILE).write_bytes(json_bytes(report_document(content)))
+
+
+def report_document(content: DropoutContent) -> dict[str, Any]:
+    """Return what report.json holds."""
+    report, run = content.report, content.run_summary
+    return {
+        "schema": DROPOUT_SCHEMA,
+        "tool_version": __version__,
+        "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
+        "reference": f"the {'smoother' if content.smoothed else 'filter'}'s estimate at the end of the blind way",
+        "starts": report.states,
+        "starts_standing": report.standing,
+        "tolerance_m": TOLERANCE_M,
+        "bootstrap": {
+            "method": "moving blocks of path",
+            "block": "the horizon",
+            "resamples": BOOTSTRAP_RESAMPLES,
+            "level": BOOTSTRAP_LEVEL,
+            "seed": report.seed,
+        },
+        "models": [_model_document(result, report) for result in report.results],
+        "trials": _count_documents(report),
+        "budgets": [one._asdict() for one in content.budgets],
+        "by_turning": [one._asdict() for one in content.by_turning],
+        "ladder": ladder_document(content.ladder) if content.ladder is not None else {"left_out": content.no_ladder},
+        "gates": [
+            {
+                **asdict(verdict.gate),
+                "value_m": verdict.value_m,
+                "margin_m": verdict.margin_m,
+                "passed": verdict.passed,
+                "verdict": verdict.line(),
+            }
+            for verdict in content.verdicts
+        ],
+        "passed": content.passed,
+        "outages": [
+            {
+                "kind": one.kind,
+                "begin_s": one.begin_s,
+                "end_s": one.end_s,
+                "distance_m": one.distance_m,
+                "end_error_m": one.end_error_m,
+                "max_error_m": one.max_error_m,
+            }
+            for one in content.outages
+        ],
+        "worst": [_drive_document(drive) for drive in content.worst],
+        "examples": [_drive_document(drive) for drive in content.examples],
+    }
+
+
+HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
+
+WORST_COLUMNS = (
+    "rank",
+    "stamp_ns",
+    "t_s",
+    "north_m",
+    "east_m",
+    "horizon_m",
+    "heading_change_deg",
+    "speed_mean_mps",
+    *(f"{model}_error_m" for model in ERROR_COLUMNS),
+)
+
+
+def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any]:
+    """Return one model's rows of summary.csv, under its name."""
+    columns = {name: _cells(column) for name, column in report.summary_columns().items()}
+    mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
+    shared = [name for name in columns if name != "model"]
+    rows = [{name: columns[name][row] for name in shared} for row in mine]
+    return {"name": result.name, "label": result.label, "knows": KNOWS.get(result.name), "by_horizon": rows}
+
+
+def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
+    """Return how many starts were a trial at each horizon, and why the others were none."""
+    counts = report.counts
+    return [
+        {
+            "horizon_m": float(horizon),
+            "trials": int(counts.trials[h]),
+            "no_trial": {
+                "too_little_way_left": int(counts.short[h]),
+                "across_wheel_gap": int(counts.gap[h]),
+                "ends_in_gnss_outage": int(counts.outage[h]),
+            },
+        }
+        for h, horizon in enumerate(report.horizons_m)
+    ]
+
+
+def _drive_document(drive: BlindDrive) -> dict[str, Any]:
+    return {
+        "stamp_ns": drive.stamp_ns,
+        "t_s": drive.t_s,
+        "north_m": drive.north_m,
+        "east_m": drive.east_m,
+        "horizon_m": drive.horizon_m,
+        "heading_change_deg": float(np.degrees(drive.heading_change_rad)),
+        "speed_mean_mps": drive.speed_mean_mps,
+        "errors_m": drive.errors_m,
+    }
+
+
+def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
+    for result in report.results:
+        for horizon, bins in zip(report.horizons_m, result.histograms, strict=True):
+            for left, right, percent in _rows(bins):
+                yield result.name, float(horizon), left, right, percent
+
+
+def _worst_rows(worst: Sequence[BlindDrive]) -> Iterator[Sequence[Cell]]:
+    for rank, drive in enumerate(worst, start=1):
+        document = {"rank": rank, **_drive_document(drive)}
+        errors = document.pop("errors_m")
+        yield *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)
+
+
+def _rows(columns: Iterable[Sequence[str] | np.ndarray[Any, Any]]) -> Iterator[Sequence[Any]]:
+    return zip(*(_cells(column) for column in columns), strict=True)
+
+
+def _cells(column: Sequence[str] | np.ndarray[Any, Any]) -> list[Any]:
+    """Return a column as plain values, None for what is not a number."""
+    values = column.tolist() if isinstance(column, np.ndarray) else list(column)
+    return [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]
+
+
+def _csv(columns: Iterable[str] | Mapping[str, object], rows: Iterable[Sequence[Cell]]) -> bytes:
+    """Return a table as CSV: numbers in their shortest exact form, empty where there is none."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue().encode()

@@ -1,0 +1,68 @@
+"""Fewer points for the same picture: long columns are thinned before they are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.records.tables import Floats, Ints
+
+LINE_POINTS = 2400
+"""Points of a drawn line: some three per pixel column of every figure."""
+
+SAMPLED_ROWS = 40_000
+"""Rows enough to tell the range of a column for drawing."""
+
+
+def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
+    """Choose rows such that a line through them shows every extreme of every column.
+
+    Parameters
+    ----------
+    columns : float64 (n,) each; NaN breaks the line
+    points : about how many rows to choose
+
+    Returns
+    -------
+    int64 (m,), increasing: first and last row, and in each of equally many rows those of the least and the greatest
+    value of each column; and the first row of every break. All rows where there are no more than `points`.
+    """
+    rows = len(columns[0])
+    if rows <= points:
+        return np.arange(rows)
+    bins = max(points // (2 * len(columns)), 1)
+    width = -(-rows // bins)
+    begin = np.arange(0, rows, width)
+    chosen = [np.array([0, rows - 1])]
+    for column in columns:
+        missing = np.isnan(column)
+        chosen.append(np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]])))
+        for sign in (1.0, -1.0):
+            padded = np.full(len(begin) * width, np.inf)
+            np.multiply(column, sign, out=padded[:rows])
+            padded[:rows][missing] = np.inf
+            chosen.append(begin + padded.reshape(-1, width).argmin(axis=1))
+    found = np.unique(np.concatenate(chosen))
+    return found[found < rows]
+
+
+def percentiles(column: Floats, shares: tuple[float, ...]) -> list[float]:
+    """Return about the percentiles of a column (n,), from every so many-th row where it is long."""
+    return [float(value) for value in np.percentile(column[:: 1 + len(column) // SAMPLED_ROWS], shares)]
+
+
+def places(north: Floats, east: Floats, cell_m: float) -> Ints:
+    """Choose the rows of a path at which it enters another cell of a square grid.
+
+    Parameters
+    ----------
+    north, east : float64 (n,) [m]
+    cell_m : side of a cell [m], about a pixel
+
+    Returns
+    -------
+    int64 (m,), increasing, with first and last row.
+    """
+    if len(north) == 0:
+        return np.empty(0, np.int64)
+    moved = (np.diff(np.floor(north / cell_m)) != 0) | (np.diff(np.floor(east / cell_m)) != 0)
+    return np.unique(np.concatenate([[0], np.flatnonzero(moved) + 1, [len(north) - 1]]))

@@ -1,0 +1,158 @@
+"""How far off after how much blind way: summary over the horizons, histograms (Pentzer 2014, Figs. 28-32, 37)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from icrtool.output.figures.style import ICR, MEAN, NO_SLIP, Pen, fill_bins, inches, new_figure
+from icrtool.output.text_format import length_text
+from icrtool.records.dropout import DropoutReport, ModelResult, Outage
+from icrtool.records.tables import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.6, 2.3
+
+PENS = {"icr": ICR, "no_slip": NO_SLIP}
+MARKERS = {"icr": "o", "no_slip": "s"}
+BANDS = {"icr": "#a6c4e0", "no_slip": "#f6d3a8"}
+FINAL = Pen("0.35", width=0.9)
+P95 = Pen("black", width=1.2)
+"""The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
+
+DASH = (0, (4.0, 2.0))
+FLATTENING = 2.5
+HISTOGRAM_IN_P95 = 2.0
+"""A histogram is shown up to this many times p95; what lies beyond is said in words."""
+
+
+def draw_summary(title: str, report: DropoutReport, outages: Sequence[Outage] = ()) -> Figure:
+    """Draw 95 % and expected error over the horizon, with their intervals, and real outages where there were some.
+
+    Where no slip is so far off that the ICR curves would lie on the axis, a second panel has them alone.
+    """
+    subtitle = f"Open-loop error after blind way, from each of {report.states:,} states"
+    apart = _flattened(report)
+    figure = new_figure(
+        title,
+        subtitle + ("; right: without no slip" if apart else ""),
+        width_in=WIDTH_IN,
+        height_in=SUMMARY_HEIGHT_IN,
+    )
+    panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
+    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.05), wspace=0.28)
+    for axes, shown in zip(panels, (("no_slip", "icr"), ("icr",)), strict=False):
+        if (final := report.result("icr_final")) is not None:
+            for values, dash in ((final.summary.p95, "-"), (final.summary.expected, DASH)):
+                axes.plot(report.horizons_m, values, color=FINAL.color, linewidth=FINAL.width, linestyle=dash)
+        for name in shown:
+            if (result := report.result(name)) is not None:
+                _draw_model(axes, result, report.horizons_m)
+        for one in _shown_outages(report, outages):
+            axes.plot([one.distance_m], [one.end_error_m], **_real_mark())
+        axes.set_xlim(0, report.horizons_m[-1] * 1.02)
+        axes.set_ylim(bottom=0)
+        axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
+        axes.set_xlabel("Way driven blind [m]")
+        axes.set_ylabel("Error [m]")
+    keys = _summary_keys(report, real=bool(_shown_outages(report, outages)))
+    figure.legend(handles=keys, loc="lower center", ncols=4, columnspacing=1.6, handlelength=2.4)
+    return figure
+
+
+def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figure:
+    """Draw the share of trials by error at one horizon, a panel a model, with the expected value and 95 % marked."""
+    h = int(np.flatnonzero(report.horizons_m == horizon_m)[0])
+    results = [result for name in PENS if (result := report.result(name)) is not None]
+    figure = new_figure(
+        title,
+        f"Open-loop error after {horizon_m:g} m, {int(report.counts.trials[h]):,} trials",
+        width_in=WIDTH_IN,
+        height_in=1.5 + PANEL_HEIGHT_IN * len(results),
+    )
+    panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
+    margins = inches(figure, left=0.7, right=0.2, top=0.85, bottom=0.9)
+    figure.subplots_adjust(**margins, hspace=0.6)
+    for axes, result in zip(panels, results, strict=True):
+        _draw_bins(axes, result, h)
+        axes.set_xlabel("Error [m]")
+    keys = [Line2D([], [], label="95 % of the trials", **P95.keywords())]
+    keys.append(Line2D([], [], label="expected value", **MEAN.keywords()))
+    figure.legend(handles=keys, loc="lower center", ncols=2, columnspacing=3.0)
+    return figure
+
+
+def _flattened(report: DropoutReport) -> bool:
+    """Say whether no slip is so much worse that the ICR curves need a panel of their own."""
+    icr, no_slip = report.result("icr"), report.result("no_slip")
+    if icr is None or no_slip is None or not np.isfinite(no_slip.summary.p95).any():
+        return False
+    return bool(np.nanmax(no_slip.summary.p95) > FLATTENING * np.nanmax(icr.summary.p95))
+
+
+def _shown_outages(report: DropoutReport, outages: Sequence[Outage]) -> list[Outage]:
+    return [one for one in outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
+
+
+def _draw_model(axes: Axes, result: ModelResult, horizons: Floats) -> None:
+    """Draw 95 % (filled marks, solid) and expected error (open marks, dashed) of a model with their intervals."""
+    summary, intervals = result.summary, result.intervals
+    color, marker = PENS[result.name].color, MARKERS[result.name]
+    look: dict[str, Any] = {"color": color, "marker": marker, "markersize": 4.5, "linewidth": 1.3, "markevery": 1}
+    for low, high in (
+        (intervals.p95_low, intervals.p95_high),
+        (intervals.expected_low, intervals.expected_high),
+    ):
+        axes.fill_between(horizons, low, high, color=BANDS[result.name], alpha=0.6, linewidth=0)
+    axes.plot(horizons, summary.p95, **look)
+    axes.plot(horizons, summary.expected, linestyle=DASH, markerfacecolor="white", **look)
+
+
+def _summary_keys(report: DropoutReport, *, real: bool) -> list[Line2D | Patch]:
+    keys: list[Line2D | Patch] = []
+    for name, label in (("icr", "ICR"), ("no_slip", "no slip")):
+        if report.result(name) is not None:
+            look: dict[str, Any] = {"color": PENS[name].color, "marker": MARKERS[name], "markersize": 4.5}
+            keys.append(Line2D([], [], label=f"{label}, 95 %", **look))
+            keys.append(Line2D([], [], label=f"{label}, expected", linestyle=DASH, markerfacecolor="white", **look))
+    if report.result("icr_final") is not None:
+        keys.append(Line2D([], [], label="final ICRs, 95 %", **FINAL.keywords()))
+        keys.append(Line2D([], [], label="final ICRs, expected", color=FINAL.color, linewidth=0.9, linestyle=DASH))
+    keys.append(Patch(color="0.8", linewidth=0, label="95 % interval"))
+    if real:
+        keys.append(Line2D([], [], label="real outage", **_real_mark()))
+    return keys
+
+
+def _real_mark() -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "X", "color": "black", "markersize": 7, "zorder": 5, "clip_on": False}
+
+
+def _draw_bins(axes: Axes, result: ModelResult, h: int) -> None:
+    """Draw the bins of one model at horizon number `h`, its expected value and 95 % with their numbers."""
+    summary, bins = result.summary, result.histograms[h]
+    p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
+    width = float(bins.right[0] - bins.left[0])
+    end = min(HISTOGRAM_IN_P95 * p95, float(bins.right[-1])) if p95 > 0 else width
+    edges = np.append(bins.left, bins.right[-1])
+    fill_bins(axes, edges, bins.percent, color=PENS[result.name].color, alpha=0.75)
+    axes.axvline(p95, **P95.keywords())
+    axes.axvline(expected, **MEAN.keywords())
+    label = {"icr": "ICR", "no_slip": "no slip"}[result.name]
+    axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
+    facts = f"expected {length_text(expected)},  95 % within {length_text(p95)},  max {length_text(largest)}"
+    axes.set_title(facts, loc="right", pad=4.0)
+    axes.set_xlim(0, end)
+    axes.set_ylabel(f"Trials [% per {_width_text(width)}]")
+    axes.grid(visible=False, axis="x")
+
+
+def _width_text(metres: float) -> str:
+    return f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"

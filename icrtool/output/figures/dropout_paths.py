@@ -1,0 +1,266 @@
+"""Blind drives on the ground: typical ones, the worst, and outages (Pentzer 2014, Figs. 27, 33, 34)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from icrtool.output.figures.decimate import places
+from icrtool.output.figures.style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
+from icrtool.output.text_format import duration_text, length_text
+from icrtool.records.dropout import BlindDrive, Outage
+from icrtool.records.tables import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 7.2
+EXAMPLES_HEIGHT_IN = 4.7
+WORST_COLUMNS = 5
+WORST_CELL_IN = 1.78
+OUTAGES_BOX_IN = (2.4, 5.4)
+
+PENS: dict[str, Pen] = {"icr": ICR, "no_slip": NO_SLIP}
+LABELS = {"icr": "ICR", "no_slip": "no slip"}
+FORCED = Pen(BAD_FIX_COLOR, width=1.8)
+REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
+WAY = Pen(FIX_COLOR, width=1.4)
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top [points]."""
+
+MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 4.9
+"""Half the size of a mark, height of a line of text, usual width of a character, in points."""
+LABEL_OFFSETS_PT = tuple(
+    (sign * dx, dy) for dx in (7.0, 16.0) for dy in (9.0, -9.0, 0.0, 18.0, -18.0) for sign in (1, -1)
+)
+SMALLEST_VIEW_M = 0.5
+CELLS = 1500.0
+
+
+def draw_examples(title: str, examples: Sequence[BlindDrive]) -> Figure:
+    """Draw a cornering and a straight blind drive side by side: reference, ICR, no slip."""
+    horizon = examples[0].horizon_m
+    figure = new_figure(
+        title,
+        f"Typical blind drives over {horizon:g} m: cornering (left), among the straightest (right)",
+        width_in=WIDTH_IN,
+        height_in=EXAMPLES_HEIGHT_IN,
+    )
+    panels = figure.subplots(1, len(examples), squeeze=False)[0]
+    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=1.0, bottom=0.9), wspace=0.34)
+    for axes, drive in zip(panels, examples, strict=True):
+        _draw_drive(axes, drive, box=(3.0, 2.75))
+        facts = f"from {drive.t_s:.1f} s, turned {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s"
+        errors = ",  ".join(f"{LABELS[name]} {length_text(error)}" for name, error in drive.errors_m.items())
+        axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
+        axes.set_xlabel("East of start [m]")
+        axes.set_ylabel("North of start [m]")
+    _add_keys(figure, examples)
+    return figure
+
+
+def draw_worst(title: str, worst: Sequence[BlindDrive]) -> Figure:
+    """Draw the worst blind drives, each in a cell of its own with its scale."""
+    rows = -(-len(worst) // WORST_COLUMNS)
+    figure = new_figure(
+        title,
+        f"The {len(worst)} worst blind drives over {worst[0].horizon_m:g} m with momentary ICRs, none overlapping",
+        width_in=9.6,
+        height_in=1.1 + rows * (WORST_CELL_IN + 0.62),
+    )
+    panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
+    figure.subplots_adjust(**inches(figure, left=0.65, right=0.15, top=0.92, bottom=0.9), wspace=0.3, hspace=0.38)
+    figure.supxlabel("East of start [m]", fontsize=9.0, y=0.42 / figure.get_figheight())
+    figure.supylabel("North of start [m]", fontsize=9.0, x=0.12 / figure.get_figwidth())
+    for rank, (axes, drive) in enumerate(zip(panels, worst, strict=False), start=1):
+        _draw_drive(axes, drive, box=(1.0, 1.0), ticks=4)
+        axes.set_title(
+            f"{rank}.  {length_text(drive.errors_m['icr'])}\n"
+            f"{drive.t_s:.1f} s, {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s",
+            loc="left",
+            pad=4.0,
+            fontsize=8.0,
+        )
+        axes.tick_params(labelsize=7.5)
+    for axes in panels[len(worst) :]:
+        axes.set_axis_off()
+    _add_keys(figure, worst)
+    return figure
+
+
+def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[Outage]) -> Figure:
+    """Draw the way with the blind paths of forced and real outages."""
+    paths = [(one.north_m, one.east_m) for one in outages]
+    norths = np.concatenate([north_m, *(north for north, _ in paths)])
+    easts = np.concatenate([east_m, *(east for _, east in paths)])
+    (south, north), (west, east), box_in = _fit_to_box(norths, easts)
+    figure = new_figure(title, _outages_text(outages), width_in=WIDTH_IN, height_in=box_in + 1.65)
+    axes = figure.subplots()
+    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
+    cell = (east - west) / CELLS
+    shown = places(north_m, east_m, cell)
+    axes.plot(east_m[shown], north_m[shown], zorder=2, **WAY.keywords())
+    for one in outages:
+        pen = FORCED if one.kind == "forced" else REAL
+        shown = places(one.north_m, one.east_m, cell)
+        axes.plot(one.east_m[shown], one.north_m[shown], zorder=3, **pen.keywords())
+        axes.plot(one.east_m[:1], one.north_m[:1], zorder=4, **_mark("white"))
+        axes.plot(one.east_m[-1:], one.north_m[-1:], zorder=4, **_mark("black"))
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    axes.set_aspect("equal")
+    _write_errors(axes, outages, (south, west), 72.0 * box_in / (north - south))
+    axes.set_xlabel("East [m]")
+    axes.set_ylabel("North [m]")
+    keys = [Line2D([], [], label="filter", **WAY.keywords())]
+    for kind, pen in (("forced", FORCED), ("real", REAL)):
+        if any(one.kind == kind for one in outages):
+            keys.append(Line2D([], [], label=f"blind, {kind} outage", **pen.keywords()))
+    keys += [Line2D([], [], label="its begin", **_mark("white")), Line2D([], [], label="its end", **_mark("black"))]
+    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.8)
+    return figure
+
+
+def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float], ticks: int = 5) -> None:
+    """Draw one blind drive about its start; the view has the shape of `box` (width, height), metres are square."""
+    north0, east0 = drive.north_m, drive.east_m
+    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, 2.0)]
+    lines += [(path.north, path.east, PENS[name], 3.0) for name, path in drive.paths.items()]
+    norths = np.concatenate([north - north0 for north, *_ in lines])
+    easts = np.concatenate([east - east0 for _, east, *_ in lines])
+    (south, north), (west, east) = _view(norths, easts, box[0] / box[1])
+    cell = (east - west) / CELLS
+    for line_north, line_east, pen, order in lines:
+        shown = places(line_north, line_east, cell)
+        axes.plot(line_east[shown] - east0, line_north[shown] - north0, zorder=order, **pen.keywords())
+        axes.plot(line_east[-1:] - east0, line_north[-1:] - north0, zorder=order + 2, **_end(pen))
+    axes.plot([0.0], [0.0], zorder=6, **_mark("white"))
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    axes.set_aspect("equal")
+    axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
+
+
+def _add_keys(figure: Figure, drives: Sequence[BlindDrive]) -> None:
+    keys = [Line2D([], [], label="start", **_mark("white")), Line2D([], [], label="filter", **FILTER.keywords())]
+    keys += [Line2D([], [], label=LABELS[name], **PENS[name].keywords()) for name in drives[0].paths]
+    keys.append(Line2D([], [], label="where each ends", **_end(Pen("0.45"))))
+    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=2.4)
+
+
+def _turn_text(drive: BlindDrive) -> str:
+    return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
+
+
+def _mark(face: str) -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": face, "markersize": 5.5}
+
+
+def _end(pen: Pen) -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "D", "color": pen.color, "markersize": 4.5}
+
+
+def _view(norths: Floats, easts: Floats, shape: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the range of north and of east [m] of a view `shape` times as wide as high, with a margin."""
+    middle = [(float(column.min()) + float(column.max())) / 2 for column in (norths, easts)]
+    spans = [float(np.ptp(column)) for column in (norths, easts)]
+    height = 1.16 * max(spans[0], spans[1] / shape, SMALLEST_VIEW_M)
+    half = (height / 2, height * shape / 2)
+    return (middle[0] - half[0], middle[0] + half[0]), (middle[1] - half[1], middle[1] + half[1])
+
+
+def _fit_to_box(norths: Floats, easts: Floats) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return the view of a whole way, and the height [in] its axes take."""
+    width_in = WIDTH_IN - 0.95
+    north, east = max(float(np.ptp(norths)), SMALLEST_VIEW_M), max(float(np.ptp(easts)), SMALLEST_VIEW_M)
+    box_in = float(np.clip(width_in * north / east, *OUTAGES_BOX_IN))
+    return *_view(norths, easts, width_in / box_in), box_in
+
+
+def _outages_text(outages: Sequence[Outage]) -> str:
+    """Return how many outages of each kind there are, and the largest end error of each."""
+    said = []
+    for kind in ("forced", "real"):
+        ours = [one for one in outages if one.kind == kind]
+        if ours:
+            worst = max(one.end_error_m for one in ours)
+            lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
+            span = duration_text(lengths[0])
+            span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
+            said.append(f"{len(ours)} {kind} of {span}, end error up to {length_text(worst)}")
+    return "Outages: " + "; ".join(said)
+
+
+def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, float], points_per_metre: float) -> None:
+    """Write each outage's number and end error beside its end where there is room; the tables have them all.
+
+    Parameters
+    ----------
+    axes : with its limits set
+    lowest : north and east [m] of the lower left corner
+    points_per_metre : scale of the picture
+    """
+
+    def point(one: Outage, row: int) -> tuple[float, float]:
+        east, north = float(one.east_m[row]), float(one.north_m[row])
+        return (east - lowest[1]) * points_per_metre, (north - lowest[0]) * points_per_metre
+
+    ends = [point(one, row) for one in outages for row in (0, -1)]
+    ways = [
+        point(one, int(row)) for one in outages for row in places(one.north_m, one.east_m, LINE_PT / points_per_metre)
+    ]
+    taken = [_box_about(place) for place in ends]
+    crossed = [_box_about(place) for place in ways]
+    upper = (axes.get_xlim()[1] - lowest[1]) * points_per_metre, (axes.get_ylim()[1] - lowest[0]) * points_per_metre
+    for number, one in enumerate(outages, start=1):
+        text = f"{number}: {length_text(one.end_error_m)}"
+        offset = _free_offset(point(one, -1), CHARACTER_PT * len(text), taken, crossed, upper)
+        if offset is not None:
+            taken.append(_label_box(point(one, -1), CHARACTER_PT * len(text), offset))
+            _write(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), offset)
+
+
+def _free_offset(
+    place: tuple[float, float], width: float, taken: list[Box], crossed: list[Box], upper: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Return where a label of this width can stand: off all that is taken, if it can off the lines it would cross."""
+    for obstacles in ([*taken, *crossed], taken):
+        for offset in LABEL_OFFSETS_PT:
+            box = _label_box(place, width, offset)
+            inside = box[0] > 0 and box[1] > 0 and box[2] < upper[0] and box[3] < upper[1]
+            if inside and not any(_overlap(box, other) for other in obstacles):
+                return offset
+    return None
+
+
+def _box_about(place: tuple[float, float]) -> Box:
+    return place[0] - MARK_PT, place[1] - MARK_PT, place[0] + MARK_PT, place[1] + MARK_PT
+
+
+def _label_box(place: tuple[float, float], width: float, offset: tuple[float, float]) -> Box:
+    left, bottom = place[0] + (offset[0] if offset[0] > 0 else offset[0] - width), place[1] + offset[1] - LINE_PT / 2
+    return left, bottom, left + width, bottom + LINE_PT
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _write(axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float]) -> None:
+    axes.annotate(
+        text,
+        place,
+        xytext=offset_pt,
+        textcoords="offset points",
+        ha="left" if offset_pt[0] > 0 else "right",
+        va="center",
+        fontsize=8.0,
+        zorder=6,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+    )

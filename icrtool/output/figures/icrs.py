@@ -1,0 +1,219 @@
+"""The ICR estimates: over time (Pentzer 2014, Fig. 15) and how they cluster (Fig. 24)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from icrtool.estimation.summary import ICR_COLUMNS
+from icrtool.output.figures.decimate import extremes, percentiles
+from icrtool.output.figures.style import (
+    BAND_COLOR,
+    BAR_COLOR,
+    CHANGE,
+    HALF_WIDTH,
+    MEAN,
+    OUTAGE_COLOR,
+    TimeAxis,
+    fill_bins,
+    inches,
+    new_figure,
+    shade_spans,
+)
+from icrtool.output.text_format import run_title, signed
+from icrtool.records.tables import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from icrtool.estimation.fit import FilterRun
+
+WIDTH_IN = 7.2
+
+LINE_COLOR = "black"
+# Plain text: mathtext costs more than the rest of a figure.
+NAMES = {
+    "y_icr_right_m": "ICR y right [m]",
+    "y_icr_left_m": "ICR y left [m]",
+    "x_icr_m": "ICR x [m]",
+}
+SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
+"""Where no slip puts an ICR, in half track widths."""
+
+RANGE_PERCENT = (0.2, 99.8)
+BAND_RANGE_PERCENT = (2.0, 98.0)
+CLUSTER_RANGE_PERCENT = (0.5, 99.5)
+"""A range passes over the extremes of so little of the time: one spike does not flatten the rest."""
+LEAST_HALF_RANGE_M = 0.02
+
+LONG_RUN = 2.5
+"""A run this many times longer than its learning gets a panel of its own for the learning."""
+LEARNING_MARGIN = 0.6
+LEAST_MARGIN_S = 10.0
+
+BINS = 30
+
+
+def draw_icr_estimates(run: FilterRun) -> Figure:
+    """Draw the three ICR estimates over time with ±2σ, their 10-90 % rise, b/2 where known, and GNSS outages.
+
+    A long run has two columns, each with its own scale: the learning, and what follows.
+    """
+    spans = _spans_s(run)
+    subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
+    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=5.8)
+    panels = figure.subplots(
+        3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
+    )
+    margins = inches(figure, left=0.75, right=0.2, top=0.8, bottom=0.9)
+    figure.subplots_adjust(**margins, wspace=0.22, hspace=0.3)
+    for row, column in zip(panels, ICR_COLUMNS, strict=True):
+        for axes, span in zip(row, spans, strict=True):
+            _draw_estimate(axes, run, column, span, first=axes is row[0])
+        row[0].set_ylabel(NAMES[column])
+        row[0].set_title(_rise_text(run, column), loc="left", pad=4.0)
+        row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
+    for axes, (begin, end) in zip(panels[-1], spans, strict=True):
+        axes.set_xlabel(f"Time [{TimeAxis.for_span(end - begin).unit}]")
+    keys = _estimate_keys(run)
+    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.4, handlelength=2.0)
+    return figure
+
+
+def draw_icr_clusters(run: FilterRun) -> Figure:
+    """Draw how much of the time each ICR estimate had which value, after convergence."""
+    settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
+    after = run.table.t_s >= settled
+    subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
+    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=3.9)
+    panels = figure.subplots(1, 3, sharey=True)
+    figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
+    weight = np.append(np.diff(run.table.t_s), 0.0)[after]
+    columns = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
+    values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
+    spans = [float(np.ptp(percentiles(value, CLUSTER_RANGE_PERCENT))) for value in values]
+    span = max(*spans, 2 * LEAST_HALF_RANGE_M)
+    for axes, column, value in zip(panels, columns, values, strict=True):
+        _draw_histogram(axes, run, column, value, weight, span)
+    panels[0].set_ylabel("Time [%]")
+    keys = [
+        Patch(color=BAR_COLOR, linewidth=0, label=f"estimates, bins of {_bin_width(span):g} m"),
+        Line2D([], [], label="mean", **MEAN.keywords()),
+    ]
+    if run.config.robot.track_width_m is not None:
+        keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
+    figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
+    return figure
+
+
+def _spans_s(run: FilterRun) -> list[tuple[float, float]]:
+    """Return begin and end [s] of the panels: the rise of all three estimates and what follows, or all in one."""
+    duration = float(run.table.t_s[-1])
+    rises = [rise for rise in run.convergence.values() if rise is not None]
+    first, last = min((rise[0] for rise in rises), default=0.0), max((rise[1] for rise in rises), default=0.0)
+    margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
+    begin, end = max(first - margin, 0.0), last + margin
+    return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
+
+
+def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float, float], *, first: bool) -> None:
+    """Draw one estimate over a span; the `first` panel also has b/2 and the rise."""
+    table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
+    rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
+    t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
+    band = 2 * getattr(table, f"std_{column}")[rows]
+    low, high = value - band, value + band
+    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit)
+    for change in run.changes_s:
+        axes.axvline(change / unit, zorder=2.6, **CHANGE.keywords())
+    shown = extremes(low, high)
+    axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
+    shown = extremes(value)
+    axes.plot(t[shown], value[shown], color=LINE_COLOR, linewidth=1.0)
+    spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
+    if first:
+        # Here the band is as wide as the prior: it is shown as far as the estimates go.
+        spread += _draw_rise(axes, run, column, unit)
+    else:
+        spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
+    middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
+    axes.set_xlim(span_s[0] / unit, span_s[1] / unit)
+    axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+    axes.locator_params(axis="y", nbins=5)
+
+
+def _draw_rise(axes: Axes, run: FilterRun, column: str, unit_s: float) -> list[float]:
+    """Draw b/2 and the begin and end of the rise; return where they are [m]."""
+    heights: list[float] = []
+    if (width := run.config.robot.track_width_m) is not None:
+        heights.append(SIDES[column] * width / 2)
+        axes.axhline(heights[0], **HALF_WIDTH.keywords())
+    if (rise := run.convergence[column]) is not None:
+        for second, face in zip(rise, ("white", "black"), strict=True):
+            height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
+            axes.plot([second / unit_s], [height], markerfacecolor=face, **_mark())
+            heights.append(height)
+    return heights
+
+
+def _mark() -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
+
+
+def _rise_text(run: FilterRun, column: str) -> str:
+    rise = run.convergence[column]
+    return f"10–90 % in {rise[1] - rise[0]:.1f} s" if rise is not None else "hardly moved from its start"
+
+
+def _final_text(run: FilterRun, column: str) -> str:
+    icr = run.summary["icr"]
+    return f"final {signed(icr['final'][column])} ± {icr['final_std'][column]:.3f} m"
+
+
+def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
+    keys: list[Line2D | Patch] = [
+        Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
+        Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
+    ]
+    if any(rise is not None for rise in run.convergence.values()):
+        keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
+        keys.append(Line2D([], [], label="90 % of the way", **_mark()))
+    if run.config.robot.track_width_m is not None:
+        keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
+    if run.changes_s:
+        keys.append(Line2D([], [], label="terrain change", **CHANGE.keywords()))
+    if len(run.outages_ns):
+        keys.append(Patch(color=OUTAGE_COLOR, linewidth=0, label="no usable GNSS"))
+    return keys
+
+
+def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weight: Floats, span_m: float) -> None:
+    """Draw percent of time over value, and show `span_m` of it."""
+    middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
+    low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
+    width = _bin_width(span_m)
+    first, last = int(np.floor(low / width)), int(np.ceil(high / width))
+    share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
+    fill_bins(axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR)
+    axes.set_xlim(low, high)
+    mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
+    axes.axvline(mean, **MEAN.keywords())
+    title = f"{signed(mean)} ± {std:.3f} m"
+    if (track := run.config.robot.track_width_m) is not None:
+        axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
+        title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"
+    axes.set_title(title, pad=4.0)
+    axes.set_xlabel(NAMES[column])
+    axes.locator_params(axis="x", nbins=3, min_n_ticks=2)
+    axes.grid(visible=False, axis="x")
+
+
+def _bin_width(span_m: float) -> float:
+    """Return the round width of about `BINS` bins over a span [m]."""
+    target = span_m / BINS
+    decade = 10.0 ** np.floor(np.log10(target))
+    return float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))

@@ -1,0 +1,175 @@
+"""The picture of a study: dispatch, and the one most studies share (an ICR quantity over what was varied)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change
+from icrtool.output.figures.study_special import draw_consistency, draw_initial
+from icrtool.output.figures.style import Pen, inches, new_figure, save, style
+from icrtool.output.tables.study import capital, study_title
+from icrtool.records.tables import Floats
+from icrtool.simulation.studies import KINDS, StudyName, StudyResult
+from icrtool.simulation.study_measures import ICR_NAMES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ICR_PENS = {
+    "y_icr_right": Pen("#2166ac", "-", 1.5),
+    "y_icr_left": Pen("#b2182b", (0, (6, 2)), 1.5),
+    "x_icr": Pen("0.25", (0, (1.5, 1.5)), 1.5),
+}
+ICR_MARKS = {"y_icr_right": "o", "y_icr_left": "s", "x_icr": "^"}
+ICR_WORDS = {"y_icr_right": "y right", "y_icr_left": "y left", "x_icr": "x"}
+
+Rows = tuple[tuple[str, str, bool], ...]
+"""Metric pattern, axis label, whether there is one for every ICR."""
+
+ROWS: dict[StudyName, Rows] = {
+    "turn-radius": (("settle_{icr}_s", "Within 10 % after [s]", True), ("inverted", "Ends inverted [%]", False)),
+    "input-noise": (("error_{icr}_m", "ICR error [m]", True),),
+    "input-bias": (("error_{icr}_m", "ICR error [m]", True),),
+    "gnss": (("rms_{icr}_m", "ICR error, rms [m]", True), ("blind", "Blind 10 m, p95 [m]", False)),
+    "rate": (("error_{icr}_m", "ICR error [m]", True),),
+}
+LOGARITHMIC = frozenset({"gnss", "rate"})
+PANEL_IN = 2.3
+LEAST_RANGE_M = 0.02
+
+
+def draw_study(result: StudyResult, stem: Path, formats: tuple[str, ...]) -> None:
+    """Write the picture of a study as ``stem.format`` in each of `formats`."""
+    special: dict[StudyName, Callable[[StudyResult], Figure]] = {
+        "convergence": draw_convergence,
+        "icr-change": draw_icr_change,
+        "initial": draw_initial,
+        "consistency": draw_consistency,
+        "input-source": draw_input_source,
+    }
+    with style():
+        save(special.get(result.request.name, draw_sweep)(result), stem, formats)
+
+
+def subtitle(result: StudyResult) -> str:
+    """Return what was studied, on which path, and how often."""
+    request = result.request
+    path = request.plan.path
+    what = f"{getattr(path, 'speed_mps', 0):g} m/s, {request.runs} runs of {request.plan.duration_s:g} s"
+    if request.name != "turn-radius":
+        what = f"{getattr(path, 'kind', '')} path, {what}"
+    return f"{capital(KINDS[request.name].about)}; {what}"
+
+
+def draw_sweep(result: StudyResult) -> Figure:
+    """Draw metrics over what was varied: medians, bars from the 5th to the 95th percentile; one column a preset."""
+    rows, presets = ROWS[result.request.name], result.request.presets
+    height = 1.5 + PANEL_IN * len(rows)
+    figure = new_figure(study_title(result), subtitle(result), width_in=7.2, height_in=height)
+    panels = figure.subplots(len(rows), len(presets), squeeze=False, sharex=True, sharey="row")
+    figure.subplots_adjust(**inches(figure, left=0.85, right=0.2, top=0.8, bottom=0.95), wspace=0.12, hspace=0.18)
+    for column, preset in enumerate(presets):
+        levels = [level for level in result.levels if level["series"] == preset]
+        for row, (metric, label, by_icr) in enumerate(rows):
+            axes = panels[row][column]
+            _draw_metric(axes, levels, metric, by_icr=by_icr)
+            if column == 0:
+                axes.set_ylabel(label)
+            if metric.startswith("error"):
+                axes.set_ylim(*_error_range(result))
+        panels[0][column].set_title(f"preset {preset}", loc="left")
+        axes = panels[-1][column]
+        axes.set_xlabel(capital(KINDS[result.request.name].varies))
+        if result.request.name in LOGARITHMIC:
+            values = [level["value"] for level in levels]
+            axes.set_xscale("log")
+            axes.set_xticks(values, [f"{value:g}" for value in values], fontsize=7.5)
+            axes.minorticks_off()
+    if result.request.name == "gnss":
+        for axes in panels.ravel():
+            # On a drive without a turn nothing is missed, and zero has no logarithm.
+            if all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
+                axes.set_yscale("log")
+    figure.legend(handles=_keys(result), loc="lower center", ncols=5, columnspacing=1.6, handlelength=2.4)
+    return figure
+
+
+def _error_range(result: StudyResult) -> tuple[float, float]:
+    """Return a range [m] that shows all medians; bars of settings where a run went astray are cut at the frame."""
+    told = [level["metrics"][f"error_{icr}_m"]["p50"] for level in result.levels for icr in ICR_NAMES]
+    finite = [value for value in told if np.isfinite(value)]
+    reach = max(LEAST_RANGE_M, float(np.ptp([*finite, 0.0])))
+    return min([*finite, 0.0]) - 0.3 * reach, max([*finite, 0.0]) + 0.3 * reach
+
+
+def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_icr: bool) -> None:
+    x = np.array([level["value"] for level in levels])
+    if by_icr:
+        if metric.startswith("error"):
+            axes.axhline(0.0, color="0.6", linewidth=0.8)
+        for icr, pen in ICR_PENS.items():
+            _bars(axes, x, [level["metrics"][metric.format(icr=icr)] for level in levels], pen, ICR_MARKS[icr])
+    elif metric == "blind":
+        _bars(axes, x, [level["metrics"]["blind_icr_10m_p95_m"] for level in levels], Pen("#1b7837"), "D")
+        no_slip = [level["metrics"]["blind_no_slip_10m_p95_m"]["p50"] for level in levels]
+        axes.plot(x, no_slip, color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), linewidth=1.5)
+    else:
+        axes.plot(
+            x, [100 * level["metrics"][metric]["mean"] for level in levels], color="black", marker="o", markersize=3.5
+        )
+        axes.set_ylim(-4, 104)
+
+
+def _bars(axes: Axes, x: Floats, told: list[dict[str, Any]], pen: Pen, mark: str) -> None:
+    middle, low, high = (np.array([one[name] for one in told]) for name in ("p50", "p5", "p95"))
+    span = np.array([middle - low, high - middle])
+    axes.errorbar(
+        x, middle, span, color=pen.color, linestyle=pen.dash, linewidth=pen.width, marker=mark, markersize=3.5,
+        elinewidth=0.8, capsize=2.0,
+    )  # fmt: skip
+
+
+def _keys(result: StudyResult) -> list[Line2D]:
+    keys = [
+        Line2D([], [], marker=ICR_MARKS[icr], markersize=3.5, label=ICR_WORDS[icr], **pen.keywords())
+        for icr, pen in ICR_PENS.items()
+    ]
+    if result.request.name == "gnss":
+        keys.append(Line2D([], [], color="#1b7837", marker="D", markersize=3.5, label="blind, final ICRs"))
+        keys.append(Line2D([], [], color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), label="blind, no slip"))
+    return keys
+
+
+def draw_input_source(result: StudyResult) -> Figure:
+    """Draw the two inputs over time (Fig. 11), and the ICR errors with either."""
+    figure = new_figure(study_title(result), subtitle(result), width_in=7.2, height_in=5.6)
+    top, bottom = figure.subplots(2, 1)
+    figure.subplots_adjust(**inches(figure, left=0.85, right=0.2, top=0.85, bottom=0.8), hspace=0.42)
+    curves = result.curves
+    until = min(100.0, result.request.plan.duration_s)
+    for name, color, width, order in (("encoder", "0.65", 0.6, 2), ("commanded", "#b2182b", 1.2, 3)):
+        seen = curves[f"{name}_t"] <= until
+        top.step(
+            curves[f"{name}_t"][seen], curves[f"{name}_v"][seen], where="post", color=color, linewidth=width,
+            label=name, zorder=order,
+        )  # fmt: skip
+    top.set_xlabel("Time [s]")
+    top.set_ylabel("Left track speed [m/s]")
+    top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
+    names = [f"{level['value']}\n{level['series']}" for level in result.levels]
+    for shift, icr in zip((-0.15, 0.0, 0.15), ICR_NAMES, strict=True):
+        x = np.arange(len(names), dtype=np.float64) + shift
+        told = [level["metrics"][f"error_{icr}_m"] for level in result.levels]
+        pen = ICR_PENS[icr]
+        _bars(bottom, x, told, Pen(pen.color, "none", pen.width), ICR_MARKS[icr])
+    bottom.axhline(0.0, color="0.6", linewidth=0.8)
+    bottom.set_xticks(np.arange(len(names)), names)
+    bottom.set_ylabel("ICR error [m]")
+    figure.legend(handles=_keys(result), loc="lower center", ncols=3)
+    return figure

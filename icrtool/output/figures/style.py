@@ -1,0 +1,152 @@
+"""How our figures look, and how they become files: no display, no user settings, the same bytes every time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from icrtool.records.tables import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PNG_DPI = 130
+
+TITLE_CHARACTERS_PER_INCH = 9.5
+
+RC: dict[str, Any] = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titley": 1.0,
+    "axes.labelsize": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.3,
+    "lines.solid_joinstyle": "round",
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "legend.handlelength": 2.8,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "path.simplify": True,
+    "agg.path.chunksize": 20000,
+    "svg.hashsalt": "icrtool",
+    "pdf.fonttype": 42,
+}
+
+SAVE: dict[str, dict[str, Any]] = {
+    "png": {"metadata": {"Software": "icrtool"}, "pil_kwargs": {"compress_level": 1}},
+    "svg": {"metadata": {"Date": None, "Creator": "icrtool"}},
+    "pdf": {"metadata": {"CreationDate": None, "Creator": "icrtool", "Producer": "icrtool"}},
+}
+"""Keywords by format: nothing that changes from run to run; PNG packed in haste, it is about a tenth larger."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pen:
+    """How a line is told apart: by dash and by luminance, so that a grey print still reads."""
+
+    color: str
+    dash: str | tuple[float, tuple[float, ...]] = "-"
+    width: float = 1.3
+
+    def keywords(self) -> dict[str, Any]:
+        """Return the keywords `Axes.plot` takes."""
+        return {"color": self.color, "linestyle": self.dash, "linewidth": self.width}
+
+
+FIX_COLOR = "0.70"
+FLOAT_COLOR = "#762a83"
+BAD_FIX_COLOR = "#b2182b"
+OUTAGE_COLOR = "0.90"
+BAR_COLOR = "#5b8db8"
+BAND_COLOR = "#a6c4e0"
+FILTER = Pen("black", width=1.1)
+ICR = Pen("#2166ac", (0, (6, 2)), 1.5)
+NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
+HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
+CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)
+MEAN = Pen("black", (0, (5, 2)), 1.1)
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc says."""
+    settings = cast(dict[str, Any], mpl.rcParams)
+    defaults = cast(dict[str, Any], mpl.rcParamsDefault)
+    with mpl.rc_context():
+        settings.update({key: value for key, value in defaults.items() if key != "backend"})
+        settings.update(RC)
+        yield
+
+
+def new_figure(title: str, subtitle: str, *, width_in: float, height_in: float) -> Figure:
+    """Return an empty figure with two lines of title at its upper left."""
+    figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI)
+    FigureCanvasAgg(figure)
+    left = 0.09 / width_in
+    if len(title) > (most := int(TITLE_CHARACTERS_PER_INCH * width_in)):
+        title = f"{title[: most // 2]}…{title[-most // 2 :]}"
+    figure.text(left, 1 - 0.09 / height_in, title, fontsize=10.5, fontweight="bold", va="top", ha="left")
+    figure.text(left, 1 - 0.30 / height_in, subtitle, fontsize=8.5, color="0.3", va="top", ha="left")
+    return figure
+
+
+def inches(figure: Figure, *, left: float, right: float, top: float, bottom: float) -> dict[str, float]:
+    """Return margins [in] as the fractions that `Figure.subplots_adjust` takes."""
+    width, height = figure.get_size_inches()
+    return {"left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height}
+
+
+def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
+    """Write a figure as ``stem.format`` in each of `formats`; the bytes depend on the figure alone."""
+    for form in formats:
+        memory = BytesIO()
+        figure.savefig(memory, format=form, **SAVE[form])
+        stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
+
+
+@dataclass(frozen=True, slots=True)
+class TimeAxis:
+    """A unit of time that suits a span: seconds, minutes or hours."""
+
+    unit: str
+    seconds: float
+
+    @classmethod
+    def for_span(cls, span_s: float) -> TimeAxis:
+        """Choose the unit for a span [s]."""
+        if span_s <= 600:
+            return cls("s", 1.0)
+        return cls("min", 60.0) if span_s <= 4 * 3600 else cls("h", 3600.0)
+
+
+def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
+    """Fill the bins of a histogram from zero up; `Axes.stairs` measures every step of its outline and takes longer."""
+    filled = axes.fill_between(edges, np.append(heights, heights[-1:]), step="post", linewidth=0, **look)
+    filled.sticky_edges.y.append(0.0)
+
+
+def shade_spans(axes: Axes, spans: Floats, label: str = "") -> None:
+    """Shade spans (k, 2) of the x axis over the whole height; one artist however many there are."""
+    if len(spans):
+        bars = [(float(begin), float(end - begin)) for begin, end in spans]
+        axes.broken_barh(
+            bars, (0, 1), transform=axes.get_xaxis_transform(), facecolor=OUTAGE_COLOR, zorder=0.5, label=label
+        )  # fmt: skip

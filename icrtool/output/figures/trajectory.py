@@ -1,0 +1,164 @@
+"""The way: fixes, filter, and where the wheels alone would have led (Pentzer 2014, Fig. 14)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.ticker import ScalarFormatter
+
+from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
+from icrtool.estimation.odometry import OdometryPath, icr_odometry, no_slip_odometry
+from icrtool.kernels.ekf import GATED, UNSEEN
+from icrtool.output.figures.decimate import places
+from icrtool.output.figures.style import (
+    BAD_FIX_COLOR,
+    FILTER,
+    FIX_COLOR,
+    FLOAT_COLOR,
+    ICR,
+    NO_SLIP,
+    Pen,
+    inches,
+    new_figure,
+)
+from icrtool.output.text_format import duration_text, position_word, run_title, way_text
+from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats, PositionFixes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+    from icrtool.estimation.fit import FilterRun
+
+WIDTH_IN = 7.2
+MARGINS_IN = {"left": 0.75, "right": 0.2, "top": 0.6, "bottom": 1.3}
+LOWEST_BOX_IN, HIGHEST_BOX_IN = 2.4, 5.4
+
+LARGEST_DETOUR = 0.75
+"""Odometry is shown this far outside the filter's path, in sizes of that path; what leads further is cut off."""
+
+SMALLEST_VIEW_M = 2.0
+FAR_M = 20_000.0
+CELLS = 1500.0
+"""Points closer than this fraction of the view are one point: about a pixel."""
+
+
+_DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
+FIX_LOOKS: dict[int, dict[str, Any]] = {
+    REFERENCE: _DOT,
+    FIXED_FIX: _DOT,
+    FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": FLOAT_COLOR},
+    OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
+}
+REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
+"""Markers by class: shape and luminance tell them apart."""
+
+
+def draw_trajectory(run: FilterRun) -> Figure:
+    """Draw fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north."""
+    table, drive = run.table, run.summary["drive"]
+    icr, no_slip = icr_odometry(run), no_slip_odometry(run)
+    lowest, highest = _view(run, icr, no_slip)
+    lowest, highest, box_in = _fit_to_box(lowest, highest)
+    facts = (
+        f"Trajectory, {way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}; ICR odometry: final ICRs"
+    )
+    height_in = box_in + MARGINS_IN["top"] + MARGINS_IN["bottom"]
+    figure = new_figure(run_title(run), facts, width_in=WIDTH_IN, height_in=height_in)
+    axes = figure.subplots()
+    figure.subplots_adjust(**inches(figure, **MARGINS_IN))
+
+    cell = float((highest - lowest).max()) / CELLS
+    _draw_fixes(axes, run, cell, lowest, highest)
+    _draw_path(axes, table.north_m, table.east_m, cell, FILTER, "filter", 4)
+    for path, pen, name, order in (
+        (icr, ICR, "ICR odometry", 3),
+        (no_slip, NO_SLIP, "no-slip odometry", 2),
+    ):
+        if path is not None:
+            label = f"{name}, ends {way_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
+            _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
+    ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
+    axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
+    axes.plot(table.east_m[-1:], table.north_m[-1:], markerfacecolor="black", markersize=6, label="end", **ends)
+
+    axes.set_xlim(lowest[1], highest[1])
+    axes.set_ylim(lowest[0], highest[0])
+    axes.set_aspect("equal")
+    axes.set_xlabel("East [m]" + _short_ticks(axes.xaxis, lowest[1]))
+    axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, lowest[0]))
+    figure.legend(loc="lower center", ncols=2, columnspacing=3.0)
+    return figure
+
+
+def _view(run: FilterRun, *odometry: OdometryPath | None) -> tuple[Floats, Floats]:
+    """Return the least and the greatest (north, east) to show [m], margin included."""
+    table = run.table
+    lowest = np.array([table.north_m.min(), table.east_m.min()])
+    highest = np.array([table.north_m.max(), table.east_m.max()])
+    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_VIEW_M)
+    low, high = lowest.copy(), highest.copy()
+    for path in odometry:
+        if path is not None:
+            low = np.minimum(low, [path.north_m.min(), path.east_m.min()])
+            high = np.maximum(high, [path.north_m.max(), path.east_m.max()])
+    low, high = np.maximum(low, lowest - detour), np.minimum(high, highest + detour)
+    margin = 0.04 * max(float((high - low).max()), SMALLEST_VIEW_M)
+    return low - margin, high + margin
+
+
+def _fit_to_box(lowest: Floats, highest: Floats) -> tuple[Floats, Floats, float]:
+    """Widen a view [m] to the shape of the axes, and return it with the height of the axes [in]: metres stay square."""
+    width_in = WIDTH_IN - MARGINS_IN["left"] - MARGINS_IN["right"]
+    north, east = highest - lowest
+    box_in = float(np.clip(width_in * north / east, LOWEST_BOX_IN, HIGHEST_BOX_IN))
+    metres_per_inch = max(north / box_in, east / width_in)
+    middle, half = (lowest + highest) / 2, metres_per_inch * np.array([box_in, width_in]) / 2
+    return middle - half, middle + half, box_in
+
+
+def _short_ticks(axis: Axis, lowest_m: float) -> str:
+    """Take whole kilometres off the ticks where coordinates are far from zero (UTM); return what the label adds."""
+    if abs(lowest_m) < FAR_M:
+        return ""
+    formatter = ScalarFormatter()
+    offset = float(np.floor(lowest_m / 1000) * 1000)
+    formatter.set_useOffset(offset)
+    axis.set_major_formatter(formatter)
+    axis.get_offset_text().set_visible(False)
+    return f"  {'+' if offset > 0 else '−'} {abs(offset):,.0f} m"
+
+
+def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
+    low = path.north_m.min() < lowest[0] or path.east_m.min() < lowest[1]
+    high = path.north_m.max() > highest[0] or path.east_m.max() > highest[1]
+    return " (out of view)" if low or high else ""
+
+
+def _draw_fixes(axes: Axes, run: FilterRun, cell_m: float, lowest: Floats, highest: Floats) -> None:
+    fixes, code, kind = run.log.gnss, run.gnss.code, run.fix_quality.fix_class
+    word, used = position_word(run), (code > UNSEEN) & (code != GATED)
+    several = len(np.unique(kind)) > 1
+    for value, look in FIX_LOOKS.items():
+        label = f"{word}, {CLASSES[value]}" if several else word
+        _draw_places(axes, fixes, used & (kind == value), (lowest, highest, cell_m), {**look, "label": label})
+    _draw_places(axes, fixes, code == GATED, (lowest, highest, cell_m), {**REJECTED_LOOK, "label": f"{word}, rejected"})
+
+
+def _draw_places(
+    axes: Axes, fixes: PositionFixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
+) -> None:
+    if not chosen.any():
+        return
+    lowest, highest, cell_m = view
+    north, east = fixes.north_m[chosen], fixes.east_m[chosen]
+    seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
+    shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
+    axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
+
+
+def _draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, label: str, order: float) -> None:
+    shown = places(north_m, east_m, cell_m)
+    axes.plot(east_m[shown], north_m[shown], label=label, zorder=order, **pen.keywords())

@@ -1,0 +1,97 @@
+"""The directory of a study, whole or not at all: every run as CSV, parameters and statistics as JSON, the picture."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrtool import __version__
+from icrtool.output.atomic_directory import check_place, whole_directory
+from icrtool.output.run_directory import json_bytes
+from icrtool.simulation.studies import KINDS, Column, StudyResult
+
+STUDY_SCHEMA = "icrtool/study/1"
+STUDY_FILE = "study.json"
+SCHEMA_FAMILY = "icrtool/study/"
+KIND = "study directory"
+
+
+def check_study_target(directory: Path) -> None:
+    """Refuse a place where a study cannot be put, before any work is done for it.
+
+    Raises
+    ------
+    OutputError
+        A file or a directory that is not a study of ours is there.
+    """
+    check_place(directory, is_study_directory, kind=KIND)
+
+
+def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
+    """Write ``study.json``, ``NAME.csv`` and ``NAME.png``.
+
+    Parameters
+    ----------
+    directory : where they shall appear; an old study there is replaced
+    plots : formats of the picture, of ``png``, ``svg`` and ``pdf``
+
+    Raises
+    ------
+    OutputError
+        A file or a foreign directory is in the way, or the disk does not take it.
+    """
+    name = result.request.name
+    with whole_directory(directory, is_study_directory, kind=KIND) as partial:
+        (partial / STUDY_FILE).write_bytes(json_bytes(study_document(result)))
+        _write_csv(result.columns, partial / f"{name}.csv")
+        if plots:
+            from icrtool.output.figures.study import draw_study
+
+            draw_study(result, partial / name, plots)
+
+
+def is_study_directory(directory: Path) -> bool:
+    """Say whether a directory is a study of ours, of whatever version."""
+    try:
+        schema = json.loads((directory / STUDY_FILE).read_bytes())["schema"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+
+
+def study_document(result: StudyResult) -> dict[str, Any]:
+    """Return what study.json holds."""
+    kind = KINDS[result.request.name]
+    return {
+        "schema": STUDY_SCHEMA,
+        "tool_version": __version__,
+        "study": result.request.name,
+        "about": kind.about,
+        "paper_figures": kind.figures,
+        "settings": result.request.settings(),
+        "findings": [
+            {"what": one.what, "ours": list(one.ours), "unit": one.unit, "paper": one.paper} for one in result.findings
+        ],
+        "levels": list(result.levels),
+    }
+
+
+def _write_csv(columns: dict[str, Column], path: Path) -> None:
+    """Write one row a run; numbers in the shortest form that reads back the same, nothing where there is none."""
+    texts = [_texts(values) for values in columns.values()]
+    with path.open("x", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*texts, strict=True))
+
+
+def _texts(values: Column) -> list[str]:
+    if isinstance(values, list):
+        return values
+    if values.dtype == np.bool_:
+        return [str(int(value)) for value in values]
+    return ["" if value != value else repr(value) for value in values.tolist()]  # noqa: PLR0124 - NaN

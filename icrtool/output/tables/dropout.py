@@ -1,0 +1,176 @@
+"""A dropout report as text: the few lines a field engineer reads first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from textwrap import wrap
+
+from icrtool.dropout_analysis.acceptance_limits import BudgetDistance
+from icrtool.dropout_analysis.straight_and_turning import TurningSplit
+from icrtool.output.dropout_content import DropoutContent, p95_at, shown_horizons
+from icrtool.output.tables.model_comparison import format_ladder
+from icrtool.output.text_format import TABLE_WIDTH, duration_text, way_text
+from icrtool.records.dropout import DropoutReport, ModelResult, Outage
+
+LABEL = 26
+MODEL = 15
+"""Columns of the left margin; of them, for a model's name."""
+CELL = 18
+
+
+NOTED_STANDING = 0.05
+"""From this share of standing states on, they are mentioned."""
+
+NEAR_HORIZONS_M = 1.5
+"""Between horizons that are further apart an interpolated distance is said to be one."""
+
+
+def format_dropout(content: DropoutContent) -> str:
+    """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
+    report, drive = content.report, content.run_summary["drive"]
+    reference = "; held against the smoothed trajectory" if content.smoothed else ""
+    way = f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    lines = [
+        content.title,
+        f"blind with wheel speeds only, from each of {report.states:,} states; {way}{reference}",
+        "",
+    ]
+    lines += _error_lines(report)
+    lines += ["", *_count_lines(report)]
+    lines += [_turning_line(one) for one in content.by_turning]
+    lines += [
+        "",
+        *(part for line in budget_lines(content.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
+    ]
+    if content.ladder is not None:
+        lines += ["", *format_ladder(content.ladder).splitlines()]
+    elif content.no_ladder:
+        lines += ["", f"models on way they were not fitted to: left out: {content.no_ladder}"]
+    if content.outages:
+        lines += ["", *_outage_lines(content.outages, report)]
+    if content.verdicts:
+        lines += ["", *(verdict.line() for verdict in content.verdicts)]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
+    """Return a sentence a budget: how far each model stays within it."""
+    if not budgets:
+        return ["no blind drive is as long as the shortest horizon: nothing can be said of budgets"]
+    lines = []
+    for budget_m in dict.fromkeys(one.budget_m for one in budgets):
+        first, *others = (one for one in budgets if one.budget_m == budget_m)
+        more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
+        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)}{more}")
+    return lines
+
+
+def metres_text(metres: float) -> str:
+    """Return an error [m] with three digits or to the millimetre."""
+    if not math.isfinite(metres):
+        return "-"
+    return f"{metres:.3f} m" if metres < 1 else f"{metres:.2f} m"
+
+
+def percent_text(percent: float) -> str:
+    """Return an error in percent of the way."""
+    return f"{percent:.1f} %" if math.isfinite(percent) else "-"
+
+
+def ratio_text(numerator: float, denominator: float) -> str:
+    """Return ``2.1 x``."""
+    return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
+
+
+def _reach_text(one: BudgetDistance) -> str:
+    if one.beyond:
+        return f"more than {one.distance_m:g} m"
+    low, high = one.between_m
+    # The error grows faster than the way: on a straight line between far horizons the distance comes out too long.
+    far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
+    return f"{one.distance_m:.1f} m{far}"
+
+
+def _error_lines(report: DropoutReport) -> list[str]:
+    shown = shown_horizons(report)
+    lines = [_row("way driven blind", [f"{report.horizons_m[h]:g} m" for h in shown])]
+    for result in report.results:
+        summary, intervals = result.summary, result.intervals
+        lines.append(
+            _row(f"{result.label:<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown])
+        )
+        spans = [_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown]
+        lines.append(_row(f"{'':<{MODEL}}  interval", spans))
+        lines.append(
+            _row(f"{'':<{MODEL}} expected", [_error_text(float(summary.expected[h]), report, h) for h in shown])
+        )
+    icr, no_slip = report.result("icr"), report.result("no_slip")
+    if icr is not None and no_slip is not None:
+        lines += _ratio_lines(icr, no_slip, shown)
+    else:
+        lines.append("no slip is left out: robot.track_width_m is not known")
+    return lines
+
+
+def _ratio_lines(icr: ModelResult, no_slip: ModelResult, shown: Sequence[int]) -> list[str]:
+    lines = []
+    for label, column in (("95 %", "p95"), ("expected", "expected")):
+        pairs = [(float(getattr(no_slip.summary, column)[h]), float(getattr(icr.summary, column)[h])) for h in shown]
+        lead = "no slip : ICR" if label == "95 %" else ""
+        lines.append(_row(f"{lead:<{MODEL}} {label}", [ratio_text(*pair) for pair in pairs]))
+    return lines
+
+
+def _turning_line(split: TurningSplit) -> str:
+    kind = "straight" if split.straight else "turning"
+    labels = {"icr": "ICR", "no_slip": "no slip"}
+    errors = ", ".join(f"{labels[name]} {metres_text(error)}" for name, error in split.expected_m.items())
+    return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
+
+
+def _count_lines(report: DropoutReport) -> list[str]:
+    shown, counts = shown_horizons(report), report.counts
+    lines = [_row("trials", [f"{int(counts.trials[h]):,}" for h in shown])]
+    for label, column in (
+        ("no trial: too little way", counts.short),
+        ("across a wheel gap", counts.gap),
+        ("ends in GNSS outage", counts.outage),
+    ):
+        if column[shown].any():
+            lines.append(_row(label, [f"{int(column[h]):,}" for h in shown]))
+    if report.standing > NOTED_STANDING * report.states:
+        share = 100 * report.standing / report.states
+        lines.append(f"the robot stood at {share:.0f} % of the states: their trials are near copies of one another")
+    return lines
+
+
+def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]:
+    """Return a line an outage, beside it p95 of the momentary ICRs over as much way."""
+    icr = report.result("icr")
+    lines = [
+        f"{'outage':<10}{'from':>10}{'length':>10}{'way':>10}{'end error':>12}{'max error':>12}{'95 % of trials':>18}"
+    ]
+    for number, one in enumerate(outages, start=1):
+        usual = p95_at(icr, report, one.distance_m) if icr is not None else None
+        label = f"{number} {one.kind}"
+        lines.append(
+            f"{label:<10}{one.begin_s:>8.1f} s{one.end_s - one.begin_s:>8.1f} s{one.distance_m:>8.1f} m"
+            f"{metres_text(one.end_error_m):>12}{metres_text(one.max_error_m):>12}"
+            f"{metres_text(usual) if usual is not None else '-':>18}"
+        )
+    return lines
+
+
+def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
+    return f"{metres_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
+
+
+def _span_text(low_m: float, high_m: float) -> str:
+    if not math.isfinite(low_m):
+        return "too little way"
+    return f"{metres_text(low_m).removesuffix(' m')}-{metres_text(high_m)}"
+
+
+def _row(label: str, cells: Sequence[str]) -> str:
+    return f"{label:<{LABEL}}" + "".join(f"{cell:>{CELL}}" for cell in cells)

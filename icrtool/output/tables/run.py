@@ -1,0 +1,239 @@
+"""A run as text: the few lines a field engineer reads first."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
+from icrtool.estimation.filter_setup import configured_process_position_mps
+from icrtool.estimation.fit import FilterRun
+from icrtool.estimation.summary import ICR_COLUMNS, separation_multiplier
+from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR, TerrainChange
+from icrtool.output.text_format import TABLE_WIDTH, duration_text, length_text, position_word, run_title, way_text
+
+LABEL = 12
+"""Columns of the left margin: what a line is about."""
+
+TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
+"""A delay that receivers have, to say what it does; at lower speeds than this it does little."""
+
+WORTH_TELLING_S = 0.05
+"""A delay below this is not worth a line."""
+
+ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+
+SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
+"""What is said of an ICR by the verdict of `judge_excitation`."""
+
+Row = tuple[str, ...]
+
+
+def format_run(run: FilterRun) -> str:
+    """Return the table of a run: streams, drive, ICRs, position, heading; at most 100 columns wide, no line end.
+
+    Warnings are not in it: they belong to stderr.
+    """
+    lines = [
+        run_title(run),
+        "",
+        *_stream_lines(run),
+        "",
+        *_drive_lines(run),
+        "",
+        *_icr_lines(run),
+        *_multiplier_lines(run),
+        *excitation_lines(run),
+        *_terrain_lines(run),
+        "",
+        *_position_lines(run),
+        *_heading_lines(run),
+        *_delay_lines(run),
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def excitation_lines(run: FilterRun) -> list[str]:
+    """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
+    found = run.summary["excitation"]
+    verdicts = found["verdict"]
+    if set(verdicts.values()) == {"shown"}:
+        said = "enough to show all three ICRs"
+    else:
+        said = ", ".join(f"{ICR_LABELS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
+    right, left = found["turned_right_deg"], found["turned_left_deg"]
+    spun = found["spun_right_deg"] + found["spun_left_deg"]
+    turned = f"turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot"
+    return [_line("excitation", f"{said}; {turned}")]
+
+
+def _stream_lines(run: FilterRun) -> list[str]:
+    rows: list[Row] = [("stream", "topic", "type", "rate", "samples", "clock")]
+    for stream in run.log.streams:
+        kind = stream.message_type.replace("/msg/", "/")
+        rows.append((stream.role, stream.topic, kind, f"{stream.rate_hz:.1f} Hz", f"{stream.count:,}", stream.clock))
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
+    widths[0] = LABEL - 2
+    # Long names give way: the topic keeps its end, the type its begin.
+    room = TABLE_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
+    widths[1] = min(widths[1], max(room - widths[2], room // 2))
+    widths[2] = min(widths[2], room - widths[1])
+    return [
+        f"{row[0]:<{widths[0]}}  {_tail(row[1], widths[1]):<{widths[1]}}  {_head(row[2], widths[2]):<{widths[2]}}  "
+        f"{row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}  {row[5]}"
+        for row in rows
+    ]
+
+
+def _drive_lines(run: FilterRun) -> list[str]:
+    drive = run.summary["drive"]
+    speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s"
+    return [
+        _line("drive", f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed} (mean ± std)")
+    ]
+
+
+def _icr_lines(run: FilterRun) -> list[str]:
+    icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
+    rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise", "")]
+    for column in ICR_COLUMNS:
+        rise = icr["convergence_s"][column]
+        rows.append(
+            (
+                ICR_LABELS[column],
+                f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}",
+                f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}",
+                f"{rise:.1f} s" if rise is not None else "hardly moved",
+                SHOWN_WORDS.get(verdicts[column], ""),
+            )
+        )
+    return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]:<24}{row[4]}" for row in rows]
+
+
+def _multiplier_lines(run: FilterRun) -> list[str]:
+    width = run.config.robot.track_width_m
+    if width is None:
+        return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
+    multiplier = separation_multiplier(run.table, width)
+    verdicts = run.summary["excitation"]["verdict"]
+    shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
+    doubt = "" if shown else ": not shown well enough to be used"
+    return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m{doubt}")]
+
+
+def _terrain_lines(run: FilterRun) -> list[str]:
+    """Return the terrain changes, given and found, and the ICRs between them."""
+    terrain = run.terrain
+    if not (terrain.changes or terrain.searched):
+        return []
+    lines = [""]
+    if terrain.searched:
+        found = sum(change.source == "detected" for change in terrain.changes)
+        driven = duration_text(3600 * terrain.driven_h)
+        if math.isfinite(terrain.threshold):
+            said = (
+                f"{found} {'change' if found == 1 else 'changes'} of the ICRs found in {driven} of driving; "
+                f"by chance: {FALSE_ALARMS_PER_HOUR:g} an hour at most"
+            )
+        else:
+            said = "too few turns, or too rough a position, to look for changes of the ICRs"
+        lines.append(_line("terrain", said))
+    if not terrain.changes:
+        return lines
+    rows: list[Row] = [("segment", "begins", "", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
+    begun = ["", *(_found_text(change, terrain.threshold) for change in terrain.changes)]
+    for number, (segment, why) in enumerate(zip(run.summary["segments"], begun, strict=True), start=1):
+        mean, std = segment["mean"], segment["std"]
+        icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
+        rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", why, *icrs))
+    return lines + [f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<22}{row[3]:<20}{row[4]:<20}{row[5]}" for row in rows]
+
+
+def _found_text(change: TerrainChange, threshold: float) -> str:
+    if change.statistic is None:
+        return "given"
+    return f"found, {change.statistic:.1f} σ > {threshold:.1f} σ"
+
+
+def _position_lines(run: FilterRun) -> list[str]:
+    gnss = run.summary["gnss"]
+    word = position_word(run)
+    lines = []
+    if gnss["mean_difference_m"] is not None:
+        mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
+        raised = run.process_position_mps != configured_process_position_mps(run.config)
+        why = "; follows them closely, for its position noise was raised" if raised else ""
+        lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}{why}"))
+    reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
+    why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
+    lines.append(
+        _line(
+            "fixes" if lines else "position",
+            f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
+        )
+    )
+    lines += _class_lines(gnss["classes"], gnss["jumps"])
+    if gnss["recoveries"]:
+        times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
+        lines.append(_line("", f"believed again after rejection: {times}"))
+    if outages := len(run.outages_ns):
+        away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
+        lost = len(run.summary["rtk_losses_ns"])
+        cause = f" ({lost} of RTK, fixes went on)" if lost else ""
+        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
+    return lines
+
+
+def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
+    """Say what classes the fixes were of, where they were not all of one, and what was done to them."""
+    lines = []
+    for name, one in classes.items() if len(classes) > 1 else ():
+        done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
+        done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
+        done += [f"{one['sold_as_fixed']:,} sold as fixed"] if one["sold_as_fixed"] else []
+        lines.append(_line("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
+    if jumps:
+        lines.append(_line("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
+    return lines
+
+
+def _heading_lines(run: FilterRun) -> list[str]:
+    check = run.heading_check
+    if not math.isfinite(check.offset_rad):
+        return [_line("heading", "could not be compared with the course: too little straight driving")]
+    # Adding zero takes the sign off a rounded -0.0.
+    found = round(math.degrees(check.offset_rad), 1) + 0.0
+    offset = f"{found:+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
+    if check.name.text:
+        offset += f" ({check.name.text})"
+    applied = math.degrees(check.applied_offset_rad)
+    return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
+
+
+def _delay_lines(run: FilterRun) -> list[str]:
+    """Say what seems to be late, or early, against the wheels."""
+    told: list[str] = []
+    if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
+        return told
+    for word, facts in (("heading", run.summary["heading"]), ("fixes", run.summary["gnss"])):
+        delay, std = facts["delay_s"], facts["delay_std_s"]
+        if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
+            told.append(f"{word} {abs(delay):.2f} ± {std:.2f} s {'late' if delay > 0 else 'early'}")
+    lines = [f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"] if told else []
+    speed = run.summary["drive"]["speed_mean_mps"]
+    if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
+        shift = length_text(TYPICAL_DELAY_S * speed)
+        lines.append(f"of the fixes: not shown by this drive; {TYPICAL_DELAY_S:g} s late would move x by {shift}")
+    return [_line("" if number else "delays", line) for number, line in enumerate(lines)]
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label:<{LABEL}}{text}"
+
+
+def _tail(text: str, width: int) -> str:
+    return text if len(text) <= width else "..." + text[len(text) - width + 3 :]
+
+
+def _head(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: width - 3] + "..."

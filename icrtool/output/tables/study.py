@@ -1,0 +1,110 @@
+"""A study as text: what was found by setting, and beside it what the paper says."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from icrtool.simulation.studies import KINDS, Finding, StudyResult
+
+ERRORS = tuple(
+    (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
+)
+SETTLE = (("settle_s", "all within 10 % [s]"),)
+INVERTED = (("inverted", "inverted"),)
+
+SHOWN: dict[str, tuple[tuple[str, str], ...]] = {
+    "convergence": SETTLE + INVERTED,
+    "icr-change": (("change1_settle_s", "change 1 [s]"), ("change2_settle_s", "change 2 [s]"), *INVERTED),
+    "turn-radius": SETTLE + INVERTED,
+    "input-noise": ERRORS + INVERTED,
+    "input-bias": ERRORS + INVERTED,
+    "input-source": ERRORS + INVERTED,
+    "gnss": (("rms_y_icr_right_m", "rms y right [m]"), ("blind_icr_10m_p95_m", "blind 10 m [m]"), *INVERTED),
+    "rate": ERRORS,
+}
+"""Metrics by study, with the heading of their column; the studies left out have no settings to list."""
+
+
+def format_study(result: StudyResult) -> str:
+    """Return the tables of a study; no line end."""
+    request, kind = result.request, KINDS[result.request.name]
+    figures = f" (Fig{'s' if len(kind.figures) > 2 else ''}. {kind.figures})" if kind.figures else ""
+    path = request.plan.path
+    icrs = ", ".join(f"{icr:+.3f}" for icr in request.plan.icrs_m)
+    driven = f"{getattr(path, 'kind', 'path')} at {getattr(path, 'speed_mps', 0):g} m/s, ICRs {icrs} m"
+    lines = [
+        f"{request.name}{figures}: {kind.about}",
+        f"{request.runs} runs of {request.plan.duration_s:g} s each, seed {request.seed}; {driven}",
+        "",
+    ]
+    lines += [*_level_lines(result), ""] if request.name in SHOWN else []
+    lines += _finding_lines(result.findings, "expected" if request.name == "consistency" else "paper")
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _level_lines(result: StudyResult) -> list[str]:
+    """Return one line a setting: median and, in brackets, the 5th and 95th percentile over its runs."""
+    shown = [metric for metric in SHOWN[result.request.name] if metric[0] in result.levels[0]["metrics"]]
+    varies = KINDS[result.request.name].varies or "setting"
+    rows = [["preset", varies, *(heading for _, heading in shown)]]
+    for level in result.levels:
+        value = level["value"]
+        rows.append(
+            [
+                level["series"],
+                value if isinstance(value, str) else f"{value:g}",
+                *(_cell(name, level["metrics"][name], result.request.runs) for name, _ in shown),
+            ]
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+    errors = any(name.startswith("error") for name, _ in shown)
+    return [*lines, f"{'errors [m]: ' if errors else ''}median [5 %, 95 %] over the runs"]
+
+
+def _cell(name: str, told: dict[str, Any], runs: int) -> str:
+    if name == "inverted":
+        return f"{100 * told['mean']:.0f} %"
+    if not told["count"]:
+        return "never"
+    form = "+.3f" if name.startswith("error") else ".3g"
+    never = f", never in {runs - told['count']}" if told["count"] < runs else ""
+    return f"{told['p50']:{form}} [{told['p5']:{form}}, {told['p95']:{form}}]{never}"
+
+
+def _finding_lines(findings: tuple[Finding, ...], beside: str) -> list[str]:
+    rows = [("", "ours", beside), *((one.what, finding_text(one), one.paper) for one in findings)]
+    first, second = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
+    return [f"{what:<{first}}  {ours:<{second}}  {paper}" for what, ours, paper in rows]
+
+
+def finding_text(finding: Finding) -> str:
+    """Return our number as ``1.23 s``, or ``0.5-1.23 s``, or median with percentiles."""
+    if any(math.isnan(value) for value in finding.ours):
+        return "never"
+    texts = [_number(value) for value in finding.ours]
+    unit = f" {finding.unit}" if finding.unit else ""
+    if len(texts) == 1:
+        return f"{texts[0]}{unit}"
+    if len(texts) == 2:
+        return f"{texts[0]} to {texts[1]}{unit}"
+    return f"{texts[1]}{unit} [{texts[0]}, {texts[2]}]"
+
+
+def _number(value: float) -> str:
+    if value == 0 or abs(value) < 1e-3:
+        return "0.000" if abs(value) < 5e-4 else f"{value:.3f}"
+    return f"{value:.3f}" if abs(value) < 1 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+
+
+def study_title(result: StudyResult) -> str:
+    """Return a study's name, with the robot's where it has one, and the true ICRs."""
+    robot = result.request.config.robot.name
+    icrs = ", ".join(f"{icr:+.2f}".replace("-", "−") for icr in result.request.plan.icrs_m)
+    return f"Study {result.request.name}  ({f'{robot}, ' if robot else ''}ICRs {icrs} m)"
+
+
+def capital(text: str) -> str:
+    """Return a text that begins with a capital."""
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,52 @@
+"""Words and numbers as a reader of our figures and tables meets them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from icrtool.estimation.fit import FilterRun
+
+TABLE_WIDTH = 100
+"""Letters in a line of a printed table."""
+
+FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
+"""What the numbers of a ladder's model were fitted to, by `icrtool.calibration.model_comparison.Rung.fitted`."""
+
+
+def run_title(run: FilterRun) -> str:
+    """Return the log's name, and the robot's where it has one."""
+    robot = run.config.robot.name
+    return f"{run.log.name}  ({robot})" if robot else run.log.name
+
+
+def position_word(run: FilterRun) -> str:
+    """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
+    return "GNSS fixes" if run.log.datum is not None else "position reference"
+
+
+def signed(metres: float) -> str:
+    """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
+    return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
+
+
+def length_text(metres: float) -> str:
+    """Return a distance as ``3.4 mm``, ``1.2 cm`` or ``3.45 m``."""
+    if metres < 0.01:
+        return f"{1000 * metres:.1f} mm"
+    return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
+
+
+def way_text(metres: float) -> str:
+    """Return a length of way as ``398.5 m`` or ``36.00 km``."""
+    return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration as ``12.3 s``, ``14:59 min`` or ``3:07:40 h``."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d} h"

@@ -1,0 +1,287 @@
+"""Simulate: a robot of known ICRs drives a path, and the sensors of Pentzer 2014, Section 4, look at it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from icrtool.errors import ConfigError
+from icrtool.kernels.arcs import drive, follow, poses_at
+from icrtool.records.tables import Floats, Ints
+from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
+
+Icrs = tuple[float, float, float]
+"""y_icr_right, y_icr_left, x_icr [m]."""
+
+TRUTH_STEP_S = 0.001
+"""Track speeds of a path are held this long by default; every sensor is slower."""
+
+PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
+"""Pentzer 2014, Section 5."""
+
+GYRO_STD_RADPS = 0.003
+
+
+@dataclass(frozen=True, slots=True)
+class TrackSpeeds:
+    """Track speeds as given: t_s (n,) increasing from 0; v_left_mps, v_right_mps (n,), held until the next row."""
+
+    t_s: Floats
+    v_left_mps: Floats
+    v_right_mps: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What really happens.
+
+    Attributes
+    ----------
+    icrs_m : true y_icr_right, y_icr_left, x_icr; the driver knows these, and plans with them
+    changes : (seconds, ICRs that hold from then on), in order of time; the driver does not notice
+    path : a path, or track speeds as given
+    command_rate_hz : the plan reaches the motors this often, and is held between; None: at every step
+    motor_lag_s : time constant with which the tracks follow; 0: at once
+    step_s : track speeds of a path are held this long; one over a whole number
+    """
+
+    icrs_m: Icrs = PAPER_ICRS_M
+    changes: tuple[tuple[float, Icrs], ...] = ()
+    path: PathPlan | TrackSpeeds = field(default_factory=PathPlan)
+    duration_s: float = 100.0
+    start_heading_rad: float = 0.5
+    command_rate_hz: float | None = None
+    motor_lag_s: float = 0.0
+    step_s: float = TRUTH_STEP_S
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What looks at it. The defaults are Section 4 of Pentzer 2014.
+
+    Attributes
+    ----------
+    wheels : ``ideal`` (true displacement), ``encoder`` (whole counts) or ``commanded`` (what the motors are told)
+    wheel_rate_hz, heading_rate_hz, gnss_rate_hz : samples per second
+    metres_per_count : travel of one encoder count
+    input_noise_mps, input_bias_mps : white noise per sample and bias, on both track speeds
+    gnss_std_m : of north and of east, white
+    outages_s : (begin, end) without fixes
+    heading_std_rad, heading_resolution_rad : white noise, and the step that headings are rounded to
+    heading_offset_rad : added to every heading, clockwise
+    antenna_forward_m, antenna_right_m : where the antenna stands, body frame
+    gnss_delay_s, heading_delay_s : their stamps are this much later than the wheels' clock says
+    """
+
+    wheels: Literal["ideal", "encoder", "commanded"] = "encoder"
+    wheel_rate_hz: float = 100.0
+    metres_per_count: float = 2 * math.pi * 0.08 / 8192
+    input_noise_mps: float = 0.0
+    input_bias_mps: float = 0.0
+    gnss_std_m: float = 0.01
+    gnss_rate_hz: float = 20.0
+    outages_s: tuple[tuple[float, float], ...] = ()
+    heading_std_rad: float = math.radians(1.0)
+    heading_resolution_rad: float = math.radians(0.05)
+    heading_rate_hz: float = 100.0
+    heading_offset_rad: float = 0.0
+    antenna_forward_m: float = 0.0
+    antenna_right_m: float = 0.0
+    gnss_delay_s: float = 0.0
+    heading_delay_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """True motion on a fine grid of time.
+
+    Attributes
+    ----------
+    t_s : (n,) increasing from 0
+    command_left_mps, command_right_mps : (n,) what the motors are told, held over [k, k+1)
+    v_left_mps, v_right_mps : (n,) true track speeds, held over [k, k+1)
+    travel_left_m, travel_right_m : (n,) their integrals
+    icrs_m : (c, 3); which : int64 (n,) row of it that holds over [k, k+1)
+    pose : (n, 3) north, east [m], heading [rad] (unwrapped)
+    """
+
+    t_s: Floats
+    command_left_mps: Floats
+    command_right_mps: Floats
+    v_left_mps: Floats
+    v_right_mps: Floats
+    travel_left_m: Floats
+    travel_right_m: Floats
+    icrs_m: Floats
+    which: Ints
+    pose: Floats
+
+    def rows(self, times: Floats) -> Ints:
+        """Return the row (m,) whose step each time (m,) [s] falls into."""
+        return np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 1).astype(np.int64)
+
+    def poses(self, times: Floats) -> Floats:
+        """Return the pose (m, 3) at times (m,) [s]."""
+        return poses_at(times, self.t_s, self.v_left_mps, self.v_right_mps, self.icrs_m, self.which, self.pose)
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What the sensors say, at the times at which they looked.
+
+    Attributes
+    ----------
+    wheel_t, travel_left_m, travel_right_m, v_left_mps, v_right_mps : (n,); a speed k is the travel from k to k + 1
+    gnss_t : (m,); gnss_m : (m, 2) north, east of the antenna
+    heading_t, heading_rad (unwrapped), yaw_rate_radps : (h,)
+    """
+
+    wheel_t: Floats
+    travel_left_m: Floats
+    travel_right_m: Floats
+    v_left_mps: Floats
+    v_right_mps: Floats
+    gnss_t: Floats
+    gnss_m: Floats
+    heading_t: Floats
+    heading_rad: Floats
+    yaw_rate_radps: Floats
+
+
+def check_drive(plan: Drive, sensors: Sensors) -> None:
+    """Refuse what cannot be driven or seen.
+
+    Raises
+    ------
+    ConfigError
+        It names what is impossible.
+    """
+    for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
+        if not right > left:
+            raise ConfigError(
+                "change" if number else "icrs",
+                f"y_icr_right {right:g} is not right of y_icr_left {left:g}",
+                "y is positive to the right",
+            )
+    if (
+        isinstance(plan.path, PathPlan)
+        and plan.path.radius_m == 0
+        and plan.path.kind not in ("circle", "spins", "straight")
+    ):
+        raise ConfigError(
+            "radius", f"a {plan.path.kind} path has no bends of radius 0", "only a circle may stand on the spot"
+        )
+    times = [time for time, _ in plan.changes]
+    if times != sorted(set(times)):
+        raise ConfigError("change", f"the times {', '.join(f'{time:g}' for time in times)} do not increase")
+    slowest = min(sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
+    if plan.duration_s * slowest < 2:
+        raise ConfigError(
+            "duration", f"{plan.duration_s:g} s holds fewer than two samples at {slowest:g} Hz", "drive longer"
+        )
+
+
+def move(plan: Drive, tail_s: float) -> Truth:
+    """Drive a plan for its duration and `tail_s` more: the last wheel speed needs a next sample."""
+    end = plan.duration_s + tail_s + 2 * plan.step_s
+    given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
+    edges = np.array([time for time, _ in plan.changes])
+    # Divided, not multiplied: k / 100 and j / 20 are then the same double where they are the same time.
+    grid = np.arange(math.ceil(end / plan.step_s)) / round(1 / plan.step_s)
+    t = np.union1d(grid, np.concatenate([given[given < end], edges[edges < end]]))
+    told_at = t
+    if plan.command_rate_hz is not None:
+        told_at = np.floor(t * plan.command_rate_hz * (1 + 1e-12)) / plan.command_rate_hz
+    if isinstance(plan.path, TrackSpeeds):
+        row = np.clip(np.searchsorted(given, told_at, side="right") - 1, 0, None)
+        left, right = plan.path.v_left_mps[row], plan.path.v_right_mps[row]
+    else:
+        left, right = track_speeds(*plan_body(plan.path, told_at, plan.icrs_m), plan.icrs_m)
+    v_left, v_right = left, right
+    if plan.motor_lag_s > 0:
+        v_left, v_right = follow(left, t, plan.motor_lag_s), follow(right, t, plan.motor_lag_s)
+    icrs = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)], np.float64)
+    which = np.searchsorted(edges, t, side="right").astype(np.int64)
+    step = np.diff(t)
+    travel_left, travel_right = (np.concatenate([[0.0], np.cumsum(speed[:-1] * step)]) for speed in (v_left, v_right))
+    start = np.array([0.0, 0.0, plan.start_heading_rad])
+    pose = drive(t, v_left, v_right, icrs, which, start)
+    return Truth(t, left, right, v_left, v_right, travel_left, travel_right, icrs, which, pose)
+
+
+def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:
+    """Look at the truth for `duration_s` from time 0.
+
+    Notes
+    -----
+    Wheel noise is drawn as a speed per sample and summed into the travel, so that positions and speeds of a message
+    say the same. An encoder then counts whole counts of that travel.
+    """
+    wheel_t = sample_times(sensors.wheel_rate_hz, duration_s)
+    v_left, v_right = (_wheel_speed(truth, side, wheel_t, sensors, rng) for side in ("left", "right"))
+    interval = np.diff(np.append(wheel_t, len(wheel_t) / sensors.wheel_rate_hz))
+    travels = [np.concatenate([[0.0], np.cumsum(speed * interval)]) for speed in (v_left, v_right)]
+    if sensors.wheels == "encoder":
+        travels = [np.floor(travel / sensors.metres_per_count) * sensors.metres_per_count for travel in travels]
+        v_left, v_right = (np.diff(travel) / interval for travel in travels)
+    gnss_t = sample_times(sensors.gnss_rate_hz, duration_s)
+    # Drawn for the whole drive: an outage changes no fix outside it.
+    noise = rng.normal(0.0, 1.0, (len(gnss_t), 2)) * sensors.gnss_std_m
+    seen = np.ones(len(gnss_t), np.bool_)
+    for begin, end in sensors.outages_s:
+        seen &= (gnss_t < begin) | (gnss_t >= end)
+    heading_t = sample_times(sensors.heading_rate_hz, duration_s)
+    psi = truth.poses(heading_t)[:, 2] + sensors.heading_offset_rad
+    psi += rng.normal(0.0, 1.0, len(heading_t)) * sensors.heading_std_rad
+    if sensors.heading_resolution_rad > 0:
+        psi = np.rint(psi / sensors.heading_resolution_rad) * sensors.heading_resolution_rad
+    turn = _turn_rate(truth, truth.rows(heading_t)) + rng.normal(0.0, GYRO_STD_RADPS, len(heading_t))
+    return Readings(
+        wheel_t,
+        travels[0][:-1],
+        travels[1][:-1],
+        v_left,
+        v_right,
+        gnss_t[seen],
+        (_antenna(truth.poses(gnss_t), sensors) + noise)[seen],
+        heading_t,
+        psi,
+        turn,
+    )
+
+
+def sample_times(rate_hz: float, duration_s: float) -> Floats:
+    """Return the times [s] of a sensor that looks `rate_hz` times a second, in [0, duration_s)."""
+    count = math.ceil(duration_s * rate_hz * (1 - 1e-12))
+    return np.arange(count) / rate_hz
+
+
+def _wheel_speed(
+    truth: Truth, side: Literal["left", "right"], wheel_t: Floats, sensors: Sensors, rng: np.random.Generator
+) -> Floats:
+    """Return the speed (n,) [m/s] of a side over each interval, noise and bias included, before any counting."""
+    if sensors.wheels == "commanded":
+        told: Floats = getattr(truth, f"command_{side}_mps")
+        speed = told[truth.rows(wheel_t)]
+    else:
+        edges = np.append(wheel_t, len(wheel_t) / sensors.wheel_rate_hz)
+        speed = np.diff(np.interp(edges, truth.t_s, getattr(truth, f"travel_{side}_m"))) / np.diff(edges)
+    # Drawn even where the noise is zero: then a run with noise differs from one without by the noise alone.
+    noise: Floats = rng.normal(0.0, 1.0, len(wheel_t)) * sensors.input_noise_mps
+    return speed + sensors.input_bias_mps + noise
+
+
+def _turn_rate(truth: Truth, row: Ints) -> Floats:
+    icrs = truth.icrs_m[truth.which[row]]
+    turn: Floats = (truth.v_left_mps[row] - truth.v_right_mps[row]) / (icrs[:, 0] - icrs[:, 1])
+    return turn
+
+
+def _antenna(pose: Floats, sensors: Sensors) -> Floats:
+    """Return north and east (m, 2) of the antenna."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    forward, right = sensors.antenna_forward_m, sensors.antenna_right_m
+    return pose[:, :2] + np.column_stack([forward * c - right * s, forward * s + right * c])

@@ -1,0 +1,139 @@
+"""A simulated drive as a robot records it: stamps, places on the globe, and the truth beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from icrtool.records.tables import Floats, Ints
+from icrtool.simulation.drives import Drive, Readings, Sensors, Truth, check_drive, move, sense
+
+START_NS = 1_760_000_000_000_000_000
+DATUM = (40.7934, -77.86, 350.0)
+"""Where and when: latitude, longitude [deg], height [m] of the first pose, and the stamp of time 0."""
+
+HEIGHT_STD_RATIO = 2.0
+LARGEST_RTK_STD_M = 0.05
+LARGEST_SBAS_STD_M = 0.6
+"""What a receiver of this noise would call its fix: GBAS, SBAS, or a plain fix beyond."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRecord:
+    """Readings as a robot records them; the fields are those of `icrtool.logs.writing.records.SensorColumns`.
+
+    Attributes
+    ----------
+    wheel_stamp_ns, gnss_stamp_ns, heading_stamp_ns : int64, of the wheels' clock
+    latitude_deg, longitude_deg, height_m : (m,) WGS 84
+    gnss_std_m : (m,); gnss_status : int64 (m,) of NavSatStatus
+    heading_rad : (h,) clockwise from north, in (-pi, pi]
+    """
+
+    wheel_stamp_ns: Ints
+    wheel_position_left_m: Floats
+    wheel_position_right_m: Floats
+    wheel_v_left_mps: Floats
+    wheel_v_right_mps: Floats
+    gnss_stamp_ns: Ints
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    gnss_std_m: Floats
+    gnss_status: Ints
+    heading_stamp_ns: Ints
+    heading_rad: Floats
+    yaw_rate_radps: Floats
+
+    def columns(self) -> dict[str, Any]:
+        """Return the columns by name."""
+        return {column.name: getattr(self, column.name) for column in fields(self)}
+
+
+@dataclass(frozen=True, slots=True)
+class TruthTable:
+    """The truth at every wheel stamp: the columns of the truth CSV, (n,) each.
+
+    Attributes
+    ----------
+    t_s : since the first wheel stamp
+    north_m, east_m : of the body origin, about `DATUM`; heading_rad : unwrapped
+    v_left_mps, v_right_mps : true track speeds at that moment
+    """
+
+    stamp_ns: Ints
+    t_s: Floats
+    north_m: Floats
+    east_m: Floats
+    heading_rad: Floats
+    y_icr_right_m: Floats
+    y_icr_left_m: Floats
+    x_icr_m: Floats
+    v_left_mps: Floats
+    v_right_mps: Floats
+
+    def columns(self) -> dict[str, Floats | Ints]:
+        """Return the columns by name, in the order of the file."""
+        return {column.name: getattr(self, column.name) for column in fields(self)}
+
+
+def simulate(plan: Drive, sensors: Sensors, seed: int) -> tuple[SensorRecord, TruthTable]:
+    """Drive a plan and record it.
+
+    Parameters
+    ----------
+    seed : of the sensors' noise; the same seed gives the same numbers
+
+    Raises
+    ------
+    ConfigError
+        What cannot be driven or seen.
+    """
+    check_drive(plan, sensors)
+    truth = move(plan, 1.0 / sensors.wheel_rate_hz)
+    height_rng, sensor_rng = (np.random.default_rng((seed, stream)) for stream in (1, 0))
+    readings = sense(truth, sensors, plan.duration_s, sensor_rng)
+    return record(readings, sensors, height_rng), truth_table(truth, readings.wheel_t)
+
+
+def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorRecord:
+    """Stamp readings from `START_NS` on, delays included, and put the fixes on the globe about `DATUM`."""
+    from pymap3d import ned2geodetic
+
+    fixes = len(readings.gnss_t)
+    down = rng.normal(0.0, HEIGHT_STD_RATIO * sensors.gnss_std_m, fixes)
+    latitude, longitude, height = ned2geodetic(*readings.gnss_m.T, down, *DATUM)
+    status = 2 if sensors.gnss_std_m <= LARGEST_RTK_STD_M else 1 if sensors.gnss_std_m <= LARGEST_SBAS_STD_M else 0
+    return SensorRecord(
+        wheel_stamp_ns=stamps(readings.wheel_t),
+        wheel_position_left_m=readings.travel_left_m,
+        wheel_position_right_m=readings.travel_right_m,
+        wheel_v_left_mps=readings.v_left_mps,
+        wheel_v_right_mps=readings.v_right_mps,
+        gnss_stamp_ns=stamps(readings.gnss_t + sensors.gnss_delay_s),
+        latitude_deg=np.asarray(latitude, np.float64),
+        longitude_deg=np.asarray(longitude, np.float64),
+        height_m=np.asarray(height, np.float64),
+        gnss_std_m=np.full(fixes, sensors.gnss_std_m),
+        gnss_status=np.full(fixes, status, np.int64),
+        heading_stamp_ns=stamps(readings.heading_t + sensors.heading_delay_s),
+        heading_rad=np.angle(np.exp(1j * readings.heading_rad)),
+        yaw_rate_radps=readings.yaw_rate_radps,
+    )
+
+
+def truth_table(truth: Truth, times: Floats) -> TruthTable:
+    """Return the truth at times (n,) [s]."""
+    row, pose = truth.rows(times), truth.poses(times)
+    right, left, x = truth.icrs_m[truth.which[row]].T
+    north, east, heading = pose.T
+    since = times - times[0]
+    speeds = (truth.v_left_mps[row], truth.v_right_mps[row])
+    return TruthTable(stamps(times), since, north, east, heading, right, left, x, *speeds)
+
+
+def stamps(times: Floats) -> Ints:
+    """Return times [s] as stamps of the log's clock."""
+    return START_NS + np.rint(times * 1e9).astype(np.int64)

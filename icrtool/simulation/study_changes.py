@@ -1,0 +1,130 @@
+"""Studies of a change of the ICRs on the way: with and without covariance inflation, and by radius of the turn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+
+from icrtool.errors import ConfigError
+from icrtool.records.tables import Floats
+from icrtool.simulation.drives import Icrs
+from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.studies import Finding, StudyRequest, StudyResult, statistics
+from icrtool.simulation.study_measures import ICR_NAMES, inverted, measure_times, trace
+from icrtool.simulation.study_runs import Chunk, Progress
+from icrtool.simulation.study_sweeps import Level, base_scenario, run_levels, spread
+
+CHANGE_TIMES_S = (175.0, 350.0)
+"""Pentzer 2014, Figs. 8 and 9."""
+
+RADIUS_CHANGE_S = 20.0
+
+ZOOM_S = 10.0
+ZOOM_STEPS = 500
+
+
+def changed(icrs_m: Icrs, number: int) -> Icrs:
+    """Return the ICRs after change 1, 2, …: wider and narrower in turn. The paper does not say its own."""
+    right, left, x = icrs_m
+    width = right - left
+    if number % 2:
+        return 1.5 * right, 0.7 * left, x + 0.2 * width
+    return 0.8 * right, 1.2 * left, x - 0.1 * width
+
+
+def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Change the ICRs twice; with and without telling the filter (Figs. 8, 9)."""
+    plan = request.plan
+    if not plan.changes:
+        icrs = tuple((time, changed(plan.icrs_m, number + 1)) for number, time in enumerate(CHANGE_TIMES_S))
+        plan = replace(plan, changes=tuple(change for change in icrs if change[0] < plan.duration_s))
+        if not plan.changes:
+            why = f"{plan.duration_s:g} s end before the first change, at {CHANGE_TIMES_S[0]:g} s"
+            raise ConfigError("duration", why, "drive longer, or say when with --change")
+    request = replace(request, plan=plan)
+    levels = [
+        Level(preset, name, replace(base_scenario(request, preset), inflate=inflate))
+        for preset in request.presets
+        for name, inflate in (("not told", False), ("inflated", True))
+    ]
+    times = [time for time, _ in plan.changes]
+    edges = [*times, plan.duration_s]
+
+    def measure(chunk: Chunk) -> dict[str, Floats]:
+        columns = {"inverted": inverted(chunk).astype(np.float64)}
+        for number, (begin, end) in enumerate(pairwise(edges), start=1):
+            found = measure_times(chunk, begin, end)
+            columns |= {f"change{number}_{name}": values for name, values in found.items()}
+        return {**columns, **trace(chunk), "zoom": _zoom(chunk, times[0])}
+
+    columns, records, found = run_levels(levels, request, measure, progress)
+    findings = []
+    for level, one in zip(levels, found, strict=True):
+        told = level.value == "inflated"
+        rises = np.concatenate([one[f"change{n}_rise_{icr}_s"] for n in range(1, len(edges)) for icr in ICR_NAMES])
+        settles = np.concatenate([one[f"change{n}_settle_s"] for n in range(1, len(edges))])
+        paper = "0.03-0.17 s (Fig. 9)" if told else "100-140 s (Fig. 8)"
+        findings += [
+            Finding(f"{level.series}, {level.value}: 10-90 % rise", spread(rises), "s", paper),
+            Finding(f"{level.series}, {level.value}: all three stay within 10 % after", spread(settles), "s"),
+            Finding(
+                f"{level.series}, {level.value}: … in so many of the changes",
+                (100 * float(np.isfinite(settles).mean()),),
+                "%",
+            ),
+            Finding(f"{level.series}, {level.value}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
+        ]
+    true_icrs = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
+    curves: dict[str, Floats] = {"changes": np.array(times), "true_icrs": true_icrs}
+    for level, one in zip(levels, found, strict=True):
+        curves |= {
+            f"trace {level.series} {level.value}": one["trace"],
+            f"zoom {level.series} {level.value}": one["zoom"],
+        }
+    return StudyResult(request, columns, records, tuple(findings), curves)
+
+
+def _zoom(chunk: Chunk, since_s: float) -> Floats:
+    """Return time since the change and the ICRs (runs, k, 4) around it."""
+    rows = np.flatnonzero((chunk.t_s >= since_s - 1.0) & (chunk.t_s <= since_s + ZOOM_S))
+    rows = rows[:: 1 + len(rows) // ZOOM_STEPS]
+    times = np.broadcast_to((chunk.t_s[rows] - since_s)[:, None], (len(chunk.x), len(rows), 1))
+    return np.concatenate([times, chunk.x[:, rows, 3:]], axis=2)
+
+
+def study_turn_radius(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Change the ICRs on circles of several radii, telling the filter (Fig. 10).
+
+    The faster track keeps one speed: at radius 0 the robot spins, and the wider the circle, the slower it turns.
+    """
+    path, change = cast(PathPlan, request.plan.path), (RADIUS_CHANGE_S, changed(request.plan.icrs_m, 1))
+    outer = abs(request.plan.icrs_m[1])
+    levels = []
+    for preset in request.presets:
+        base = base_scenario(request, preset)
+        for radius in request.values:
+            speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
+            circle = replace(path, kind="circle", radius_m=radius, speed_mps=speed)
+            plan = replace(base.plan, path=circle, changes=base.plan.changes or (change,))
+            levels.append(Level(preset, radius, replace(base, plan=plan, inflate=True)))
+    since = levels[0].scenario.plan.changes[0][0]
+
+    def measure(chunk: Chunk) -> dict[str, Floats]:
+        return {"inverted": inverted(chunk).astype(np.float64), **measure_times(chunk, since)}
+
+    columns, records, found = run_levels(levels, request, measure, progress)
+    findings = []
+    for level, one in zip(levels, found, strict=True):
+        if level.value in (min(request.values), max(request.values)):
+            paper = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}.get(float(level.value), "")
+            settles = np.concatenate([one[f"settle_{icr}_s"] for icr in ICR_NAMES])
+            label = f"{level.series}: radius {level.value:g} m"
+            findings += [
+                Finding(f"{label}: an ICR stays within 10 % after, mean", (statistics(settles)["mean"],), "s", paper),
+                Finding(f"{label}: all three do", spread(one["settle_s"]), "s"),
+                Finding(f"{label}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
+            ]
+    return StudyResult(request, columns, records, tuple(findings))

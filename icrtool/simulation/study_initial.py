@@ -1,0 +1,107 @@
+"""Which initial ICRs converge, without the sign guard and with it (Pentzer 2014, Section 5.1, Figs. 6, 7)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from icrtool.kernels.batch_filter import PRINTED, TOOL, UNGUARDED
+from icrtool.records.tables import Floats
+from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult
+from icrtool.simulation.study_measures import inverted, trace
+from icrtool.simulation.study_runs import Chunk, Progress, run_scenarios, with_start
+from icrtool.simulation.study_sweeps import base_scenario
+
+GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": TOOL}
+"""Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as the tool has them."""
+
+CONVERGED_M = 0.1
+"""All three ICRs are this near the truth, on the average of the last tenth of a run."""
+
+LAST_SHARE = 10
+
+
+def study_initial(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Start every run at a point of a grid of y ICRs, in every guard."""
+    preset = request.presets[0]
+    base = base_scenario(request, preset)
+    settings = request.config.filter
+    start_x = settings.initial_x_icr_m if settings.initial_x_icr_m is not None else (1.0 if preset == "paper" else 0.0)
+    cells = [(name, right, left) for name in GUARDS for right in request.values for left in request.values]
+    scenarios = [
+        replace(base, guard=GUARDS[name], config=with_start(base.config, (right, left, start_x)))
+        for name, right, left in cells
+    ]
+    found = run_scenarios(scenarios, request.runs, request.seed, _measure, progress=progress)
+    runs = request.runs
+    columns: dict[str, Column] = {
+        "series": [name for name, _, _ in cells for _ in range(runs)],
+        "start_y_icr_right_m": np.repeat([right for _, right, _ in cells], runs),
+        "start_y_icr_left_m": np.repeat([left for _, _, left in cells], runs),
+        "run": np.tile(np.arange(runs), len(cells)),
+    }
+    for name in found[0]:
+        if name != "trace":
+            columns[name] = np.concatenate([one[name] for one in found])
+    levels = tuple(
+        {
+            "series": name,
+            "start_y_icr_right_m": right,
+            "start_y_icr_left_m": left,
+            **{fate: float(one[fate].mean()) for fate in ("converged", "inverted", "elsewhere")},
+        }
+        for (name, right, left), one in zip(cells, found, strict=True)
+    )
+    return StudyResult(request, columns, levels, tuple(_findings(levels)), _curves(request, cells, found))
+
+
+def _measure(chunk: Chunk) -> dict[str, Floats]:
+    last = max(1, chunk.x.shape[1] // LAST_SHARE)
+    error = np.abs(chunk.x[:, -last:, 3:] - chunk.true_icrs_m[-last:]).mean(axis=1)
+    near, wrong = (error < CONVERGED_M).all(axis=1), inverted(chunk)
+    return {
+        "converged": near.astype(np.float64),
+        "inverted": (wrong & ~near).astype(np.float64),
+        "elsewhere": (~wrong & ~near).astype(np.float64),
+        "final_y_icr_right_m": chunk.x[:, -1, 3],
+        "final_y_icr_left_m": chunk.x[:, -1, 4],
+        "final_x_icr_m": chunk.x[:, -1, 5],
+        **trace(chunk),
+    }
+
+
+def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
+    findings = []
+    papers = {
+        "no guard": "those with y_icr_right > 0 (Fig. 6)",
+        "guard, printed derivatives": "all (Fig. 7)",
+        "guard": "all (Fig. 7)",
+    }
+    for name in GUARDS:
+        of_guard = [level for level in levels if level["series"] == name]
+        proper = [level for level in of_guard if level["start_y_icr_right_m"] > level["start_y_icr_left_m"]]
+        wrong = [level for level in of_guard if level["start_y_icr_right_m"] < level["start_y_icr_left_m"]]
+        for label, some in (("proper start", proper), ("inverted start", wrong)):
+            if some:
+                shares = [100 * float(np.mean([level[fate] for level in some])) for fate in ("converged", "inverted")]
+                findings.append(Finding(f"{name}, {label}: converged", (shares[0],), "%", papers[name]))
+                findings.append(Finding(f"{name}, {label}: ends inverted", (shares[1],), "%"))
+    return findings
+
+
+def _curves(
+    request: StudyRequest, cells: list[tuple[str, float, float]], found: list[dict[str, Floats]]
+) -> dict[str, Floats]:
+    """Return the maps (values, values) by guard and fate, and y_icr_right over time from every start, one run each."""
+    size = len(request.values)
+    near = min(sorted(request.values), key=lambda value: abs(value - request.plan.icrs_m[1]))
+    curves = {"starts": np.array(request.values), "left_of_curves": np.array([near])}
+    for name in GUARDS:
+        places = [place for place, cell in enumerate(cells) if cell[0] == name]
+        for fate in ("converged", "inverted", "elsewhere"):
+            curves[f"{fate} {name}"] = np.array([found[place][fate].mean() for place in places]).reshape(size, size)
+        shown = [place for place in places if cells[place][2] == near]
+        curves[f"trace {name}"] = np.array([found[place]["trace"][0] for place in shown])
+    return curves

@@ -1,0 +1,131 @@
+"""What a study asks of its runs: errors, convergence times, consistency, blind driving. One row a run."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.kernels.arcs import drive
+from icrtool.records.tables import Bools, Floats
+from icrtool.simulation.study_runs import Chunk
+
+ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
+
+SETTLED_SHARE = 0.1
+SETTLED_M = 0.02
+"""An estimate has settled when it stays within a tenth of its way, or within 2 cm, of the truth."""
+
+TRACE_POINTS = 400
+
+BLIND_M = 10.0
+BLIND_STARTS = 40
+"""Starts of blind driving, evenly over a run."""
+
+
+def measure_errors(chunk: Chunk) -> dict[str, Floats]:
+    """Return, over the second half of every run, mean error and its rms, with the stated std, by ICR; and NIS."""
+    half = len(chunk.t_s) // 2
+    error = chunk.x[:, half:, 3:] - chunk.true_icrs_m[half:]
+    columns = {"inverted": inverted(chunk).astype(np.float64)}
+    for place, name in enumerate(ICR_NAMES):
+        columns[f"final_{name}_m"] = chunk.x[:, -1, 3 + place]
+        columns[f"std_{name}_m"] = chunk.std[:, -1, 3 + place]
+        columns[f"error_{name}_m"] = error[:, :, place].mean(axis=1)
+        columns[f"rms_{name}_m"] = np.sqrt((error[:, :, place] ** 2).mean(axis=1))
+    columns["nis_gnss"] = np.nanmean(chunk.gnss_nis, axis=1)
+    columns["nis_heading"] = np.nanmean(chunk.heading_nis, axis=1)
+    return columns
+
+
+def measure_times(chunk: Chunk, since_s: float = 0.0, until_s: float = np.inf) -> dict[str, Floats]:
+    """Return rise and settling times [s] of every ICR after `since_s`, NaN where they do not come before `until_s`."""
+    begin = max(int(np.searchsorted(chunk.t_s, since_s - 1e-9)) - 1, 0)
+    end = int(np.searchsorted(chunk.t_s, until_s - 1e-9))
+    t = chunk.t_s[begin:end] - max(since_s, chunk.t_s[0])
+    columns = {}
+    for place, name in enumerate(ICR_NAMES):
+        value, target = chunk.x[:, begin:end, 3 + place], float(chunk.true_icrs_m[end - 1, place])
+        columns[f"rise_{name}_s"] = rise_times(t, value, target)
+        columns[f"settle_{name}_s"] = settling_times(t, value, target)
+    columns["settle_s"] = np.max([columns[f"settle_{name}_s"] for name in ICR_NAMES], axis=0)
+    return columns
+
+
+def rise_times(t: Floats, value: Floats, target: float) -> Floats:
+    """Return the time (runs,) [s] from 10 % to 90 % of the way from the first value to the target; NaN: never there.
+
+    Parameters
+    ----------
+    t : (k,) [s]; value : (runs, k)
+
+    Notes
+    -----
+    Pentzer 2014, Section 5.2, as `icrtool.estimation.summary.converge` has it: the first passage of each mark. An
+    estimate that overshoots passes both at once.
+    """
+    way = target - value[:, :1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gone = (value - value[:, :1]) / way
+    times = np.full(len(value), np.nan)
+    for run, share in enumerate(gone):
+        first = int(np.argmax(share >= 0.1))
+        last = first + int(np.argmax(share[first:] >= 0.9))
+        if share[first] >= 0.1 and share[last] >= 0.9:
+            times[run] = t[last] - t[first]
+    return times
+
+
+def settling_times(t: Floats, value: Floats, target: float) -> Floats:
+    """Return the time (runs,) [s] from which on the value stays near the target (`SETTLED_SHARE`); NaN: it does not."""
+    near = np.maximum(SETTLED_SHARE * np.abs(target - value[:, :1]), SETTLED_M)
+    away: Bools = ~(np.abs(value - target) <= near)
+    last = away.shape[1] - 1 - np.argmax(away[:, ::-1], axis=1)
+    ever = away.any(axis=1)
+    ends_away = away[:, -1]
+    settled = np.where(ever, t[np.minimum(last + 1, len(t) - 1)], t[0])
+    return np.where(ends_away, np.nan, np.maximum(settled, 0.0))
+
+
+def inverted(chunk: Chunk) -> Bools:
+    """Say which runs (runs,) ended with the right ICR left of the left one, or with no number at all."""
+    return ~(chunk.x[:, -1, 3] > chunk.x[:, -1, 4])
+
+
+def trace(chunk: Chunk, until_s: float = np.inf) -> dict[str, Floats]:
+    """Return time and ICR estimates, (runs, about 400, 4) [s, m, m, m], from the start until `until_s`."""
+    last = int(np.searchsorted(chunk.t_s, until_s, side="right")) - 1
+    rows = np.unique(np.linspace(0, last, TRACE_POINTS).astype(np.int64))
+    times = np.broadcast_to(chunk.t_s[rows, None], (len(chunk.x), len(rows), 1))
+    return {"trace": np.concatenate([times, chunk.x[:, rows, 3:]], axis=2)}
+
+
+def blind_errors(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
+    """Return the 95th percentile (runs,) of how far wheels alone miss after 10 m [m]: with the final ICRs, and no slip.
+
+    Notes
+    -----
+    Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
+    """
+    runs = len(chunk.x)
+    columns = {"blind_icr_10m_p95_m": np.full(runs, np.nan), "blind_no_slip_10m_p95_m": np.full(runs, np.nan)}
+    for run in range(runs):
+        no_slip = np.array([track_width_m / 2, -track_width_m / 2, 0.0])
+        for name, icrs in zip(columns, (chunk.x[run, -1, 3:], no_slip), strict=True):
+            columns[name][run] = np.percentile(_blind_misses(chunk, run, icrs), 95)
+    return columns
+
+
+def _blind_misses(chunk: Chunk, run: int, icrs: Floats) -> Floats:
+    truth = chunk.truths[run]
+    north, east = truth.pose[:, 0], truth.pose[:, 1]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(north), np.diff(east)))])
+    ends = np.searchsorted(way, way + BLIND_M)
+    possible = np.flatnonzero(ends < len(way))
+    if not len(possible):
+        return np.full(1, np.nan)
+    misses = []
+    for first in possible[np.linspace(0, len(possible) - 1, BLIND_STARTS).astype(np.int64)]:
+        rows = slice(first, int(ends[first]) + 1)
+        t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
+        end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
+        misses.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
+    return np.array(misses)

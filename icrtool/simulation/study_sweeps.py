@@ -1,0 +1,220 @@
+"""Studies that vary one thing and look at the ICRs: paths, input noise and bias, input source, GNSS noise, rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.records.tables import Floats
+from icrtool.simulation.drives import Sensors, move, sense
+from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult, statistics
+from icrtool.simulation.study_measures import ICR_NAMES, blind_errors, measure_errors, measure_times, trace
+from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
+
+HIDDEN = frozenset({"trace", "zoom"})
+"""Columns for the picture, not for the table."""
+
+PATH_POINTS = 2000
+
+SHOWN_S = 20.0
+"""First seconds of a run that the picture of convergence shows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One setting: the series it belongs to, its value (a number or a name), and how it is run."""
+
+    series: str
+    value: float | str
+    scenario: Scenario
+
+
+def with_preset(config: Config, preset: str) -> Config:
+    """Return the configuration with a filter preset."""
+    return config.with_filter(preset=preset)
+
+
+def base_scenario(request: StudyRequest, preset: str) -> Scenario:
+    """Return the scenario of a request in a preset, before anything is varied."""
+    return Scenario(request.plan, request.sensors, with_preset(request.config, preset), request.vary_path)
+
+
+def run_levels(
+    levels: Sequence[Level], request: StudyRequest, measure: Measure, progress: Progress | None
+) -> tuple[dict[str, Column], tuple[dict[str, Any], ...], list[dict[str, Floats]]]:
+    """Run every level; return the CSV's columns, the levels' statistics, and all columns by level."""
+    found = run_scenarios([level.scenario for level in levels], request.runs, request.seed, measure, progress=progress)
+    values = [level.value for level in levels for _ in range(request.runs)]
+    names = any(isinstance(value, str) for value in values)
+    columns: dict[str, Column] = {
+        "series": [level.series for level in levels for _ in range(request.runs)],
+        "value": [str(value) for value in values] if names else np.array(values, np.float64),
+        "run": np.tile(np.arange(request.runs), len(levels)),
+    }
+    shown = [name for name in found[0] if name not in HIDDEN]
+    for name in shown:
+        columns[name] = np.concatenate([one[name] for one in found])
+    records = tuple(
+        {"series": level.series, "value": level.value, "metrics": {name: statistics(one[name]) for name in shown}}
+        for level, one in zip(levels, found, strict=True)
+    )
+    return columns, records, found
+
+
+def spread(values: Floats) -> tuple[float, float, float]:
+    """Return the 5th percentile, the median and the 95th percentile."""
+    told = statistics(values)
+    return told["p5"], told["p50"], told["p95"]
+
+
+def study_convergence(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Time the convergence from the preset's start, by kind of path (Figs. 4, 5)."""
+    path = cast(PathPlan, request.plan.path)
+    levels = []
+    for preset in request.presets:
+        base = base_scenario(request, preset)
+        levels += [
+            Level(preset, kind, replace(base, plan=replace(base.plan, path=replace(path, kind=kind))))
+            for kind in request.paths
+        ]
+    columns, records, found = run_levels(
+        levels,
+        request,
+        lambda chunk: {**measure_times(chunk), **measure_errors(chunk), **trace(chunk, SHOWN_S)},
+        progress,
+    )
+    findings = [
+        Finding(f"{level.value} ({level.series}): all three ICRs converged after", spread(one["settle_s"]), "s", said)
+        for level, one in zip(levels, found, strict=True)
+        for said in ["2.9-12.8 s, driven (Figs. 15, 17)" if level.value == "circle" else "5-15 s, driven"]
+    ]
+    shown = next((place for place, level in enumerate(levels) if level.value == path.kind), 0)
+    truth = move(levels[shown].scenario.plan, 0.0)
+    curves = {
+        "trace": found[shown]["trace"],
+        "path": truth.pose[:: 1 + len(truth.pose) // PATH_POINTS, :2],
+        "true_icrs": truth.icrs_m,
+        "shown": np.array([float(shown)]),
+    }
+    return StudyResult(request, columns, records, tuple(findings), curves)
+
+
+def study_input_noise(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Vary the noise of the track speeds (Fig. 12)."""
+    return _vary_sensors(request, "input_noise_mps", "Fig. 12's axis: -1 to 1 m", progress)
+
+
+def study_input_bias(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Vary the bias of both track speeds (Fig. 13)."""
+    return _vary_sensors(request, "input_bias_mps", "Fig. 13's axis: -0.1 to 0.02 m", progress)
+
+
+def _vary_sensors(
+    request: StudyRequest, name: Literal["input_noise_mps", "input_bias_mps"], paper: str, progress: Progress | None
+) -> StudyResult:
+    levels = []
+    for preset in request.presets:
+        base = base_scenario(request, preset)
+        levels += [
+            Level(preset, value, replace(base, sensors=_varied(base.sensors, name, value))) for value in request.values
+        ]
+    columns, records, found = run_levels(levels, request, measure_errors, progress)
+    findings = [
+        Finding(f"{preset}: error of {icr} at {max(request.values):g} m/s", spread(one[f"error_{icr}_m"]), "m", paper)
+        for preset in request.presets
+        for level, one in zip(levels, found, strict=True)
+        if level.series == preset and level.value == max(request.values)
+        for icr in ICR_NAMES
+    ]
+    return StudyResult(request, columns, records, tuple(findings))
+
+
+def _varied(sensors: Sensors, name: Literal["input_noise_mps", "input_bias_mps"], value: float) -> Sensors:
+    if name == "input_noise_mps":
+        return replace(sensors, input_noise_mps=value)
+    return replace(sensors, input_bias_mps=value)
+
+
+def study_input_source(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Compare encoders with commanded speeds (Fig. 11, Section 5.3), on the same drives.
+
+    The motors get commands at a low rate and follow with a lag; the bias is between command and track.
+    """
+    rate = cast(float, request.plan.command_rate_hz)
+    views: dict[str, Sensors] = {
+        "encoder": replace(request.sensors, wheels="encoder", input_bias_mps=0.0),
+        "commanded": replace(request.sensors, wheels="commanded", wheel_rate_hz=rate),
+    }
+    levels = [
+        Level(preset, name, replace(base_scenario(request, preset), sensors=sensors))
+        for preset in request.presets
+        for name, sensors in views.items()
+    ]
+    columns, records, found = run_levels(levels, request, measure_errors, progress)
+    findings = [
+        Finding(f"{level.series}: error of {icr}, {level.value} speeds", spread(one[f"error_{icr}_m"]), "m")
+        for level, one in zip(levels, found, strict=True)
+        for icr in ICR_NAMES
+    ]
+    truth = move(request.plan, 1.0)
+    curves: dict[str, Floats] = {"true_t": truth.t_s, "true_v": truth.v_left_mps}
+    for name, sensors in views.items():
+        seen = sense(truth, sensors, request.plan.duration_s, np.random.default_rng((request.seed, 0)))
+        curves |= {f"{name}_t": seen.wheel_t, f"{name}_v": seen.v_left_mps}
+    return StudyResult(request, columns, records, tuple(findings), curves)
+
+
+def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Vary the noise of the GNSS, and drive blind with what was learned (Figs. 35-37)."""
+    width = cast(float, request.config.robot.track_width_m)
+
+    def measure(chunk: Chunk) -> dict[str, Floats]:
+        return {**measure_errors(chunk), **measure_times(chunk), **blind_errors(chunk, width)}
+
+    levels = []
+    for preset in request.presets:
+        base = base_scenario(request, preset)
+        levels += [
+            Level(preset, value, replace(base, sensors=replace(base.sensors, gnss_std_m=value)))
+            for value in request.values
+        ]
+    columns, records, found = run_levels(levels, request, measure, progress)
+    findings = []
+    for level, one in zip(levels, found, strict=True):
+        if level.value in (min(request.values), 0.3):
+            label = f"{level.series}: GNSS {level.value:g} m"
+            paper = "within 3.8 m for 95 % (RTK, tracked, Fig. 29)" if level.value == min(request.values) else ""
+            findings.append(Finding(f"{label}: blind 10 m, p95", spread(one["blind_icr_10m_p95_m"]), "m", paper))
+            findings.append(Finding(f"{label}: rms error of y_icr_right", spread(one["rms_y_icr_right_m"]), "m"))
+    findings.append(Finding("no slip: blind 10 m, p95", spread(found[0]["blind_no_slip_10m_p95_m"]), "m"))
+    return StudyResult(request, columns, records, tuple(findings))
+
+
+def study_rate(request: StudyRequest, progress: Progress | None) -> StudyResult:
+    """Record the same drives at several rates, to see whether the ICRs are the same."""
+    levels = []
+    for preset in request.presets:
+        base = base_scenario(request, preset)
+        for rate in request.values:
+            gnss_rate = min(rate, base.sensors.gnss_rate_hz)
+            sensors = replace(base.sensors, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
+            levels.append(Level(preset, rate, replace(base, sensors=sensors)))
+    columns, records, found = run_levels(levels, request, measure_errors, progress)
+    findings = []
+    for preset in request.presets:
+        of_preset = [one for level, one in zip(levels, found, strict=True) if level.series == preset]
+        for icr in ICR_NAMES:
+            means = [float(one[f"error_{icr}_m"].mean()) for one in of_preset]
+            stated = [float(np.median(one[f"std_{icr}_m"])) for one in of_preset]
+            findings.append(
+                Finding(f"{preset}: {icr} differs between rates by at most", (max(means) - min(means),), "m")
+            )
+            findings.append(
+                Finding(f"{preset}: stated std of {icr}, least and greatest", (min(stated), max(stated)), "m")
+            )
+    return StudyResult(request, columns, records, tuple(findings))

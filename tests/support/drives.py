@@ -1,0 +1,59 @@
+"""Robot logs made in memory: a kinematic drive with known ICRs and the paper's sensors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from icrtool.kernels.ekf_plain import step_state
+from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+
+EPOCH_NS = 1_760_000_000_000_000_000
+ICRS = (0.5, -0.6, 0.1)
+
+
+def make_log(
+    seed: int = 0,
+    seconds: float = 60.0,
+    icrs: tuple[float, float, float] = ICRS,
+    *,
+    gnss_std: float = 0.01,
+    heading_offset_deg: float = 0.0,
+    lever: tuple[float, float] = (0.0, 0.0),
+    rate: float = 50.0,
+    faster: float = 1.0,
+    step_heading: float = 0.5,
+) -> RobotLog:
+    """Drive curves for some seconds, or (``step_heading=0``) by Euler steps; return what the sensors said."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    v_left, v_right = 0.5 + 0.25 * np.sin(0.5 * t), 0.5 + 0.25 * np.sin(0.31 * t + 1.0)
+    v_left, v_right = faster * v_left, faster * v_right
+    x = np.zeros((len(t), 6))
+    x[0] = [10.0, -5.0, 0.3, *icrs]
+    for k in range(len(t) - 1):
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1.0 / rate, step_heading)
+    stamps = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
+    every = max(int(rate / 20), 1)
+    psi = x[::every, 2]
+    north = x[::every, 0] + lever[0] * np.cos(psi) - lever[1] * np.sin(psi)
+    east = x[::every, 1] + lever[0] * np.sin(psi) + lever[1] * np.cos(psi)
+    m = len(psi)
+    variance = np.full(m, gnss_std**2)
+    heading = x[:, 2] + math.radians(heading_offset_deg) + rng.normal(0, math.radians(1), len(t))
+    stream = StreamChoice("wheels", "/x", "x/Y", len(t), rate, "header", 0.0, "made in a test")
+    return RobotLog(
+        "made",
+        WheelSamples(stamps, v_left, v_right),
+        PositionFixes(
+            stamps[::every], north + rng.normal(0, gnss_std, m), east + rng.normal(0, gnss_std, m),
+            variance, variance.copy(), np.zeros(m),
+        ),
+        HeadingSamples(stamps, np.angle(np.exp(1j * heading)), np.full(len(t), math.radians(1) ** 2)),
+        None,
+        (stream,),
+        (),
+        {},
+        (),
+    )  # fmt: skip

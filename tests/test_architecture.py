@@ -1,0 +1,213 @@
+"""The architecture as a test: which package may import which, no circles, no module too long (docs/architecture.md).
+
+A breach is reported as a sentence.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "icrtool"
+
+LAYERS = (
+    ("cli",),
+    ("output",),
+    ("dropout_analysis", "simulation"),
+    ("calibration",),
+    ("estimation",),
+    ("alignment", "logs"),
+    ("motion",),
+    ("kernels",),
+)
+"""The packages, from the top down: a package imports only from those below it."""
+
+SHARED = ("errors", "records", "config")
+"""Parts that every package but `kernels` may import; they import only one another."""
+
+RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
+VAGUE_NAMES = {"utils", "util", "tools", "common", "helpers", "misc"}
+LONGEST_MODULE_LINES = 420
+
+ONLY_IN = {"click": "cli", "matplotlib": "output"}
+KERNEL_LIBRARIES = {"numpy", "numba"}
+LATE_LIBRARIES = {"pandas"}
+"""Imported inside the function that needs them, so that ``--help`` is instant."""
+
+
+@dataclass(frozen=True)
+class Import:
+    module: str
+    line: int
+    at_start: bool
+    """Carried out when the module is imported: neither inside a function nor for types only."""
+
+
+def imports_of(source: str, package: str) -> list[Import]:
+    """List the imports of a module that lies in `package`, relative ones made absolute."""
+    found: list[Import] = []
+
+    def visit(node: ast.AST, *, at_start: bool) -> None:
+        if isinstance(node, ast.Import):
+            found.extend(Import(name.name, node.lineno, at_start) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            names = [f"{base}.{name.name}" for name in node.names] if base == "icrtool" else [base]
+            found.extend(Import(module, node.lineno, at_start) for module in names)
+        elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            for child in node.body:
+                visit(child, at_start=False)
+            for child in node.orelse:
+                visit(child, at_start=at_start)
+        else:
+            later = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            for child in ast.iter_child_nodes(node):
+                visit(child, at_start=at_start and not later)
+
+    visit(ast.parse(source), at_start=True)
+    return found
+
+
+def breaches(path: Path, source: str) -> list[str]:
+    """Return what is wrong with the module at `path` (relative to the package), one sentence each."""
+    package = path.parts[0].removesuffix(".py")
+    names = [part.removesuffix(".py").strip("_") for part in path.parts]
+    found = [f"icrtool/{path}: a module is named {name}" for name in names if name in VAGUE_NAMES]
+    if (lines := len(source.splitlines())) > LONGEST_MODULE_LINES:
+        found.append(
+            f"icrtool/{path}: {lines} lines are more than {LONGEST_MODULE_LINES}; split it where its subject splits"
+        )
+    for one in imports_of(source, ".".join(["icrtool", *path.parts[:-1]])):
+        found += [f"icrtool/{path}:{one.line}: {why}" for why in _objections(package, one)]
+    return found
+
+
+def _may_import(package: str, target: str) -> bool:
+    if package == target:
+        return True
+    if package in SHARED:
+        return target in SHARED or (package == "records" and target == "kernels")
+    if package == "kernels":
+        return False
+    return target in SHARED or RANK[target] > RANK[package]
+
+
+def _objections(package: str, one: Import) -> list[str]:
+    top, _, rest = one.module.partition(".")
+    found: list[str] = []
+    if top == "icrtool":
+        target = rest.partition(".")[0]
+        if package not in {*RANK, *SHARED} or target == "__version__":
+            return found  # the package's own __init__ and __main__ give the public API
+        if target not in {*RANK, *SHARED}:
+            if package != "cli":
+                found.append(f"{package} must not import {target or 'icrtool'} from the public API")
+        elif not _may_import(package, target):
+            found.append(f"{package} must not import {target}")
+        return found
+    if package == "kernels" and top not in KERNEL_LIBRARIES | sys.stdlib_module_names:
+        found.append(f"kernels must not import {top}")
+    if (home := ONLY_IN.get(top)) and package not in {home, "kernels"}:
+        found.append(f"{package} must not import {top}: only {home} does")
+    if top in LATE_LIBRARIES and package != "kernels" and one.at_start:
+        found.append(f"{package} must not import {top} at module level: import it in the function that needs it")
+    return found
+
+
+def circle_among(modules: dict[str, str]) -> list[str]:
+    """Return the modules of an import circle, imports for types only included; empty where there is none.
+
+    `modules` maps dotted module names to their sources.
+    """
+    graph: dict[str, set[str]] = {}
+    for name, source in modules.items():
+        package = name if f"{name}.__init__" in modules else name.rpartition(".")[0]
+        targets = {one.module for one in imports_of(source, package)}
+        # `from icrtool.a import b` may name the module b
+        targets |= {
+            f"{node.module}.{alias.name}"
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.ImportFrom) and node.module
+            for alias in node.names
+        }
+        graph[name] = {target for target in targets if target in modules and target != name}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as err:
+        return list(err.args[1])
+    return []
+
+
+MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_module_keeps_to_its_layer(module: Path) -> None:
+    assert not (found := breaches(module, (PACKAGE / module).read_text(encoding="utf-8"))), "\n".join(found)
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    sources = {
+        ".".join(("icrtool", *path.with_suffix("").parts)): (PACKAGE / path).read_text(encoding="utf-8")
+        for path in MODULES
+        if path.name not in {"__init__.py", "__main__.py"}
+    }
+    assert (circle := circle_among(sources)) == [], " imports ".join(circle)
+
+
+def test_a_circle_of_types_is_found() -> None:
+    types = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from icrtool.a.one import One"
+    assert circle_among({"icrtool.a.one": "from icrtool.a import two", "icrtool.a.two": types})
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "sentence"),
+    [
+        ("kernels/ekf.py", "import pandas as pd", "kernels must not import pandas"),
+        ("kernels/ekf.py", "from scipy.stats import chi2", "kernels must not import scipy"),
+        (
+            "kernels/ekf.py",
+            "def f():\n    from icrtool.records.tables import States",
+            "kernels must not import records",
+        ),
+        ("kernels/ekf.py", "if TYPE_CHECKING:\n    import pandas", "kernels must not import pandas"),
+        ("records/run.py", "from icrtool.estimation import fit", "records must not import estimation"),
+        ("config.py", "from icrtool import logs", "config must not import logs"),
+        ("logs/bag.py", "from ..estimation.fit import fit", "logs must not import estimation"),
+        ("logs/bag.py", "from icrtool import fit", "logs must not import fit from the public API"),
+        ("logs/bag.py", "import icrtool", "logs must not import icrtool from the public API"),
+        ("alignment/delays.py", "import icrtool.logs.bag", "alignment must not import logs"),
+        ("estimation/fit.py", "import matplotlib.pyplot as plt", "estimation must not import matplotlib: only output"),
+        ("estimation/fit.py", "import click", "estimation must not import click: only cli does"),
+        ("output/figures/icrs.py", "from icrtool.cli import fit", "output must not import cli"),
+        ("output/figures/icrs.py", "import click", "output must not import click: only cli does"),
+        ("cli/fit.py", "import matplotlib", "cli must not import matplotlib: only output does"),
+        ("output/run.py", "try:\n    import pandas\nexcept ImportError:\n    pass", "output must not import pandas at"),
+        ("logs/utils.py", "", "a module is named utils"),
+        ("helpers/bag.py", "", "a module is named helpers"),
+        ("logs/bag.py", "\n" * (LONGEST_MODULE_LINES + 1), "lines are more than"),
+    ],
+)
+def test_a_breach_is_reported_in_a_sentence(module: str, source: str, sentence: str) -> None:
+    assert any(sentence in found for found in breaches(Path(module), source))
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("kernels/ekf.py", "import math\nimport numba\nimport numpy as np\nfrom . import angles"),
+        ("records/run.py", "if TYPE_CHECKING:\n    import pandas as pd"),
+        ("logs/bag.py", "from icrtool.kernels.gather import gather\nfrom icrtool.errors import LogError"),
+        ("estimation/fit.py", "def frame():\n    import pandas as pd"),
+        ("output/run.py", "from matplotlib.figure import Figure\nfrom icrtool.estimation.fit import fit"),
+        ("cli/__init__.py", "import click\nfrom icrtool import __version__, read_log"),
+    ],
+)
+def test_what_is_allowed_is_not_reported(module: str, source: str) -> None:
+    assert breaches(Path(module), source) == []

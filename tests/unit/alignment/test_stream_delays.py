@@ -1,0 +1,152 @@
+"""Late headings and late fixes: found each alone, taken out when clear, and never where there is none."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.alignment import stream_delays
+from icrtool.alignment.stream_delays import heading_delay
+from icrtool.config import load_config
+from icrtool.estimation.fit import FilterRun, fit
+from icrtool.kernels.ekf_plain import step_state
+from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+
+START_NS = 1_760_000_000_000_000_000
+ICRS = (0.5, -0.6, 0.1)
+WIDTH = "robot.track_width_m=0.8"
+DELAY_TOLERANCE_S = 0.03
+ICR_TOLERANCE_M = 0.02
+
+
+def stop_and_go(seed: int = 1, *, heading_late_s: float = 0.0, fixes_late_s: float = 0.0) -> RobotLog:
+    """Drive curves with changing speed for three minutes at 50 Hz; fixes at 10 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 180.0, 0.02)
+    speed = 0.6 + 0.25 * np.sign(np.sin(0.8 * t)) * np.minimum(1.0, 3.0 * np.abs(np.sin(0.8 * t)))
+    turn = 0.3 * np.sin(0.45 * t) + 0.1 * np.sin(1.7 * t)
+    v_left, v_right = speed + turn / 2, speed - turn / 2
+    x = np.zeros((len(t), 6))
+    x[0] = [0.0, 0.0, 0.3, *ICRS]
+    for k in range(len(t) - 1):
+        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 0.02)
+    stamps = START_NS + np.round(t * 1e9).astype(np.int64)
+    fix = slice(0, None, 5)
+    count = len(t[fix])
+    place = x[fix, :2] + rng.normal(0, 0.01, (count, 2))
+    psi = x[:, 2] + rng.normal(0, np.radians(0.5), len(t))
+    known = np.full(count, 1e-4)
+    streams = tuple(
+        StreamChoice(role, topic, "x/Y", 1, 1.0, "header", 0.0, "")
+        for role, topic in (("wheels", "/wheels"), ("gnss", "/fix"), ("heading", "/imu"))
+    )
+    return RobotLog(
+        "late",
+        WheelSamples(stamps, v_left, v_right),
+        PositionFixes(stamps[fix] + round(fixes_late_s * 1e9), *place.T, known, known, np.zeros(count)),
+        HeadingSamples(
+            stamps + round(heading_late_s * 1e9), np.angle(np.exp(1j * psi)), np.full(len(t), np.radians(0.5) ** 2)
+        ),
+        Datum(40.8, -77.9, 350.0),
+        streams,
+        (),
+        {},
+        (),
+    )
+
+
+def icr_error(run: FilterRun) -> float:
+    final = run.summary["icr"]["final"]
+    found = [final[name] for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")]
+    return float(np.abs(np.array(found) - ICRS).max())
+
+
+def test_streams_on_time_are_left_alone() -> None:
+    run = fit(stop_and_go(), load_config(sets=[WIDTH]))
+    assert run.warnings == ()
+    assert run.summary["heading"]["delay_s"] == pytest.approx(0.0, abs=DELAY_TOLERANCE_S)
+    assert run.summary["gnss"]["delay_s"] == pytest.approx(0.0, abs=DELAY_TOLERANCE_S)
+    assert run.summary["heading"]["applied_delay_s"] == run.summary["filter"]["reference_delay_s"] == 0.0
+
+
+@pytest.mark.parametrize("delay", [0.12, 0.3, 0.9])
+@pytest.mark.parametrize("stream", ["heading", "fixes"])
+def test_a_late_stream_is_found_and_taken_out_alone(stream: str, delay: float) -> None:
+    late = {"heading_late_s": delay} if stream == "heading" else {"fixes_late_s": delay}
+    run = fit(stop_and_go(**late), load_config(sets=[WIDTH]))
+    heading, fixes = run.summary["heading"]["applied_delay_s"], run.summary["filter"]["reference_delay_s"]
+    found, other = (heading, fixes) if stream == "heading" else (fixes, heading)
+    assert found == pytest.approx(delay, abs=DELAY_TOLERANCE_S)
+    assert other == 0.0
+    assert any(f"the {stream} {'is' if stream == 'heading' else 'are'} {delay:.1f}"[:-1] in w for w in run.warnings)
+    # Left in, it moves x by speed times delay, 7 cm and more.
+    assert icr_error(run) < ICR_TOLERANCE_M
+
+
+def test_a_search_that_does_not_settle_finds_nothing() -> None:
+    """A robot that is parked and then drives a circle: the one change of speed says this, and then that."""
+    rng = np.random.default_rng(1)
+    design = np.column_stack([np.ones(400), rng.normal(0.0, 0.1, 400), np.ones(400)])
+
+    def explain(at: float) -> tuple[Floats, Floats, Callable[[Floats], float]]:
+        seen = design[:, 1] * (0.15 if at < 0.1 else -0.15) + rng.normal(0.0, 1e-4, 400)
+        return design, seen, lambda _: 1.0
+
+    assert np.isnan(stream_delays._search(explain).value_s)
+
+
+def test_configured_delays_are_used_as_they_are() -> None:
+    sets = [WIDTH, "frames.heading_delay_s=0.2", "frames.reference_delay_s=0.3"]
+    run = fit(stop_and_go(heading_late_s=0.2, fixes_late_s=0.3), load_config(sets=sets))
+    assert run.summary["heading"]["applied_delay_s"] == 0.2
+    assert run.summary["filter"]["reference_delay_s"] == 0.3
+    assert icr_error(run) < ICR_TOLERANCE_M
+    assert run.warnings == ()
+
+
+def test_preset_paper_and_one_topic_for_both_take_nothing_out() -> None:
+    log = stop_and_go(heading_late_s=0.3)
+    assert fit(log, load_config(sets=[WIDTH, "filter.preset=paper"])).log.heading is log.heading
+    together = replace(log, streams=tuple(replace(stream, topic="/pose") for stream in log.streams))
+    assert fit(together, load_config(sets=[WIDTH])).summary["heading"]["applied_delay_s"] == 0.0
+
+
+def test_a_constant_speed_tells_no_delay_of_the_fixes() -> None:
+    log = stop_and_go(fixes_late_s=0.3)
+    even = np.full(len(log.wheels.stamp_ns), 0.6)
+    turning = replace(log, wheels=replace(log.wheels, v_left_mps=even + 0.1, v_right_mps=even - 0.1))
+    x = np.zeros((len(even), 6))
+    x[0] = [0.0, 0.0, 0.3, *ICRS]
+    for k in range(len(even) - 1):
+        x[k + 1] = step_state(x[k], 0.7, 0.5, 0.02)
+    circle = replace(
+        turning,
+        gnss=replace(log.gnss, north_m=x[::5, 0], east_m=x[::5, 1]),
+        heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * x[:, 2]))),
+    )
+    summary = fit(circle, load_config(sets=[WIDTH])).summary
+    assert summary["gnss"]["delay_s"] is None
+    assert summary["heading"]["delay_s"] is None
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row: int) -> None:
+    log = stop_and_go(heading_late_s=0.3)
+    stray = [stream.stamp_ns.copy() for stream in (log.wheels, log.heading)]
+    for stamps in stray:
+        stamps[row] += -START_NS if row == 0 else START_NS
+    wheels, heading = replace(log.wheels, stamp_ns=stray[0]), replace(log.heading, stamp_ns=stray[1])
+    tracemalloc.start()
+    try:
+        found = heading_delay(replace(log, wheels=wheels, heading=heading))
+        most = tracemalloc.get_traced_memory()[1]
+    except MemoryError:
+        pytest.fail("an array over the time between first and last stamp")
+    finally:
+        tracemalloc.stop()
+    assert found.value_s == pytest.approx(0.3, abs=DELAY_TOLERANCE_S)
+    assert most < 50e6

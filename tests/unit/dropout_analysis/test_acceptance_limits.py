@@ -1,0 +1,147 @@
+"""Gates and budgets."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate, parse_gate
+from icrtool.dropout_analysis.trials import dropout
+from icrtool.errors import ConfigError
+from icrtool.estimation.fit import FilterRun
+from icrtool.records.dropout import DropoutReport
+
+METRICS = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}
+
+
+@pytest.fixture(scope="module")
+def report(run: FilterRun) -> DropoutReport:
+    return dropout(run, [1.0, 2.5, 10.0])
+
+
+@pytest.mark.parametrize("model", ["icr", "no_slip", "icr_final"])
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("relation", ["<=", "<", ">=", ">"])
+def test_a_gate_holds_its_number_against_its_bound(
+    report: DropoutReport, model: str, metric: str, relation: str
+) -> None:
+    result = report.result(model)
+    assert result is not None
+    value = float(getattr(result.summary, METRICS[metric])[1])
+    above, below = value + 0.25, value - 0.25
+    for bound in (above, below):
+        verdict = judge_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report)
+        assert verdict.value_m == value
+        assert verdict.passed == ((bound == above) == (relation[0] == "<"))
+        assert verdict.margin_m == pytest.approx(0.25 if verdict.passed else -0.25)
+
+
+@pytest.mark.parametrize(("relation", "passes"), [("<=", True), (">=", True), ("<", False), (">", False)])
+def test_a_number_on_its_bound_passes_only_where_equality_is_allowed(
+    report: DropoutReport, relation: str, passes: bool
+) -> None:
+    value = float(report.results[0].summary.p95[0])
+    verdict = judge_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report)
+    assert verdict.passed is passes
+    assert verdict.margin_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "horizon", "bound"),
+    [
+        ("icr.p95@10m <= 3.8", 10.0, 3.8),
+        ("  icr.p95@10 m<=3.8 m ", 10.0, 3.8),
+        ("icr.p95@2.5<=.5", 2.5, 0.5),
+        ("icr.p95@10m <= 1e-1", 10.0, 0.1),
+    ],
+)
+def test_gates_are_read_with_or_without_units_and_spaces(text: str, horizon: float, bound: float) -> None:
+    gate = parse_gate(text)
+    assert (gate.model, gate.metric, gate.horizon_m, gate.relation, gate.bound_m) == (
+        "icr",
+        "p95",
+        horizon,
+        "<=",
+        bound,
+    )
+    assert gate.text == " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "icr.p95", "icr.p90@10m <= 1", "p95@10m <= 1", "icr.p95@10m = 1", "icr.p95@10m <=", "icr.p95@10km <= 1",
+     "icr.p95@0m <= 1", "icr.p95@-5m <= 1", "icr.p95@10m <= nan", "icr.p95@10m <= 1 and more"],
+)  # fmt: skip
+def test_text_that_is_no_gate_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        parse_gate(text)
+    assert refusal.value.what == f"gate {text!r}"
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_model_or_horizon_is_an_error_that_names_what_there_is(report: DropoutReport) -> None:
+    with pytest.raises(ConfigError, match="no model calibrated; this run has icr, no_slip, icr_final"):
+        judge_gate(parse_gate("calibrated.p95@1m <= 1"), report)
+    with pytest.raises(ConfigError, match="no horizon of 7 m"):
+        judge_gate(parse_gate("icr.p95@7m <= 1"), report)
+
+
+def test_a_gate_without_trials_fails_and_says_so(run: FilterRun) -> None:
+    report = dropout(run, [900.0])
+    for relation in ("<=", ">="):
+        verdict = judge_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
+        assert not verdict.passed
+        assert math.isnan(verdict.value_m)
+        assert verdict.line() == f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log"
+
+
+def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
+    value = float(report.results[0].summary.p95[0])
+    line = judge_gate(parse_gate("icr.p95@1m <= 3"), report).line()
+    assert line == f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m"
+
+
+def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
+    """The report of one model with these p95 at 1, 2.5 and 10 m."""
+    result = report.results[0]
+    summary = result.summary._replace(p95=np.array(p95))
+    return DropoutReport(
+        name="x",
+        horizons_m=report.horizons_m,
+        results=(result._replace(summary=summary),),
+        counts=report.counts,
+        states=1,
+        standing=0,
+        seed=1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("budget", "p95", "distance", "beyond"),
+    [
+        (0.05, (0.1, 0.4, 2.0), 0.5, False),
+        (0.1, (0.1, 0.4, 2.0), 1.0, False),
+        (0.2, (0.1, 0.4, 2.0), 1.5, False),
+        (1.2, (0.1, 0.4, 2.0), 6.25, False),
+        (2.0, (0.1, 0.4, 2.0), 10.0, True),
+        (9.0, (0.1, 0.4, 2.0), 10.0, True),
+        (0.3, (0.1, 0.5, 0.2), 1.75, False),
+        (0.3, (0.1, 0.2, math.nan), 2.5, True),
+        (0.3, (math.nan, 0.6, 1.0), 1.25, False),
+    ],
+)
+def test_a_budget_is_interpolated_between_horizons_from_zero(
+    report: DropoutReport, budget: float, p95: tuple[float, ...], distance: float, beyond: bool
+) -> None:
+    (found,) = budget_distances(with_p95(report, *p95), budget)
+    assert found.distance_m == pytest.approx(distance)
+    assert (found.model, found.budget_m, found.beyond) == ("icr", budget, beyond)
+
+
+def test_a_budget_without_trials_is_left_out_and_no_length_is_refused(report: DropoutReport) -> None:
+    assert budget_distances(with_p95(report, math.nan, math.nan, math.nan), 1.0) == ()
+    for budget in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ConfigError, match="budget"):
+            budget_distances(report, budget)

@@ -1,0 +1,171 @@
+"""Outages: planned, forced on the filter, and those the log really had."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
+from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.errors import ConfigError, DataError
+from icrtool.estimation.filter_setup import WarmStart
+from icrtool.estimation.fit import STATE_COLUMNS, FilterRun, fit
+from icrtool.kernels.ekf_plain import step_state
+
+
+@pytest.fixture(scope="module")
+def clean(make_run: Callable[..., FilterRun]) -> FilterRun:
+    return make_run(troubles=False)
+
+
+def seconds(run: FilterRun, spans: tuple[tuple[int, int], ...]) -> list[tuple[float, float]]:
+    origin = int(run.table.stamp_ns[0])
+    return [((begin - origin) / 1e9, (end - origin) / 1e9) for begin, end in spans]
+
+
+def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: FilterRun) -> None:
+    last = clean.table.t_s[-1]
+    for length in (1.0, 4.0, 10.0):
+        spans = seconds(clean, plan_outages(clean, length))
+        assert 1 <= len(spans) <= 10
+        assert len(spans) * length <= last / 2
+        assert spans[0][0] > 0
+        assert spans[-1][1] <= last
+        assert all(end - begin == pytest.approx(length) for begin, end in spans)
+        pauses = [later[0] - earlier[1] for earlier, later in pairwise(spans)]
+        assert all(pause > 0 for pause in pauses)
+        assert pauses == pytest.approx(pauses[:1] * len(pauses), abs=0.03)
+
+
+def test_no_spaced_outage_begins_where_the_robot_stands(clean: FilterRun) -> None:
+    t, way = clean.table.t_s, clean.table.distance_m
+    stood = np.interp(np.where(t < 20, t, np.maximum(t - 20, 20)), t, way)
+    parked = replace(clean, table=replace(clean.table, distance_m=stood))
+    spans = seconds(parked, plan_outages(parked, 2.0))
+    assert len(spans) > 3
+    for begin, end in spans:
+        assert not 20 < begin < 39.9
+        assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.1
+
+
+def test_no_outage_reaches_into_one_of_the_logs_own(run: FilterRun) -> None:
+    origin = int(run.table.stamp_ns[0])
+    ((own_begin, own_end),) = [((a - origin) / 1e9, (b - origin) / 1e9) for a, b in run.outages_ns.tolist()]
+    spans = seconds(run, plan_outages(run, 2.0))
+    assert len(spans) > 3
+    assert all(end <= own_begin + 0.03 or begin >= own_end - 0.03 for begin, end in spans)
+    with pytest.raises(ConfigError, match="of the log's own"):
+        plan_outages(run, 2.0, (own_begin - 1.0,))
+
+
+def test_an_outage_that_takes_nothing_away_is_refused(clean: FilterRun) -> None:
+    for length, begin in ((5.0, 0.0), (1e-6, 20.0)):
+        with pytest.raises(ConfigError, match="fewer than two states"):
+            force_outages(clean, plan_outages(clean, length, (begin,)))
+
+
+def test_outages_do_not_change_how_headings_at_odd_times_are_weighed(make_run: Callable[..., FilterRun]) -> None:
+    log = make_run(troubles=False).log
+    # A little more than half of the headings come at a third of the rate: without some of them the median interval
+    # would be that of the others.
+    rows = np.arange(len(log.heading.stamp_ns))
+    kept = (rows < len(rows) * 0.24) | (rows % 3 == 0)
+    columns = {field.name: getattr(log.heading, field.name) for field in fields(log.heading)}
+    thinned = {name: column[kept] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    heading = replace(log.heading, **thinned)
+    run = fit(replace(log, heading=heading))
+    assert force_outages(run, plan_outages(run, 15.0, (40.0,)))
+
+
+def test_outages_stand_where_they_are_asked_for(clean: FilterRun) -> None:
+    assert seconds(clean, plan_outages(clean, 5.0, (30.0, 12.0))) == [(12.0, 17.0), (30.0, 35.0)]
+
+
+@pytest.mark.parametrize(
+    ("length", "at", "why"),
+    [
+        (0.0, (), "no duration"),
+        (-1.0, (3.0,), "no duration"),
+        (100.0, (), "too long"),
+        (5.0, (58.0,), "do not fit"),
+        (5.0, (-1.0,), "do not fit"),
+        (5.0, (10.0, 14.0), "reach into"),
+        (5.0, (10.0, 15.0), "reach into"),
+    ],
+)
+def test_outages_that_do_not_fit_are_refused(clean: FilterRun, length: float, at: tuple[float, ...], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        plan_outages(clean, length, at)
+
+
+def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: FilterRun) -> None:
+    (outage,) = force_outages(clean, plan_outages(clean, 8.0, (20.0,)))
+    table = clean.table
+    first, last = np.searchsorted(table.t_s, [20.0, 28.0])
+    # The state at the begin's own stamp has lost its fix and its heading already: the last one with them is before.
+    before = int(first) - 1
+    x = np.array([getattr(table, column)[before] for column in STATE_COLUMNS])
+    path = []
+    for k in range(before, last - 1):
+        x = step_state(x, table.v_left_mps[k], table.v_right_mps[k], table.t_s[k + 1] - table.t_s[k], 0.5)
+        path.append(x[:2])
+    north, east = np.array(path).T
+    np.testing.assert_allclose(outage.north_m, north, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(outage.east_m, east, rtol=0, atol=1e-9)
+    away = np.hypot(north - table.north_m[first:last], east - table.east_m[first:last])
+    assert outage.end_error_m == pytest.approx(away[-1], abs=1e-9)
+    assert outage.max_error_m == pytest.approx(away.max(), abs=1e-9)
+    assert (outage.kind, outage.begin_s, outage.end_s) == ("forced", 20.0, 28.0)
+    assert outage.distance_m == pytest.approx(table.distance_m[last - 1] - table.distance_m[first])
+
+
+def test_the_filter_learns_on_after_a_forced_outage(clean: FilterRun) -> None:
+    alone = force_outages(clean, plan_outages(clean, 5.0, (40.0,)))[0]
+    after_another = force_outages(clean, plan_outages(clean, 5.0, (20.0, 40.0)))[1]
+    assert after_another.end_error_m == pytest.approx(alone.end_error_m, abs=0.05)
+
+
+def test_an_outage_is_never_better_than_none_and_none_costs_nothing(clean: FilterRun) -> None:
+    short, long = (force_outages(clean, plan_outages(clean, length, (20.0,)))[0] for length in (0.1, 15.0))
+    assert 0 <= short.max_error_m < 0.03 < long.max_error_m
+    for outage in (short, long):
+        assert outage.end_error_m <= outage.max_error_m
+
+
+def test_a_warm_started_run_is_made_again_from_its_own_start(clean: FilterRun) -> None:
+    warm = fit(clean.log, clean.config, warm_start=WarmStart(np.array([0.9, -0.4, 0.2]), 1e-4 * np.eye(3)))
+    (cold_outage,), (outage,) = (force_outages(run, plan_outages(run, 5.0, (2.0,))) for run in (clean, warm))
+    assert outage.end_error_m != pytest.approx(cold_outage.end_error_m, rel=0.01)
+    with pytest.raises(DataError, match="cannot be made again"):
+        force_outages(replace(warm, warm_start=None), plan_outages(warm, 5.0, (20.0,)))
+
+
+def test_a_run_with_terrain_changes_is_made_again_with_them(clean: FilterRun) -> None:
+    changing = fit(clean.log, clean.config, changes_s=(15.0,))
+    assert len(force_outages(changing, plan_outages(changing, 5.0, (20.0,)))) == 1
+
+
+def test_a_real_outage_is_judged_at_reacquisition(run: FilterRun) -> None:
+    (outage,), table = real_outages(run), run.table
+    (begin, end), origin = run.outages_ns[0], table.stamp_ns[0]
+    assert (outage.kind, outage.begin_s, outage.end_s) == ("real", (begin - origin) / 1e9, (end - origin) / 1e9)
+    first, last = np.searchsorted(table.stamp_ns, [begin, end])
+    assert outage.distance_m == pytest.approx(table.distance_m[last] - table.distance_m[first])
+    miss = np.hypot(outage.north_m[-1] - table.north_m[last], outage.east_m[-1] - table.east_m[last])
+    assert outage.end_error_m == outage.max_error_m == pytest.approx(miss)
+    assert 0 < miss < 1.0
+    assert len(outage.north_m) == last - first + 1
+
+
+def test_a_real_outage_that_never_ends_or_spans_a_wheel_gap_has_no_miss(run: FilterRun) -> None:
+    (begin, end), last = run.outages_ns[0], int(run.table.stamp_ns[-1])
+    endless = replace(run, outages_ns=np.array([[begin, last + 1]]))
+    assert real_outages(endless) == ()
+    gap = int(run.table.stamp_ns[np.flatnonzero(run.in_gap)[0]])
+    across = replace(run, outages_ns=np.array([[gap - 10**9, gap + 10**9]]))
+    assert real_outages(across) == ()
+    assert end > begin

@@ -1,0 +1,51 @@
+"""The fast analysis against direct integration on logs that nobody here tuned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import icrtool
+from icrtool.dropout_analysis.trials import dropout, models_of
+from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, trial_ends
+from icrtool.records.run import drive_of
+
+LOGS = {
+    "real/warthog_grass.bag": "warthog",
+    "real/warthog_asphalt": "warthog",
+    "real/husky_parking_lot.bag": "husky-a200",
+    "real/husky_wet_grass": "husky-a200",
+    "simulated/tracked_curved.bag": "pentzer-tracked",
+    "simulated/tracked_trouble": "pentzer-tracked",
+    "simulated/wheeled_circle": "segway-rmp400",
+    "simulated/wheeled_lawnmower": "segway-rmp400",
+}
+EQUAL_M = 1e-9
+"""What the fast algorithm promises."""
+
+MOST_STEPS = 6e7
+"""Steps of direct integration a model and log: above, every so many-th start is tried."""
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_every_error_equals_brute_force(shared_logs: Path, name: str) -> None:
+    config = icrtool.load_config(robot=LOGS[name])
+    run = icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
+    fast: dict[str, list[np.ndarray]] = {}
+    report = dropout(run, sink=lambda model, _, errors: fast.setdefault(model, []).append(errors.copy()))
+    drive = drive_of(run)
+    ends = np.array(trial_ends(drive, report.horizons_m), order="F")
+    furthest = ends.max(axis=1)
+    steps = float((furthest - np.arange(len(ends)))[furthest >= 0].sum())
+    stride = max(1, int(np.ceil(steps / MOST_STEPS)))
+    left_out = np.arange(len(ends)) % stride > 0
+    ends[left_out] = SHORT
+    assert (ends >= 0).any()
+    for model in models_of(run):
+        errors = np.concatenate(fast[model.name], axis=1)
+        errors[left_out] = np.nan
+        np.testing.assert_allclose(
+            errors, open_loop_errors_direct(drive, model.icrs, ends), rtol=0, atol=EQUAL_M, err_msg=model.name
+        )

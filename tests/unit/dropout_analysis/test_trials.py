@@ -1,0 +1,228 @@
+"""The dropout analysis: its trials, its counts, and what may not change it."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import icrtool
+from icrtool.dropout_analysis import trials as module
+from icrtool.dropout_analysis.trials import Model, configured_horizons_m, dropout, models_of
+from icrtool.errors import ConfigError, DataError
+from icrtool.estimation.fit import FilterRun
+from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
+from icrtool.kernels.trials import FrozenIcrs
+from icrtool.records.run import drive_of
+
+EQUAL_M = 1e-9
+"""What the fast algorithm promises against direct integration."""
+
+HORIZONS_M = (0.5, 1.0, 3.0, 10.0)
+
+
+def gathered(run, horizons_m=HORIZONS_M, **options):
+    """All single errors by model and horizon."""
+    errors: dict[tuple[str, float], np.ndarray] = {}
+
+    def sink(model, horizons, table):
+        errors.update({(model, float(h)): table[:, i].copy() for i, h in enumerate(horizons)})
+
+    return dropout(run, horizons_m, sink=sink, **options), errors
+
+
+def changed(run: FilterRun, **columns) -> SimpleNamespace:
+    return SimpleNamespace(
+        name=run.name,
+        table=replace(run.table, **columns),
+        in_gap=run.in_gap,
+        outages_ns=run.outages_ns,
+        track_width_m=run.track_width_m,
+        summary=run.summary,
+    )
+
+
+def test_every_single_error_equals_brute_force_for_all_models(run: FilterRun) -> None:
+    _, errors = gathered(run)
+    drive, horizons = drive_of(run), np.array(HORIZONS_M)
+    ends = trial_ends(drive, horizons)
+    assert [model.name for model in models_of(run)] == ["icr", "no_slip", "icr_final"]
+    for model in models_of(run):
+        expected = open_loop_errors_direct(drive, model.icrs, ends)
+        for h, horizon in enumerate(HORIZONS_M):
+            np.testing.assert_allclose(errors[model.name, horizon], expected[:, h], rtol=0, atol=EQUAL_M)
+
+
+def test_the_summary_is_that_of_the_single_errors(run: FilterRun) -> None:
+    report, errors = gathered(run)
+    frame = report.summary.set_index(["model", "horizon_m"])
+    for key, error in errors.items():
+        tried, row = error[~np.isnan(error)], frame.loc[key]
+        assert row.trials == len(tried)
+        for column, value in (
+            ("expected_error_m", tried.mean()),
+            ("p50_m", np.percentile(tried, 50)),
+            ("p95_m", np.percentile(tried, 95)),
+            ("max_m", tried.max()),
+            ("p95_pct", 100 * np.percentile(tried, 95) / key[1]),
+            ("expected_pct", 100 * tried.mean() / key[1]),
+        ):
+            assert row[column] == pytest.approx(value, rel=1e-12)
+
+
+def test_the_contracts_columns_come_first(run: FilterRun) -> None:
+    assert list(icrtool.dropout(run, [1.0]).summary.columns)[:9] == [
+        "model",
+        "horizon_m",
+        "trials",
+        "expected_error_m",
+        "p50_m",
+        "p95_m",
+        "max_m",
+        "expected_pct",
+        "p95_pct",
+    ]
+
+
+def test_starts_that_are_no_trial_are_counted_by_kind(run: FilterRun) -> None:
+    report = dropout(run, HORIZONS_M)
+    table, counts = run.table, report.counts
+    assert report.states == len(table)
+    distance, stamps = table.distance_m, table.stamp_ns
+    (outage,) = run.outages_ns
+    for h, horizon in enumerate(HORIZONS_M):
+        kinds = {"trials": 0, "short": 0, "gap": 0, "outage": 0}
+        for k in range(len(table)):
+            far = np.flatnonzero(distance[k:] - distance[k] >= horizon)
+            if not len(far):
+                kinds["short"] += 1
+            elif run.in_gap[k : k + far[0]].any():
+                kinds["gap"] += 1
+            elif outage[0] < stamps[k + far[0]] < outage[1]:
+                kinds["outage"] += 1
+            else:
+                kinds["trials"] += 1
+        assert {kind: int(getattr(counts, kind)[h]) for kind in kinds} == kinds
+        assert all(kinds.values())
+        assert sum(kinds.values()) == len(table)
+
+
+def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., FilterRun]) -> None:
+    report = dropout(make_run(track_width_m=None, duration_s=20.0), [1.0])
+    assert [result.name for result in report.results] == ["icr", "icr_final"]
+    assert report.result("no_slip") is None
+
+
+def test_a_model_is_data(run: FilterRun) -> None:
+    models = [Model("mine", "my own", FrozenIcrs.constant(0.3, -0.3, 0.0))]
+    mine, known = dropout(run, [5.0], models=models).result("mine"), dropout(run, [5.0]).result("no_slip")
+    assert mine is not None
+    assert known is not None
+    np.testing.assert_allclose(np.array(mine.summary), np.array(known.summary), rtol=1e-12)
+    assert dropout(run, [5.0], models=models).counts.trials == known.summary.trials
+
+
+def test_rotating_and_shifting_the_world_changes_no_error(run: FilterRun) -> None:
+    _, before = gathered(run)
+    angle, table = 2.0, run.table
+    cos, sin = math.cos(angle), math.sin(angle)
+    north, east = table.north_m * cos - table.east_m * sin, table.north_m * sin + table.east_m * cos
+    moved = changed(run, north_m=north + 400.0, east_m=east - 900.0, heading_rad=table.heading_rad + angle)
+    _, after = gathered(moved)
+    for key, error in before.items():
+        np.testing.assert_allclose(after[key], error, rtol=0, atol=EQUAL_M)
+
+
+def test_neither_order_nor_company_of_horizons_matters(run: FilterRun) -> None:
+    report, errors = gathered(run)
+    reverse, others = gathered(run, [*HORIZONS_M[::-1], 1.0, 7.0])
+    assert reverse.horizons_m.tolist() == [0.5, 1.0, 3.0, 7.0, 10.0]
+    for key, error in errors.items():
+        np.testing.assert_allclose(others[key], error, rtol=0, atol=EQUAL_M)
+    alone, together = dropout(run, [3.0]).results[0].intervals, report.results[0].intervals
+    assert alone.p95_low[0] == pytest.approx(together.p95_low[2], abs=EQUAL_M)
+
+
+def test_small_tables_and_small_ranges_give_the_same(run: FilterRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    report = dropout(run, HORIZONS_M)
+    monkeypatch.setattr(module, "LARGEST_TABLE_BYTES", 1)
+    monkeypatch.setattr(module, "STARTS_A_CALL", 333)
+    pieces = dropout(run, HORIZONS_M)
+    np.testing.assert_array_equal(np.array(pieces.counts), np.array(report.counts))
+    for ours, theirs in zip(pieces.results, report.results, strict=True):
+        np.testing.assert_allclose(np.array(ours.summary), np.array(theirs.summary), rtol=0, atol=EQUAL_M)
+        np.testing.assert_allclose(np.array(ours.intervals), np.array(theirs.intervals), rtol=0, atol=EQUAL_M)
+
+
+def test_intervals_hold_the_estimate_and_depend_on_the_seed_alone(run: FilterRun) -> None:
+    reports = [dropout(run, [2.0], seed=seed) for seed in (1, 1, 2)]
+    spans = [(r.results[0].intervals.p95_low[0], r.results[0].intervals.p95_high[0]) for r in reports]
+    assert spans[0] == spans[1] != spans[2]
+    assert spans[0][0] <= reports[0].results[0].summary.p95[0] <= spans[0][1]
+    assert [r.seed for r in reports] == [1, 1, 2]
+
+
+def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: FilterRun) -> None:
+    for result in dropout(run, HORIZONS_M).results:
+        for h, bins in enumerate(result.histograms):
+            assert bins.percent.sum() == pytest.approx(100.0)
+            assert bins.right[-1] >= result.summary.largest[h]
+            assert len(bins.left) <= 600
+            assert np.count_nonzero(bins.left < result.summary.p95[h]) >= 6
+
+
+def test_horizons_default_to_the_configured_ones(run: FilterRun) -> None:
+    assert configured_horizons_m(run) == tuple(float(d) for d in range(1, 21))
+    summary = {**run.summary, "config": {**run.summary["config"], "dropout": {"horizons_m": [4.0, 2.0]}}}
+    stub = changed(run)
+    stub.summary = summary
+    assert dropout(stub).horizons_m.tolist() == [2.0, 4.0]
+
+
+@pytest.mark.parametrize("horizons", [[], [0.0], [-1.0], [math.inf], [math.nan]])
+def test_horizons_that_are_no_distances_are_refused(run: FilterRun, horizons: list[float]) -> None:
+    with pytest.raises(ConfigError, match="horizons"):
+        dropout(run, horizons)
+
+
+def test_a_run_of_one_state_is_refused(run: FilterRun) -> None:
+    stub = changed(run, **{name: column[:1] for name, column in run.table.columns().items()})
+    with pytest.raises(DataError, match="1 states"):
+        dropout(stub, [1.0])
+
+
+def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..., FilterRun]) -> None:
+    report = dropout(make_run(duration_s=12.0, troubles=False), [500.0])
+    assert report.counts.trials.tolist() == [0]
+    assert np.isnan(report.results[0].summary.p95).all()
+    assert np.isnan(report.summary.p95_pct).all()
+
+
+def test_standing_states_are_counted(make_run: Callable[..., FilterRun]) -> None:
+    assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
+    parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False)
+    assert dropout(parked, [1.0]).standing == len(parked.table) - 1
+
+
+def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
+    code = (
+        "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
+        "from icrtool.kernels import error_statistics, open_loop, open_loop_fast as fast, window_errors\n"
+        "kernels = [open_loop.find_trial_ends, open_loop.integrate_trials, open_loop.integrate_path, fast.last_end,\n"
+        "    fast.plan_block, fast.solve_block, error_statistics.resample_blocks, window_errors.march,\n"
+        "    window_errors.fill_misses]\n"
+        "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_two_models_of_one_name_are_refused(run: FilterRun) -> None:
+    model = models_of(run)[0]
+    with pytest.raises(ValueError, match="same name"):
+        dropout(run, [1.0], models=[model, model])

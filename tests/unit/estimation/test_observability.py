@@ -1,0 +1,51 @@
+"""Excitation: the verdict follows what was driven, and agrees with the scatter of fits."""
+
+from __future__ import annotations
+
+import pytest
+
+from icrtool.estimation.fit import fit
+from icrtool.estimation.observability import judge_excitation
+from support.exact_drives import CONFIG, simulate
+
+
+@pytest.fixture(scope="module")
+def varied():
+    return judge_excitation(
+        fit(simulate(0, seconds=120.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG)
+    )
+
+
+def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
+    assert varied.sufficient
+    assert varied.sentences == ()
+    assert varied.turned_right_rad > 3.0
+    assert varied.turned_left_rad > 3.0
+    assert all(0.0 < std < 0.03 for std in varied.std_m.values())
+
+
+def test_a_straight_drive_shows_none_and_asks_for_spins() -> None:
+    found = judge_excitation(fit(simulate(0, path="straight", seconds=60.0, offset_deg=0.0), CONFIG))
+    assert set(found.verdicts.values()) == {"not shown"}
+    assert "add two spins each way" in found.sentences[-1]
+
+
+def test_a_circle_asks_for_the_other_way() -> None:
+    found = judge_excitation(fit(simulate(0, path="circle", seconds=60.0, offset_deg=0.0), CONFIG))
+    assert not found.sufficient
+    assert "to the left" in found.sentences[-1]
+
+
+def test_more_way_tells_more(varied) -> None:
+    longer = judge_excitation(
+        fit(simulate(0, seconds=240.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG)
+    )
+    assert all(longer.std_m[name] < std for name, std in varied.std_m.items())
+
+
+def test_the_summary_is_plain_data(varied) -> None:
+    import json
+
+    document = varied.summary()
+    assert json.loads(json.dumps(document)) == document
+    assert set(document["verdict"]) == {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}

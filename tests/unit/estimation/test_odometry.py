@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.estimation.fit import FilterRun
+from icrtool.estimation.odometry import icr_odometry, no_slip_odometry
+
+ROUNDING_M = 1e-9
+
+
+def plain_path(run: FilterRun, y_right: float, y_left: float, x: float) -> np.ndarray:
+    """Eqs. 8-12, Euler, state by state; over a gap the filter's own motion, seen from the odometry's heading."""
+    table = run.table
+    place, psi = np.array([table.north_m[0], table.east_m[0]]), table.heading_rad[0]
+    path = [place]
+    for k in range(len(table) - 1):
+        if run.in_gap[k]:
+            move = np.array([table.north_m[k + 1] - table.north_m[k], table.east_m[k + 1] - table.east_m[k]])
+            turned = psi - table.heading_rad[k]
+            psi += table.heading_rad[k + 1] - table.heading_rad[k]
+        else:
+            dt, separation = table.t_s[k + 1] - table.t_s[k], abs(y_right - y_left)
+            omega = (table.v_left_mps[k] - table.v_right_mps[k]) / separation
+            ahead = (table.v_left_mps[k] * y_right - table.v_right_mps[k] * y_left) / separation
+            move, turned = dt * np.array([ahead, -omega * x]), psi
+            psi += dt * omega
+        c, s = np.cos(turned), np.sin(turned)
+        place = place + np.array([[c, -s], [s, c]]) @ move
+        path.append(place)
+    return np.array(path).T
+
+
+@pytest.mark.parametrize("gaps", [(), (700,), (0, 700, 701, 1500), (2000,)])
+def test_odometry_is_the_plain_integration_gaps_included(run: FilterRun, gaps: tuple[int, ...]) -> None:
+    in_gap = np.zeros(len(run.table), np.bool_)
+    in_gap[list(gaps)] = True
+    gappy = replace(run, in_gap=in_gap)
+    table = run.table
+    expected = plain_path(gappy, table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
+    found = icr_odometry(gappy)
+    assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
+    assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
+    end = np.hypot(expected[0, -1] - table.north_m[-1], expected[1, -1] - table.east_m[-1])
+    assert abs(found.end_error_m - end) < ROUNDING_M
+
+
+def test_no_slip_drives_with_half_the_width_on_either_side(run: FilterRun) -> None:
+    expected = plain_path(run, 0.3, -0.3, 0.0)
+    found = no_slip_odometry(run)
+    assert found is not None
+    assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
+    assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
+
+
+def test_learned_icrs_lead_closer_than_no_slip(run: FilterRun) -> None:
+    no_slip = no_slip_odometry(run)
+    assert no_slip is not None
+    assert icr_odometry(run).end_error_m < 0.5 * no_slip.end_error_m
+
+
+def test_without_width_there_is_no_no_slip_path(make_run: Callable[..., FilterRun]) -> None:
+    assert no_slip_odometry(make_run(track_width_m=None, duration_s=20.0)) is None

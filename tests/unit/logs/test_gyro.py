@@ -1,0 +1,52 @@
+"""The gyro of a log: which one, and which way round."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.gyro import find_gyro
+
+COUNT = 60
+TIMES = 1_760_000_000_000_000_000 + 10_000_000 * np.arange(COUNT)
+RATE = 0.3 * np.sin(np.linspace(0.0, 6.0, COUNT))
+
+
+def imu(topic: str, rate: Any = RATE, frame: str = "imu_link", count: int = COUNT) -> TopicTable:
+    columns = {"angular_velocity.z": np.asarray(rate)[:count], "header.frame_id": np.zeros(count, np.int64)}
+    return TopicTable(topic, "sensor_msgs/Imu", TIMES[:count], columns, {"header.frame_id": [frame]}, 0, "the log")
+
+
+@pytest.mark.parametrize(("frame", "sign"), [("imu_link", -1.0), ("imu_link_ned", 1.0)])
+def test_rates_are_clockwise_in_either_convention(frame: str, sign: float) -> None:
+    found = find_gyro([imu("/imu/data", frame=frame)], "/joint_states", "/imu/data", "log")
+    assert found is not None
+    assert found.rate_radps == pytest.approx(sign * RATE)
+    assert np.array_equal(found.stamp_ns, TIMES)
+
+
+def test_the_headings_own_unit_comes_first_then_the_wheels_namespace_then_the_one_with_more_samples() -> None:
+    heading, kin = imu("/x/ahrs", count=20), imu("/bot/imu", count=30)
+    long, short = imu("/a/imu"), imu("/b/imu", count=40)
+
+    def chosen(*tables: TopicTable) -> str:
+        found = find_gyro(tables, "/bot/joints", "/x/ahrs", "log")
+        return found.topic if found is not None else ""
+
+    assert chosen(long, kin, heading) == "/x/ahrs"
+    assert chosen(long, kin) == "/bot/imu"
+    assert chosen(short, long) == "/a/imu"
+
+
+def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() -> None:
+    assert find_gyro([imu("/imu", np.zeros(COUNT)), imu("/b", np.full(COUNT, np.nan))], "/w", "/h", "log") is None
+    spoilt = np.where(np.arange(2 * COUNT) == 7, 1e6, np.tile(RATE, 2))
+    times = TIMES[0] + 10_000_000 * np.arange(2 * COUNT)
+    tables = [TopicTable("/imu", "sensor_msgs/Imu", times, {"angular_velocity.z": spoilt}, {}, 0, "the log")]
+    found = find_gyro(tables, "/w", "/h", "log")
+    assert found is not None
+    assert len(found.rate_radps) == 2 * COUNT - 1
+    assert np.abs(found.rate_radps).max() < 1.0

@@ -1,0 +1,99 @@
+"""The antenna's place from /tf_static, written by another library."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from icrtool.logs import survey_log
+from icrtool.logs.streams.static_transforms import antenna_place
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+HALF = np.sqrt(0.5)
+
+
+def write(
+    path: Path, transforms: list[tuple[str, str, tuple[float, ...], tuple[float, ...]]], frame: str = "gps"
+) -> Path:
+    types = STORE.types
+    time = types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    stamped = [
+        types["geometry_msgs/msg/TransformStamped"](
+            header=types["std_msgs/msg/Header"](stamp=time, frame_id=parent),
+            child_frame_id=child,
+            transform=types["geometry_msgs/msg/Transform"](translation=vector(*t), rotation=quaternion(*q)),
+        )
+        for parent, child, t, q in transforms
+    ]
+    fix = types["sensor_msgs/msg/NavSatFix"](
+        header=types["std_msgs/msg/Header"](stamp=time, frame_id=frame),
+        status=types["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+        latitude=40.0, longitude=-77.0, altitude=300.0,
+        position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, name, message in (
+            ("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](transforms=stamped)),
+            ("/gps/fix", "sensor_msgs/msg/NavSatFix", fix),
+        ):
+            connection = writer.add_connection(topic, name, typestore=STORE)
+            writer.write(connection, 10**9, STORE.serialize_cdr(message, name))
+    return path
+
+
+def place(path: Path) -> tuple[float, float] | None:
+    return antenna_place(survey_log(path).tables, "/gps/fix")
+
+
+def test_a_chain_of_turned_frames_is_followed_from_the_base_to_the_antenna(tmp_path: Path) -> None:
+    log = write(
+        tmp_path / "log",
+        [
+            ("base_footprint", "base_link", (0.0, 0.0, 0.1), (0, 0, 0, 1)),
+            ("base_link", "mast", (0.5, 0.0, 0.3), (0, 0, HALF, HALF)),
+            ("mast", "gps", (0.2, 0.1, 1.0), (0, 0, 0, 1)),
+        ],
+    )
+    # The mast looks left: its x axis is the body's left, its y axis the body's back.
+    assert place(log) == pytest.approx((0.5 - 0.1, -0.2))
+
+
+def test_an_antenna_beside_the_base_in_the_tree_is_found_through_their_common_root(tmp_path: Path) -> None:
+    log = write(
+        tmp_path / "log",
+        [
+            ("chassis", "robot/base_link", (1.0, 0.0, 0.0), (0, 0, 0, 1)),
+            ("chassis", "gps", (1.2, -0.3, 0.5), (0, 0, 0, 1)),
+        ],
+    )
+    assert place(log) == pytest.approx((0.2, 0.3))
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [("base_link", "camera", (0.2, 0.0, 0.0), (0, 0, 0, 1))],
+        [("odd", "gps", (0.2, 0.0, 0.0), (0, 0, 0, 1))],
+        [("base_link", "gps", (50.0, 0.0, 0.0), (0, 0, 0, 1))],
+        [("gps", "base_link", (0.1, 0.0, 0.0), (0, 0, 0, 1)), ("base_link", "gps", (0.1, 0.0, 0.0), (0, 0, 0, 0))],
+    ],
+)
+def test_a_tree_that_does_not_tell_gives_nothing(tmp_path: Path, transforms: list) -> None:
+    assert place(write(tmp_path / "log", transforms)) is None
+
+
+def test_transforms_in_a_circle_do_not_hang(tmp_path: Path) -> None:
+    log = write(
+        tmp_path / "log",
+        [
+            ("a", "gps", (0.1, 0.0, 0.0), (0, 0, 0, 1)),
+            ("gps", "a", (0.1, 0.0, 0.0), (0, 0, 0, 1)),
+            ("a", "base_link", (0, 0, 0.0), (0, 0, 0, 1)),
+        ],
+    )
+    place(log)

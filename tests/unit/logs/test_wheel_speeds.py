@@ -1,0 +1,88 @@
+"""From what wheels tell to speeds: what no wheel can have done is left out, and said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icrtool.config import load_config
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.stamps import StampedRows
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
+from icrtool.logs.streams.wheel_speeds import wheel_samples
+from icrtool.records.tables import Floats, Ints, PositionFixes
+
+RADIUS_M, STEP_NS = 0.1, 20_000_000
+CONFIG = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}"])
+NOTHING = PositionFixes(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
+
+
+def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[str]]:
+    stamps = STEP_NS * np.arange(len(left), dtype=np.int64)
+    motion = motion_of("/wheels", "some/Type", StampedRows(None, stamps, "", 0), position=(left, right))
+    samples, _, warnings = wheel_samples(motion, stamps, CONFIG, NOTHING, "log")
+    return samples.stamp_ns, samples.v_left_mps, samples.v_right_mps, warnings
+
+
+@pytest.fixture
+def travel() -> Floats:
+    """Positions [rad] of a wheel that speeds up to 8 rad/s, stops, and goes on."""
+    t = np.arange(600) * STEP_NS / 1e9
+    return np.cumsum(np.where((t > 5) & (t < 7), 0.0, np.minimum(4 * t, 8.0))) * STEP_NS / 1e9
+
+
+@pytest.mark.parametrize("where", [1, 250, 300, 598])
+def test_a_counter_that_is_reset_costs_one_sample_and_is_said(travel: Floats, where: int) -> None:
+    _, clean, _, nothing = speeds_of(travel, travel)
+    reset = np.where(np.arange(len(travel)) >= where, travel + 12.0, travel)
+    stamps, left, right, warnings = speeds_of(reset, travel)
+    kept = np.isin(STEP_NS * np.arange(len(travel)), stamps)
+    assert np.count_nonzero(~kept) == 1
+    assert left == pytest.approx(clean[kept], abs=1e-9)
+    assert right == pytest.approx(clean[kept], abs=1e-9)
+    assert len(warnings) == 1
+    assert "1 wheel speeds, up to 60 m/s" in warnings[0] or "up to 61 m/s" in warnings[0]
+    assert not nothing
+
+
+def within_a_turn(positions: Floats, low: float) -> Floats:
+    return np.mod(positions - low, 2 * np.pi) + low
+
+
+@pytest.mark.parametrize("low", [-np.pi, 0.0])
+def test_joints_told_within_one_turn_are_read_like_those_that_go_on(travel: Floats, low: float) -> None:
+    positions = np.column_stack([travel, travel + 1.0, -0.7 * travel, 2.0 - 0.7 * travel])
+    whole, wrapped = (joints_motion(each) for each in (positions, within_a_turn(positions, low)))
+    for one, other in zip(
+        (whole.position_left, whole.position_right), (wrapped.position_left, wrapped.position_right), strict=True
+    ):
+        assert np.diff(other) == pytest.approx(np.diff(one), abs=1e-9)
+
+
+def test_a_gap_in_less_than_a_turn_is_no_wrap() -> None:
+    positions = np.repeat(np.array([0.0, 0.1, 5.0, 5.1, 5.2])[:, None], 4, axis=1)
+    left = joints_motion(positions).position_left
+    assert left is not None
+    assert left.tolist() == positions[:, 0].tolist()
+
+
+def joints_motion(positions: Floats) -> WheelMotion:
+    names = ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"]
+    rows = len(positions)
+    columns = {
+        "name[*]": np.broadcast_to(np.arange(4), (rows, 4)), "position[*]": positions,
+        "velocity[*]": np.full((rows, 4), np.nan),
+    }  # fmt: skip
+    times = STEP_NS * np.arange(rows, dtype=np.int64)
+    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0, "test")
+    return WHEEL_TYPES["sensor_msgs/JointState"][1](table, CONFIG)
+
+
+def test_hard_braking_and_a_short_dash_of_a_robot_that_mostly_stands_are_driving() -> None:
+    speed = np.zeros(5000)
+    speed[1000:1008], speed[3000:3004] = 40.0, -40.0
+    travel = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * STEP_NS / 1e9
+    _, left, _, warnings = speeds_of(travel, travel)
+    assert np.abs(left).max() == pytest.approx(40.0 * RADIUS_M)
+    assert len(left) == 5000
+    assert not warnings

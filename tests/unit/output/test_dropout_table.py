@@ -1,0 +1,165 @@
+"""The report as text: on the terminal, as JUnit XML and as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, judge_gate, parse_gate
+from icrtool.dropout_analysis.example_trials import worst_drives
+from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.trials import dropout
+from icrtool.errors import OutputError, RunError
+from icrtool.estimation.fit import FilterRun
+from icrtool.output.atomic_file import check_place
+from icrtool.output.dropout_content import DropoutContent, p95_at, shown_horizons, title_of
+from icrtool.output.exports.acceptance import format_markdown, write_junit, write_markdown
+from icrtool.output.tables.dropout import budget_lines, format_dropout
+
+HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
+GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001")
+
+
+def content_of(run: FilterRun, horizons_m: list[float], gates: tuple[str, ...] = ()) -> DropoutContent:
+    report = dropout(run, horizons_m)
+    return DropoutContent(
+        title=title_of(run),
+        run_summary=run.summary,
+        report=report,
+        budgets=budget_distances(report, 0.05) + budget_distances(report, 50.0),
+        verdicts=tuple(judge_gate(parse_gate(gate), report) for gate in gates),
+        worst=worst_drives(run),
+        examples=(),
+        outages=real_outages(run),
+    )
+
+
+@pytest.fixture(scope="module")
+def content(run: FilterRun) -> DropoutContent:
+    return content_of(run, HORIZONS_M, GATES)
+
+
+def row_of(text: str, begin: str) -> list[str]:
+    return next(line for line in text.splitlines() if line.startswith(begin)).removeprefix(begin).split()
+
+
+def test_the_table_shows_the_horizons_nearest_to_1_5_10_and_20_m(content: DropoutContent) -> None:
+    assert shown_horizons(content.report) == [1, 2, 3, 4]
+    assert row_of(format_dropout(content), "way driven blind") == ["1", "m", "5", "m", "9", "m", "30", "m"]
+
+
+def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: DropoutContent) -> None:
+    text = format_dropout(content)
+    icr, no_slip = content.report.result("icr"), content.report.result("no_slip")
+    assert icr is not None
+    assert no_slip is not None
+    p95 = float(icr.summary.p95[1])
+    assert row_of(text, "ICR, momentary  95 %")[:4] == [f"{p95:.3f}", "m", f"{100 * p95:.1f}", "%"]
+    ratio = float(no_slip.summary.p95[1]) / p95
+    assert row_of(text, "no slip : ICR   95 %")[:2] == [f"{ratio:.1f}", "x"]
+    assert "ICR, final" in text
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert not any(line != line.rstrip() for line in text.splitlines())
+
+
+def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutContent) -> None:
+    text, counts = format_dropout(content), content.report.counts
+    assert row_of(text, "trials")[0] == f"{counts.trials[1]:,}"
+    assert row_of(text, "no trial: too little way")[0] == f"{counts.short[1]:,}"
+    assert row_of(text, "across a wheel gap")[0] == f"{counts.gap[1]:,}"
+    assert row_of(text, "ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
+
+
+def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutContent) -> None:
+    (outage,), icr = content.outages, content.report.result("icr")
+    assert icr is not None
+    usual = p95_at(icr, content.report, outage.distance_m)
+    assert usual == icr.summary.p95[2]
+    assert p95_at(icr, content.report, 31.0) is None
+    line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
+    assert f"{outage.end_error_m:.3f} m" in line
+    assert usual > 1
+    assert line.endswith(f"{usual:.2f} m")
+
+
+def test_verdicts_are_lines_of_the_table(content: DropoutContent) -> None:
+    lines = format_dropout(content).splitlines()
+    assert [verdict.line() for verdict in content.verdicts] == lines[-2:]
+    assert not content.passed
+    assert replace(content, verdicts=content.verdicts[:1]).passed
+
+
+def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
+    budgets = [
+        BudgetDistance("icr", "ICR, momentary", 0.5, 7.34, beyond=False, between_m=(7.0, 8.0)),
+        BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
+        BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True, between_m=(20.0, 20.0)),
+    ]
+    assert budget_lines(budgets) == [
+        "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m (interpolated between 1 and 20 m)",
+        "stays within 9 m (95 %) for more than 20 m",
+    ]
+
+
+def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., FilterRun]) -> None:
+    parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False, track_width_m=None)
+    text = format_dropout(content_of(parked, [5.0]))
+    assert "nothing can be said of budgets" in text
+    assert "robot.track_width_m is not known" in text
+    assert "the robot stood at 100 % of the states" in text
+
+
+def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutContent, tmp_path: Path) -> None:
+    odd = replace(content, title='a <b> & "c" \x01', verdicts=content.verdicts[1:])
+    error = RunError("runs/x", "edited", "fit <again> & again")
+    write_junit(tmp_path / "j.xml", [("barn", content), ("odd", odd), ("runs/x", error)])
+    root = ET.parse(tmp_path / "j.xml").getroot()
+    assert root.tag == "testsuites"
+    assert {key: root.get(key) for key in ("tests", "failures", "errors")} == {
+        "tests": "4",
+        "failures": "2",
+        "errors": "1",
+    }
+    first, second, third = root.findall("testsuite")
+    assert [case.get("name") for case in first.findall("testcase")] == list(GATES)
+    passed, failed = first.findall("testcase")
+    assert passed.find("failure") is None
+    failure = failed.find("failure")
+    assert failure is not None
+    assert failure.get("message") == content.verdicts[1].line()
+    assert second.get("name") == 'a <b> & "c" ?'
+    told = third.find("testcase/error")
+    assert told is not None
+    assert told.get("message") == str(error)
+    assert [path.name for path in tmp_path.iterdir()] == ["j.xml"]
+
+
+def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutContent, tmp_path: Path) -> None:
+    write_markdown(tmp_path / "m.md", [("barn", content), ("runs/x", RunError("runs/x", "was edited"))])
+    text = (tmp_path / "m.md").read_text(encoding="utf-8")
+    assert text.startswith("## barn")
+    assert "**A gate failed.**" in text
+    assert "- stays within 50 m (95 %) for more than" in text
+    assert "Could not be used: runs/x: was edited" in text
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    columns = {line.count("|") for line in table[:8]}
+    assert len(columns) == 1
+    assert "All gates passed." in format_markdown(replace(content, verdicts=content.verdicts[:1]))
+
+
+def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutContent, tmp_path: Path) -> None:
+    (tmp_path / "j.xml").write_text("old", encoding="utf-8")
+    write_junit(tmp_path / "j.xml", [("barn", content)])
+    ET.parse(tmp_path / "j.xml")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_junit(tmp_path / "missing" / "j.xml", [("barn", content)])
+    with pytest.raises(OutputError, match="does not exist"):
+        check_place(tmp_path / "missing" / "j.xml")
+    with pytest.raises(OutputError, match="is a directory"):
+        check_place(tmp_path)
+    check_place(tmp_path / "new.xml")
+    assert [path.name for path in tmp_path.iterdir()] == ["j.xml"]

@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from icrtool.estimation.fit import FilterRun
+from icrtool.estimation.odometry import icr_odometry
+from icrtool.output.figures.run_figures import FIGURES
+from icrtool.output.figures.style import new_figure, save, style
+
+BAD_FIXES = 4
+CELL = 1 / 700
+"""Two points closer than this part of the view are one dot."""
+
+
+def drawn(name: str, run: FilterRun) -> Figure:
+    with style():
+        figure = FIGURES[name](run)
+        figure.canvas.draw()
+    return figure
+
+
+def legend_texts(figure: Figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def line_labelled(axes: Axes, begin: str) -> np.ndarray:
+    return next(np.column_stack(line.get_data()) for line in axes.lines if str(line.get_label()).startswith(begin))
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_axis_has_a_name_and_a_unit(name: str, run: FilterRun) -> None:
+    figure = drawn(name, run)
+    lowest_row = [axes for axes in figure.axes if axes.get_subplotspec().is_last_row()]
+    first_column = [axes for axes in figure.axes if axes.get_subplotspec().is_first_col()]
+    for label in [axes.get_xlabel() for axes in lowest_row] + [axes.get_ylabel() for axes in first_column]:
+        assert label.endswith(("[m]", "[s]", "[%]")), label
+    assert figure.texts[0].get_text() == "barn  (segway-rmp400)"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize(
+    "drive",
+    [
+        {},
+        {"troubles": False, "track_width_m": None, "datum": False},
+        {"speed_mps": 0.0, "duration_s": 20.0},
+        {"duration_s": 1.0, "troubles": False},
+        {"duration_s": 700.0},
+    ],
+    ids=["usual", "bare", "parked", "one second", "long"],
+)
+def test_no_text_leaves_the_picture_or_covers_another(
+    name: str, drive: dict[str, object], make_run: Callable[..., FilterRun]
+) -> None:
+    figure = drawn(name, make_run(**drive))
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts_of(figure)]
+    for text, box in boxes:
+        assert figure.bbox.x0 <= box.x0, text
+        assert figure.bbox.y0 <= box.y0, text
+        assert box.x1 <= figure.bbox.x1, text
+        assert box.y1 <= figure.bbox.y1, text
+    for number, (text, box) in enumerate(boxes):
+        for other, other_box in boxes[number + 1 :]:
+            assert not box.padded(-1.0).overlaps(other_box.padded(-1.0)), f"{text!r} covers {other!r}"
+
+
+def texts_of(figure: Figure) -> list[mpl.text.Text]:
+    found = list(figure.texts)
+    for legend in figure.legends:
+        found += legend.get_texts()
+    for axes in figure.axes:
+        titles = [axes.title, axes._left_title, axes._right_title, axes.xaxis.label, axes.yaxis.label]
+        low, high = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+        ticks = [tick.label1 for tick in axes.xaxis.get_major_ticks() if low[0] <= tick.get_loc() <= low[1]]
+        ticks += [tick.label1 for tick in axes.yaxis.get_major_ticks() if high[0] <= tick.get_loc() <= high[1]]
+        found += titles + [tick for tick in ticks if tick.get_visible()]
+    return [text for text in found if text.get_text().strip()]
+
+
+def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: FilterRun) -> None:
+    figure = drawn("trajectory", run)
+    (axes,) = figure.axes
+    texts = legend_texts(figure)
+    for begin in (
+        "GNSS fixes",
+        "GNSS fixes, rejected",
+        "filter",
+        "ICR odometry, ends",
+        "no-slip odometry, ends",
+        "start",
+        "end",
+    ):
+        assert any(text.startswith(begin) for text in texts), begin
+    assert axes.get_aspect() == 1.0
+    view = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    path = line_labelled(axes, "filter")
+    assert np.allclose(path[[0, -1]], np.column_stack([run.table.east_m, run.table.north_m])[[0, -1]])
+    odometry = icr_odometry(run)
+    assert np.allclose(line_labelled(axes, "ICR odometry")[-1], [odometry.east_m[-1], odometry.north_m[-1]])
+    for states, line in ((run.table.east_m, path[:, 0]), (run.table.north_m, path[:, 1])):
+        assert abs(line.max() - states.max()) < CELL * view
+        assert abs(line.min() - states.min()) < CELL * view
+    assert len(line_labelled(axes, "GNSS fixes, rejected")) == BAD_FIXES
+
+
+def test_trajectory_without_width_has_no_no_slip_path(make_run: Callable[..., FilterRun]) -> None:
+    texts = legend_texts(drawn("trajectory", make_run(track_width_m=None, datum=False, troubles=False)))
+    assert not any("no-slip" in text for text in texts)
+    assert "position reference" in texts
+
+
+def test_trajectory_far_from_the_origin_keeps_short_ticks(make_run: Callable[..., FilterRun]) -> None:
+    near = make_run(troubles=False, datum=False, duration_s=20.0)
+    for column in (near.table.north_m, near.log.gnss.north_m):
+        np.add(column, 5_412_300.0, out=column)
+    (axes,) = drawn("trajectory", near).axes
+    assert axes.get_ylabel() == "North [m]  + 5,412,000 m"
+    assert max(len(tick.get_text()) for tick in axes.get_yticklabels()) < 7
+
+
+def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., FilterRun]) -> None:
+    run = make_run(duration_s=300.0, track_width_m=20.0, troubles=False)
+    figure = drawn("trajectory", run)
+    assert any(text.endswith("(out of view)") for text in legend_texts(figure))
+
+
+def test_icr_estimates_show_bands_rises_and_outage(run: FilterRun) -> None:
+    figure = drawn("icr_estimates", run)
+    texts = legend_texts(figure)
+    assert texts == ["estimate", "±2σ", "10 %", "90 % of the way", "no slip (±b/2, 0)", "no usable GNSS"]
+    rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
+    convergence = run.summary["icr"]["convergence_s"]
+    assert rises == [
+        f"10–90 % in {convergence[column]:.1f} s" for column in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+    ]
+    finals = [axes.get_title(loc="right") for axes in figure.axes if axes.get_title(loc="right")]
+    assert finals[1].startswith("final −0.6")
+    assert [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] == [
+        "ICR y right [m]", "ICR y left [m]", "ICR x [m]",
+    ]  # fmt: skip
+
+
+def test_icr_clusters_add_up_to_all_of_the_time(run: FilterRun) -> None:
+    figure = drawn("icr_clusters", run)
+    for axes in figure.axes:
+        (filled,) = axes.collections
+        x, y = filled.get_paths()[0].vertices.T
+        widths = np.diff(np.unique(x))
+        area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2.0
+        assert 98.0 < area / widths.mean() < 100.0 + 1e-6
+        assert axes.get_ylim()[0] == 0.0
+    assert figure.axes[0].get_title().splitlines()[1] == "no slip: −0.300 m"
+
+
+def test_gnss_difference_marks_rejected_fixes_and_breaks_at_the_outage(run: FilterRun) -> None:
+    figure = drawn("gnss_difference", run)
+    (axes,) = figure.axes
+    texts = legend_texts(figure)
+    assert f"{BAD_FIXES} rejected, above" in texts
+    assert any(text.startswith("mean ") for text in texts)
+    assert "no usable GNSS" in texts
+    line = line_labelled(axes, "used, max")
+    assert np.isnan(line[:, 1]).sum() == 1
+    assert np.nanmax(line[:, 1]) == run.summary["gnss"]["max_difference_m"]
+    assert axes.get_ylim()[1] < 0.2
+    assert axes.get_xlim() == (0.0, 100.0)
+
+
+def test_line_styles_differ_in_grey() -> None:
+    from icrtool.output.figures.style import FILTER, FIX_COLOR, ICR, NO_SLIP
+
+    grey = [
+        float(np.dot(mpl.colors.to_rgb(color), (0.299, 0.587, 0.114)))
+        for color in (FILTER.color, ICR.color, NO_SLIP.color, FIX_COLOR)
+    ]
+    assert min(np.diff(sorted(grey))) > 0.09
+    assert len({str(pen.dash) for pen in (FILTER, ICR, NO_SLIP)}) == 3
+
+
+def test_a_users_settings_change_nothing(tmp_path, run: FilterRun) -> None:
+    with style():
+        save(FIGURES["gnss_difference"](run), tmp_path / "plain", ("png",))
+    with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "savefig.dpi": 20, "text.usetex": True}):
+        with style():
+            save(FIGURES["gnss_difference"](run), tmp_path / "set", ("png",))
+        assert mpl.rcParams["font.size"] == 30.0
+    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "set.png").read_bytes()
+
+
+def test_a_pdf_has_the_same_bytes_every_time(tmp_path, run: FilterRun) -> None:
+    for place in ("one", "two"):
+        with style():
+            save(FIGURES["gnss_difference"](run), tmp_path / place, ("pdf",))
+    assert (tmp_path / "one.pdf").read_bytes() == (tmp_path / "two.pdf").read_bytes()
+
+
+def test_a_long_title_is_cut_in_its_middle() -> None:
+    figure = new_figure("begin" + "x" * 200 + "end", "", width_in=7.2, height_in=3.0)
+    title = figure.texts[0].get_text()
+    assert title.startswith("begin")
+    assert title.endswith("end")
+    assert "…" in title
+    assert figure.texts[0].get_window_extent().x1 < figure.bbox.x1

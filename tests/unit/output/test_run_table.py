@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from icrtool.estimation.fit import FilterRun
+from icrtool.estimation.summary import separation_multiplier
+from icrtool.output.tables.run import format_run
+from icrtool.output.text_format import TABLE_WIDTH, duration_text, length_text, signed, way_text
+
+
+def line_of(text: str, begin: str) -> str:
+    return next(line for line in text.splitlines() if line.startswith(begin))
+
+
+def test_the_table_says_what_was_read_and_learned(run: FilterRun) -> None:
+    text = format_run(run)
+    icr, drive = run.summary["icr"], run.summary["drive"]
+    assert text.splitlines()[0] == "barn  (segway-rmp400)"
+    assert line_of(text, "wheels").split() == [
+        "wheels",
+        "/joint_states",
+        "sensor_msgs/JointState",
+        "50.0",
+        "Hz",
+        "3,000",
+        "header",
+    ]
+    assert line_of(text, "heading     /imu").endswith("log")
+    assert f"{drive['distance_m']:.1f} m in {duration_text(drive['duration_s'])}" in line_of(text, "drive")
+    assert f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s" in line_of(text, "drive")
+    for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x ", "x_icr_m")):
+        line = line_of(text, label)
+        assert f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}" in line
+        assert f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}" in line
+        assert f"{icr['convergence_s'][column]:.1f} s" in line
+    assert f"{separation_multiplier(run.table, 0.6):.2f} = (y right - y left) / b, with b = 0.6 m" in line_of(
+        text, "multiplier"
+    )
+    assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
+    assert "1 outage, " in text
+    assert "filter to GNSS fixes: mean " in line_of(text, "position")
+    assert "off the course" in text.splitlines()[-2]
+
+
+def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: FilterRun) -> None:
+    long_names = tuple(
+        replace(stream, topic="/robot/namespace" * 9, message_type="some_vendor_msgs/msg/VeryLongNameOfAMessageIndeed")
+        for stream in run.log.streams
+    )
+    wide = replace(run, log=replace(run.log, streams=long_names))
+    for text in (format_run(run), format_run(wide)):
+        assert max(map(len, text.splitlines())) <= TABLE_WIDTH
+        assert "\x1b" not in text
+        assert not any(line != line.rstrip() for line in text.splitlines())
+        assert not text.endswith("\n")
+    wheels = line_of(format_run(wide), "wheels")
+    assert wheels.split()[1].startswith("...")
+    assert wheels.split()[1].endswith("/robot/namespace")
+
+
+def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., FilterRun]) -> None:
+    text = format_run(make_run(track_width_m=None, datum=False, troubles=False, duration_s=20.0))
+    assert "robot.track_width_m is not known" in line_of(text, "multiplier")
+    assert "filter to position reference" in text
+    assert "outage" not in text
+    assert " 0 rejected" in text
+
+
+def test_a_parked_robot_has_a_table_too(make_run: Callable[..., FilterRun]) -> None:
+    text = format_run(make_run(speed_mps=0.0, duration_s=20.0))
+    assert line_of(text, "y right").count("hardly moved") == 1
+    assert "too little straight driving" in text
+
+
+def test_warnings_are_not_in_the_table(run: FilterRun) -> None:
+    assert run.warnings
+    assert not any(warning in format_run(run) for warning in run.warnings)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (12.34, "12.3 s"),
+        (59.99, "60.0 s"),
+        (60.0, "1:00 min"),
+        (899.99, "15:00 min"),
+        (3599.9, "1:00:00 h"),
+        (36000, "10:00:00 h"),
+    ],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text
+
+
+def test_lengths_read_well() -> None:
+    assert [length_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456)] == [
+        "3.1 mm",
+        "1.2 cm",
+        "99.9 cm",
+        "3.46 m",
+    ]
+    assert [way_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
+    assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
+
+
+def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: FilterRun) -> None:
+    steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
+    speed = run.summary["drive"]["speed_mean_mps"]
+    said = f"not shown by this drive; 0.1 s late would move x by {length_text(0.1 * speed)}"
+    assert said in format_run(steady)
+    known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02, "delay_std_s": 0.01}})
+    assert said not in format_run(known)

@@ -1,0 +1,190 @@
+"""What a study leaves behind: a directory that appears whole, a CSV and JSON that read back, a table that fits."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from icrtool.config import Config, load_config
+from icrtool.errors import DataError, OutputError
+from icrtool.output.study_directory import check_study_target, write_study
+from icrtool.output.tables.study import finding_text, format_study
+from icrtool.output.truth_file import log_and_truth, read_speeds, truth_path, write_truth
+from icrtool.simulation.drives import Drive, Sensors
+from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.record import simulate
+from icrtool.simulation.studies import STUDY_NAMES, Finding, StudyResult, default_request, run_study
+
+WIDEST = 120
+PNG = b"\x89PNG"
+
+
+def small(name, robot: str | None = None) -> StudyResult:
+    request = default_request(name, load_config(robot=robot) if robot else Config())
+    settings = (1.0, -1.0) if name == "initial" else request.values[:2]  # noqa: PD011 - the values of a study, no pandas
+    plan = replace(request.plan, duration_s={"turn-radius": 25.0, "gnss": 40.0}.get(name, 12.0))
+    if name == "icr-change":
+        plan = replace(plan, changes=((4.0, (0.7, -0.6, 0.0)), (8.0, (0.5, -0.7, 0.1))))
+    return run_study(replace(request, runs=2, values=settings, paths=request.paths[:2], plan=plan))
+
+
+@pytest.mark.parametrize("name", STUDY_NAMES)
+def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> None:
+    result = small(name)
+    write_study(result, tmp_path / "study")
+    assert sorted(path.name for path in (tmp_path / "study").iterdir()) == sorted(
+        ["study.json", f"{name}.csv", f"{name}.png"]
+    )
+    document = json.loads((tmp_path / "study" / "study.json").read_text(encoding="utf-8"))
+    assert document["schema"] == "icrtool/study/1"
+    assert document["settings"]["drive"]["path"]["kind"]
+    assert len(document["levels"]) == len(result.levels)
+    table = pd.read_csv(tmp_path / "study" / f"{name}.csv")
+    assert list(table) == list(result.columns)
+    for column, values in result.columns.items():
+        if not isinstance(values, list):
+            np.testing.assert_array_equal(table[column].to_numpy(), np.asarray(values))
+    assert (tmp_path / "study" / f"{name}.png").read_bytes().startswith(PNG)
+    text = format_study(result)
+    assert text.startswith(name)
+    assert max(map(len, text.splitlines())) <= WIDEST + 20
+
+
+def test_an_old_study_is_replaced_and_anything_else_is_left_alone(tmp_path: Path) -> None:
+    result = small("rate")
+    write_study(result, tmp_path / "study", plots=())
+    (tmp_path / "study" / "old").touch()
+    write_study(result, tmp_path / "study", plots=())
+    assert not (tmp_path / "study" / "old").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes").touch()
+    with pytest.raises(OutputError, match="not a study directory"):
+        check_study_target(tmp_path / "mine")
+    with pytest.raises(OutputError, match="not a study directory"):
+        write_study(result, tmp_path / "mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes"]
+
+
+def test_a_study_that_cannot_be_drawn_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from icrtool.output.figures import study as figure_study
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(figure_study, "draw_study", fail)
+    with pytest.raises(OutputError, match="No space left"):
+        write_study(small("rate"), tmp_path / "deep" / "study")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_names_the_robot_settings_and_the_paper(tmp_path: Path) -> None:
+    text = format_study(small("turn-radius"))
+    assert "turn-radius (Fig. 10): convergence after a change" in text
+    assert "2 runs of 25 s each, seed 0; circle at 0.4 m/s, ICRs +0.500, -0.750, -0.250 m" in text
+    assert "0.1 s (Fig. 10)" in text
+
+
+@pytest.mark.parametrize(
+    ("ours", "unit", "text"),
+    [
+        ((1.234,), "s", "1.23 s"),
+        ((0.0004,), "m", "0.000 m"),
+        ((12.345, 99.9), "%", "12.3 to 99.9 %"),
+        ((0.1, 0.25, 3.0), "m", "0.250 m [0.100, 3.00]"),
+        ((float("nan"),), "s", "never"),
+        ((6.1,), "", "6.10"),
+    ],
+)
+def test_numbers_are_told_with_three_digits(ours: tuple[float, ...], unit: str, text: str) -> None:
+    assert finding_text(Finding("", ours, unit)) == text
+
+
+def test_the_truth_reads_back_to_the_last_bit(tmp_path: Path) -> None:
+    _, truth = simulate(Drive(duration_s=3.0), Sensors(), 0)
+    write_truth(truth, tmp_path / "truth.csv")
+    table = pd.read_csv(tmp_path / "truth.csv")
+    for name, values in truth.columns().items():
+        np.testing.assert_array_equal(table[name].to_numpy(), values)
+
+
+def test_track_speeds_read_from_a_table_with_other_columns(tmp_path: Path) -> None:
+    file = tmp_path / "speeds.csv"
+    file.write_text("\ufeffv_right_mps, t_s, note, v_left_mps\n0.1,10,a,0.2\n0.3,11.5,b,0.4\n", encoding="utf-8")
+    speeds = read_speeds(file)
+    np.testing.assert_array_equal(speeds.t_s, [0.0, 1.5])
+    np.testing.assert_array_equal(speeds.v_left_mps, [0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,v_left_mps\n0,1\n", "no column v_right_mps; it holds t_s, v_left_mps"),
+        ("", "no column t_s; it holds nothing"),
+        ("t_s,v_left_mps,v_right_mps\n0,1,1\n", "1 rows; at least two are needed"),
+        ("t_s,v_left_mps,v_right_mps\n0,1,1\n1,,1\n", "row 2 holds a value that is not a finite number"),
+        ("t_s,v_left_mps,v_right_mps\n0,1,1\n0,1,1\n", "the times do not increase at row 2; t_s = 0 after 0"),
+        ("t_s,v_left_mps,v_right_mps\n0,fast,1\n", "not a table of numbers; could not convert"),
+        ("t_s,v_left_mps,v_right_mps\n0,1\n1,1,1\n", "row 1 holds a value that is not a finite number"),
+    ],
+)
+def test_speeds_that_cannot_be_driven_are_refused_in_words(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "speeds.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError) as refused:
+        read_speeds(file)
+    assert words in str(refused.value)
+
+
+def write_pair(log: Path, *, force: bool, text: str = "new") -> None:
+    with log_and_truth(log, force=force) as (fresh, truth):
+        fresh.write_text(text, encoding="utf-8")
+        truth.write_text(text, encoding="utf-8")
+
+
+def test_a_log_and_its_truth_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    log = tmp_path / "drive.mcap"
+
+    def fail() -> None:
+        with log_and_truth(log, force=False) as (fresh, _):
+            fresh.touch()
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="No space left"):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+    write_pair(log, force=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.mcap", "drive.mcap.truth.csv"]
+    assert truth_path(log).read_text(encoding="utf-8") == "new"
+
+
+def test_nothing_is_overwritten_unless_forced(tmp_path: Path) -> None:
+    log = tmp_path / "drive.bag"
+    write_pair(log, force=False, text="old")
+    with pytest.raises(OutputError, match="exists already; --force replaces it"):
+        write_pair(log, force=False)
+    assert log.read_text(encoding="utf-8") == "old"
+    write_pair(log, force=True)
+    assert log.read_text(encoding="utf-8") == "new"
+
+
+def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    with pytest.raises(OutputError, match="is a directory and no bag"):
+        write_pair(tmp_path / "photos", force=True)
+
+
+def test_a_place_that_does_not_exist_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot be written; No such file"):
+        write_pair(tmp_path / "nowhere" / "drive.mcap", force=False)
+
+
+def test_a_path_may_be_named_in_any_study(tmp_path: Path) -> None:
+    request = default_request("rate", Config())
+    plan = replace(request.plan, path=PathPlan("spins"), duration_s=6.0)
+    result = run_study(replace(request, runs=1, values=(50.0,), plan=plan))
+    assert "spins at 0.4 m/s" in format_study(result)
