@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import inspect
+import itertools
 import re
+import shlex
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -113,3 +117,63 @@ def test_a_public_function_documents_every_parameter(name: str) -> None:
     section = text.partition("Parameters\n----------\n")[2].partition("\n\n")[0]
     documented = {word for names in re.findall(r"^(\w[\w, ]*?) :", section, re.MULTILINE) for word in names.split(", ")}
     assert documented == set(inspect.signature(function).parameters)
+
+
+COMMANDS = [
+    (page, line)
+    for page in PAGES
+    for block in re.findall(r"```sh\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("icrtool ")
+]
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS)
+def test_a_command_that_a_page_shows_has_these_arguments(
+    page: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    for log in ("field.mcap", "field.bag"):
+        (tmp_path / log).touch()
+    for run in ("RUN", "icrtool-runs/field"):
+        (tmp_path / run).mkdir(parents=True)
+    name, *arguments = shlex.split(line, comments=True)[1:]
+    command = command_line.get_command(None, name)  # type: ignore[arg-type]
+    assert command is not None
+    command.make_context(name, arguments)
+
+
+@pytest.fixture(scope="module")
+def readme_session() -> dict[str, Any]:
+    """Return what the README's Python block leaves behind."""
+    names: dict[str, Any] = {}
+    with contextlib.chdir(ROOT):
+        exec(README.split("```python\n")[1].split("```")[0], names)
+    return names
+
+
+def readme_table(first_cell: str) -> list[list[str]]:
+    """Return the rows below the header of the README's table whose header begins with `first_cell`."""
+    lines = README.partition(f"\n| {first_cell} |")[2].splitlines()[2:]
+    rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
+
+
+def test_the_readmes_errors_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+    summary = readme_session["report"].summary.set_index(["model", "horizon_m"])
+    rows = readme_table("model")
+    for model, row in zip(("no_slip", "icr", "icr_final"), rows, strict=True):
+        found = [f"{summary.loc[(model, horizon), 'p95_m']:.3f}" for horizon in (1, 5, 10, 20)]
+        assert found == row[1:]
+    assert f"{summary['trials'].min():,} trials or more" in README
+
+
+def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+    run = readme_session["run"]
+    last = run.states.iloc[-1]
+    rows = dict(row[:2] for row in readme_table("ICR"))
+    for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x", "x_icr_m")):
+        assert rows[label] == f"{last[column]:+.3f} ± {last['std_' + column]:.3f} m"
+    width = last["y_icr_right_m"] - last["y_icr_left_m"]
+    assert rows["multiplier"] == f"{width / readme_session['config'].robot.track_width_m:.2f}"

@@ -29,7 +29,9 @@ def glossary() -> dict[str, str]:
 
 WORDS = glossary()
 PATTERN = re.compile(rf"\b(?:{'|'.join(sorted(map(re.escape, WORDS), key=len, reverse=True))})\b", re.IGNORECASE)
-INSTEAD = re.compile("|".join(re.escape(one) for text in set(WORDS.values()) for one in text.split(", ")), re.IGNORECASE)
+INSTEAD = re.compile(
+    "|".join(re.escape(one) for text in set(WORDS.values()) for one in text.split(", ")), re.IGNORECASE
+)
 
 
 def found_in_text(text: str) -> list[str]:
@@ -99,7 +101,8 @@ def test_a_word_not_to_use_is_found(source: str, word: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "source", ["y = 1  # course over ground", "course_over_ground = 1", "for n in ast.walk(x): pass", "always = 'latest'"]
+    "source",
+    ["y = 1  # course over ground", "course_over_ground = 1", "for n in ast.walk(x): pass", "always = 'latest'"],
 )
 def test_other_words_are_not(source: str) -> None:
     assert found_in_source(source) == []
