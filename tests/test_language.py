@@ -18,7 +18,12 @@ GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition
 DONE: tuple[str, ...] = ()
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
-PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs/architecture.md", "docs/equations.md")
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    *(f"docs/{page}.md" for page in ("architecture", "configuration", "equations", "paper")),
+)
 
 
 def glossary() -> dict[str, str]:
