@@ -72,6 +72,12 @@ def test_the_files_a_page_names_are_there(page: str) -> None:
         assert (ROOT / name).exists(), name
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_the_public_names_of_a_page_exist(page: str) -> None:
+    for name in re.findall(r"\bicrtool\.([a-z]\w+)\b(?!\.)", (ROOT / page).read_text(encoding="utf-8")):
+        assert hasattr(icrtool, name), name
+
+
 def functions_in(path: Path) -> Iterator[str]:
     """List the functions of a module and the methods of its classes."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
