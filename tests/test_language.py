@@ -19,6 +19,7 @@ DONE: tuple[str, ...] = ()
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PAGES = (
+    "CHANGELOG.md",
     "README.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
