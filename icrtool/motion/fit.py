@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
-from icrtool.motion.models import MotionModel, model_columns, wheel_motion
+from icrtool.motion.models import MotionModel, model_columns, twist, wheel_motion
 from icrtool.motion.recording import STRETCH_M, Windows
 from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
@@ -53,6 +53,15 @@ class PooledFit:
     jacobian: Floats
     kept: Bools
 
+    @property
+    def turning(self) -> Turning:
+        """What a model with a gyro weighs."""
+        return self.model, self.parameters
+
+
+Turning = tuple[MotionModel, Floats]
+"""A wheels-only model and its parameters."""
+
 
 class WindowResiduals:
     """Residuals of all windows of one recording for one model, (d - d_ref) / sqrt(length), and their derivatives.
@@ -61,10 +70,13 @@ class WindowResiduals:
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
     """
 
-    def __init__(self, windows: Windows, model: MotionModel, width_m: float) -> None:
-        motion = wheel_motion(windows.v_left, windows.v_right, width_m, windows.gyro)
+    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
+        motion = wheel_motion(windows.v_left, windows.v_right, width_m)
+        if wheels is not None:
+            motion = motion._replace(gyro=windows.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
         fixed, free = model_columns(model, motion)
         self._w = windows
         self._fixed_omega = fixed[2]
@@ -95,7 +107,7 @@ class WindowResiduals:
         row, share = self._locate(at)
         knot_theta, knot_place = _between(theta, row, share), _between(place, row, share)
         knot_angle, knot_place_by = _between(self._angle, row, share), _between(place_by, row, share)
-        back = _direction(-knot_theta[w.start])
+        back = np.conj(_direction(np.real(knot_theta[w.start])))
         went = knot_place[w.end] - knot_place[w.start]
         d = back * went
         expected = w.reference * np.exp(-1j * offset)
@@ -122,11 +134,14 @@ class Pool:
     Parameters
     ----------
     windows, widths_m : by recording
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
     """
 
-    def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float], model: MotionModel) -> None:
+    def __init__(
+        self, windows: Sequence[Windows], widths_m: Sequence[float], model: MotionModel, wheels: Turning | None = None
+    ) -> None:
         self.model = model
-        self._parts = [WindowResiduals(w, model, width) for w, width in zip(windows, widths_m, strict=True)]
+        self._parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(windows, widths_m, strict=True)]
         self._windows = windows
         groups, offset = [], 0
         for w in windows:
@@ -136,15 +151,29 @@ class Pool:
         self.group = np.concatenate(groups)
         self.length_m = np.concatenate([np.tile(w.length_m, 2) for w in windows])
 
+    def own_constants(self, recording: int, parameters: Floats) -> Floats:
+        """Return the constants (3,) of one recording for given parameters of the model."""
+        part, free = self._parts[recording], self._constant_std()
+        kept = np.ones(len(self._windows[recording].start) * 2, np.bool_)
+
+        def evaluate(constants: Floats) -> tuple[Floats, Floats]:
+            residuals, slopes = part(parameters, constants)
+            return residuals, slopes[:, -3:]
+
+        return robust_least_squares(evaluate, np.zeros(3), np.zeros(3), free, overlap=len(kept) / 10.0).x
+
+    def _constant_std(self) -> Floats:
+        free = CONSTANT_STD.copy()
+        if not self.model.uses_gyro:
+            free[2] = 1e-9
+        return free
+
     @property
     def prior(self) -> tuple[Floats, Floats]:
         """Mean and standard deviation of all parameters, model first, then the constants of each recording."""
         count = len(self._parts)
-        free = CONSTANT_STD.copy()
-        if not self.model.uses_gyro:
-            free[2] = 1e-9
         mean = np.concatenate([self.model.prior_mean, np.zeros(3 * count)])
-        return mean, np.concatenate([self.model.prior_std, np.tile(free, count)])
+        return mean, np.concatenate([self.model.prior_std, np.tile(self._constant_std(), count)])
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
         """Return residuals (m,) of all windows of all recordings and their derivatives (m, k + 3 recordings)."""

@@ -4,8 +4,9 @@ A `Term` is one phi with its prior, a `MotionModel` a list of terms. Adding eith
 forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds are those at the
 configured wheel radius.
 
-The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is v_x = v + (y_r + y_l) / W w b / 2,
-v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model is the one without free terms.
+The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is
+v_x = v + (y_r + y_l) / W w b / 2, v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model is the one
+without free terms.
 """
 
 from __future__ import annotations
@@ -29,23 +30,24 @@ class WheelMotion(NamedTuple):
     ----------
     v, w : mean speed [m/s], (V_l - V_r) / b [rad/s]
     spin : |V_l - V_r| / (|V_l| + |V_r|): 0 straight ahead, 1 on the spot
-    gyro : turn rate [rad/s], clockwise; zeros where there is none
     b : track width [m]
+    gyro : turn rate of a gyro [rad/s], clockwise; turn : that of a wheels-only model; zeros where neither is used
     """
 
     v: Floats
     w: Floats
     spin: Floats
-    gyro: Floats
     b: float
+    gyro: Floats
+    turn: Floats
 
 
-def wheel_motion(v_left: Floats, v_right: Floats, width_m: float, gyro: Floats | None = None) -> WheelMotion:
+def wheel_motion(v_left: Floats, v_right: Floats, width_m: float) -> WheelMotion:
     """Return what the terms are made of, from speeds at the configured wheel radius (n,) [m/s]."""
     both = np.abs(v_left) + np.abs(v_right)
     spin = np.divide(np.abs(v_left - v_right), both, out=np.zeros_like(both), where=both > 0.0)
-    rate = np.zeros_like(both) if gyro is None else gyro
-    return WheelMotion((v_left + v_right) / 2.0, (v_left - v_right) / width_m, spin, rate, width_m)
+    none = np.zeros_like(both)
+    return WheelMotion((v_left + v_right) / 2.0, (v_left - v_right) / width_m, spin, width_m, none, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +80,21 @@ TERMS: dict[str, Term] = {
         Term("omega_w", OMEGA, lambda m: m.w, 1.0, 0.6, 0.4, "b / W, one over the multiplier (Mandow 2007)"),
         Term("omega_v", OMEGA, lambda m: m.v / m.b, 0.0, 0.0, 0.02, "left/right asymmetry: turns while driving ahead"),
         Term("vy_w", VY, lambda m: m.w * m.b / 2, 0.0, 0.0, 0.3, "-2 x_icr / W (Martinez 2005)"),
-        Term("vy_vw", VY, lambda m: m.v * m.w, 0.0, 0.0, 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"),
+        Term(
+            "vy_vw", VY, lambda m: m.v * m.w, 0.0, 0.0, 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"
+        ),
         Term("omega_sw", OMEGA, lambda m: m.spin * m.w, 0.0, 0.0, 0.3, "turn gain that depends on curvature"),
         Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, 0.0, 0.0, 0.2, "turn gain that depends on speed"),
         Term("vy_v", VY, lambda m: m.v, 0.0, 0.0, 0.02, "sideways while driving ahead (Anousaki 2004)"),
         Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, 0.0, 0.0, 0.1, "drag in turns (Seegmiller 2014)"),
-        Term("omega_gyro", OMEGA, lambda m: m.gyro, 0.0, 0.5, 0.5, "weight of the gyro in the turn rate"),
+        Term("gyro_scale", OMEGA, lambda m: m.gyro, 0.0, 0.0, 0.02, "scale error of the gyro"),
+        Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.5, "weight of the wheels in the turn rate"),
     )
 }
 """Every term by name."""
 
-GYRO_TERM = "omega_gyro"
+GYRO_TERMS = ("gyro_scale", "wheels_weight")
+"""Terms of a model with a gyro: the turn rate is the gyro's where a drive shows nothing of the wheels' turning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,13 +124,13 @@ class MotionModel:
 
     @property
     def uses_gyro(self) -> bool:
-        """Whether the turn rate is the weighted mean of wheels and gyro."""
-        return GYRO_TERM in self.terms
+        """Whether the turn rate is the weighted mean of a gyro's and that of a wheels-only model."""
+        return GYRO_TERMS[0] in self.terms
 
     def with_gyro(self) -> MotionModel:
-        """Return the same model, its turn rate a weighted mean with a gyro's; without slip it has the gyro's alone."""
-        turn = () if "omega_w" in self.terms else ("omega_w",)
-        return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*self.terms, *turn, GYRO_TERM), self.source)
+        """Return the same model, its turn rate the weighted mean of its own and a gyro's."""
+        moves = tuple(name for name in self.terms if TERMS[name].axis != OMEGA)
+        return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*moves, *GYRO_TERMS), self.source)
 
 
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
@@ -134,7 +140,9 @@ MODELS: dict[str, MotionModel] = {
     model.name: model
     for model in (
         MotionModel("no_slip", "no slip", (), "Pentzer 2014, Eqs. 38-39"),
-        MotionModel("multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier of diff_drive_controller"),
+        MotionModel(
+            "multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier of diff_drive_controller"
+        ),
         MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
         MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
         MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
@@ -151,7 +159,11 @@ def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Floa
     """Return the twist without the free terms (3, n) and the columns of the free terms (k, 3, n)."""
     fixed = np.zeros((3, len(motion.v)))
     free = np.zeros((len(model.terms), 3, len(motion.v)))
+    if model.uses_gyro:
+        fixed[OMEGA] = motion.gyro
     for term in TERMS.values():
+        if model.uses_gyro and term.axis == OMEGA:
+            continue
         if term.name not in model.terms and term.nominal:
             fixed[term.axis] += term.nominal * term.column(motion)
     for k, name in enumerate(model.terms):
@@ -187,28 +199,55 @@ class TrackGeometry(NamedTuple):
     radius_right: float
 
 
-def track_geometry(model: MotionModel, parameters: Floats, width_m: float) -> TrackGeometry:
+class TypicalDrive(NamedTuple):
+    """At what curvature and speed the robot turned, weighted with the square of w.
+
+    Attributes
+    ----------
+    spin : of `WheelMotion`; speed_mps, speed_abs_mps : mean of v and of its size
+    """
+
+    spin: float = 0.0
+    speed_mps: float = 0.0
+    speed_abs_mps: float = 0.0
+
+
+def typical_drive(motions: Sequence[tuple[WheelMotion, Floats]]) -> TypicalDrive:
+    """Return where robots turned; `motions` are wheel motions with how long each sample holds [s]."""
+    weight = np.concatenate([held * m.w**2 for m, held in motions])
+    if not weight.sum() > 0.0:
+        return TypicalDrive()
+    spin, v = np.concatenate([m.spin for m, _ in motions]), np.concatenate([m.v for m, _ in motions])
+    return TypicalDrive(*(float(weight @ column / weight.sum()) for column in (spin, v, np.abs(v))))
+
+
+def track_geometry(
+    model: MotionModel, parameters: Floats, width_m: float, typical: TypicalDrive | None = None
+) -> TrackGeometry:
     """Return ICRs, multiplier and radius factors of a model.
+
+    Parameters
+    ----------
+    typical : terms that are not linear in the speeds enter with the curvature and speed here; default zero
 
     Notes
     -----
-    y_r = (d v_x / d V_l) / (d omega / d V_l), y_l = -(d v_x / d V_r) / (-d omega / d V_r), x from the pure turn:
-    v_y = -x omega for w alone. Terms that are not linear in the speeds (turn gain with curvature and speed) enter at
-    the curvature and speed they have at spin 0 and speed 0. A radius factor of a side is that by which its speed must
-    be multiplied for one W to give the turn: a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
+    y_r = (d v_x / d V_l) / (d omega / d V_l), y_l = (d v_x / d V_r) / (d omega / d V_r), x from v_y = -x omega of a
+    turn. A radius factor of a side is that by which its speed must be multiplied for one W to give the turn:
+    a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
     """
+    at = typical if typical is not None else TypicalDrive()
     value = {name: TERMS[name].nominal for name in TERMS} | dict(zip(model.terms, parameters.tolist(), strict=True))
+    turn_gain = value["omega_w"] + value["omega_sw"] * at.spin + value["omega_vw"] * at.speed_abs_mps
     vx_left, vx_right = value["vx_v"] / 2 + value["vx_w"] / 2, value["vx_v"] / 2 - value["vx_w"] / 2
-    turn_left = (value["omega_v"] / 2 + value["omega_w"]) / width_m
-    turn_right = (value["omega_v"] / 2 - value["omega_w"]) / width_m
+    turn_left = (value["omega_v"] / 2 + turn_gain) / width_m
+    turn_right = (value["omega_v"] / 2 - turn_gain) / width_m
     y_right, y_left = vx_left / turn_left, vx_right / turn_right
     separation = y_right - y_left
-    # v_y = vy_w w b / 2 and omega = omega_w w where both sides turn against one another
-    x = -value["vy_w"] * width_m / 2 / value["omega_w"]
+    x = -(value["vy_w"] * width_m / 2 + value["vy_vw"] * at.speed_mps) / turn_gain
     return TrackGeometry(
-        y_right, y_left, x, separation / width_m, 1.0 / value["omega_w"],
-        separation * turn_left, -separation * turn_right,
-    )  # fmt: skip
+        y_right, y_left, x, separation / width_m, 1.0 / turn_gain, separation * turn_left, -separation * turn_right
+    )
 
 
 def find_model(name: str) -> MotionModel:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.open_loop import trial_ends
+from icrtool.motion.fit import Turning
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import MOVING_MPS, Recording, samples_a_step
 from icrtool.records.tables import Floats, Ints
@@ -49,38 +50,53 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     return Trials(starts, trial_ends(drive, np.array(horizons_m, np.float64))[starts])
 
 
-def trial_errors(
-    recording: Recording, trials: Trials, model: MotionModel, parameters: Floats, gyro_bias: float = 0.0
-) -> Floats:
+def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_read_later_s: float = 0.0) -> Floats:
     """Return the distance (k, h) [m] between open-loop position and reference at each trial's end, NaN for no trial.
 
     Parameters
     ----------
-    parameters : (k,) of the model's terms
-    gyro_bias : added to the turn rate of a model with a gyro [rad/s]
+    rates : (3, n) body twist of each wheel sample, of `twist_rates`
+    wheels_read_later_s : delay of the wheels against the poses, a constant of the recording
 
     Notes
     -----
     Euler steps as in `icrtool.kernels.open_loop`. The parameters are constants, so the path from any start is the same
     path, turned and shifted: one pass serves all.
     """
+    drive, held, t = recording.drive, recording.held_s, recording.t_s
     errors = np.full(trials.ends.shape, np.nan)
-    if not len(trials.starts):
-        return errors
-    first, stop = int(trials.starts[0]), max(int(trials.ends.max()), int(trials.starts[-1])) + 1
-    drive, rows = recording.drive, slice(first, stop)
-    gyro = recording.gyro_radps[rows] if model.uses_gyro and recording.gyro_radps is not None else None
-    motion = wheel_motion(drive.v_left[rows], drive.v_right[rows], recording.width_m, gyro)
-    v_x, v_y, omega = twist(model, parameters, motion)
-    if model.uses_gyro:
-        omega = omega + gyro_bias
-    held = recording.held_s[rows]
+    v_x, v_y, omega = rates[0], rates[1], rates[2]
     heading = np.concatenate([[0.0], np.cumsum(held * omega)])[:-1]
     place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * heading))])[:-1]
-    reference = drive.north[rows] + 1j * drive.east[rows]
-    turn = np.exp(1j * (drive.heading[rows] - heading))
+    if wheels_read_later_s:
+        later = t + wheels_read_later_s
+        heading, place = np.interp(later, t, heading), np.interp(later, t, place)
+    reference = drive.north + 1j * drive.east
+    turn = np.exp(1j * (drive.heading - heading))
     for h in range(errors.shape[1]):
         some = trials.ends[:, h] >= 0
-        s, e = trials.starts[some] - first, trials.ends[some, h] - first
+        s, e = trials.starts[some], trials.ends[some, h]
         errors[some, h] = np.abs(turn[s] * (place[e] - place[s]) - (reference[e] - reference[s]))
     return errors
+
+
+def twist_rates(
+    recording: Recording,
+    model: MotionModel,
+    parameters: Floats,
+    wheels: Turning | None = None,
+    gyro_bias: float = 0.0,
+) -> Floats:
+    """Return the body twist v_x, v_y, omega (3, n) of each wheel sample.
+
+    Parameters
+    ----------
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    gyro_bias : added to the turn rate [rad/s]
+    """
+    motion = wheel_motion(recording.drive.v_left, recording.drive.v_right, recording.width_m)
+    if wheels is not None and recording.gyro_radps is not None:
+        motion = motion._replace(gyro=recording.gyro_radps, turn=twist(wheels[0], wheels[1], motion)[2])
+    rates = twist(model, parameters, motion)
+    rates[2] += gyro_bias
+    return rates
