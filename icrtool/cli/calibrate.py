@@ -151,14 +151,14 @@ def _read(source: Path, config: Config, *, quiet: bool) -> tuple[RobotLog, Confi
     path = source
     if is_run_directory(source):
         from icrtool.errors import ConfigError
-        from icrtool.output.run_source import log_of, read_source, stored_config
+        from icrtool.output.stored_run import log_of, open_run
 
         if config.given_sections:
             section = min(config.given_sections)
             raise ConfigError(
                 f"[{section}]", "a finished run keeps the configuration it was made with", "name its log instead"
             )
-        run = read_source(source)
-        path, config = log_of(run), stored_config(run)
+        run = open_run(source)
+        path, config = log_of(run), run.config
     with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
         return read_log(path, config, progress), config
