@@ -15,8 +15,6 @@ from icrtool.kernels.ekf import (
     FilterParameters,
     FilterState,
     Measurements,
-    Nodes,
-    empty_nodes,
     filter_rows,
 )
 from icrtool.kernels.kinematics import Floats, euler_step
@@ -80,12 +78,12 @@ def run_batch(batch: Batch, parameters: FilterParameters) -> BatchOutput:
         gnss_nis=np.full((runs, len(batch.gnss_t)), np.nan),
         heading_nis=np.full((runs, len(batch.heading_t)), np.nan),
     )
-    _filter_runs(batch, parameters, first, out, empty_nodes(0))
+    _filter_runs(batch, parameters, first, out)
     return out
 
 
 @njit
-def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: BatchOutput, nodes: Nodes) -> None:
+def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: BatchOutput) -> None:
     n_gnss, n_heading = len(batch.gnss_t), len(batch.heading_t)
     gnss_code, heading_code = np.zeros(n_gnss, np.uint8), np.zeros(n_heading, np.uint8)
     residual, innovation, distance = np.zeros((n_gnss, 2)), np.zeros(n_heading), np.zeros(len(batch.wheel_t))
@@ -107,7 +105,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
                 out.x[run, begin - first : end - first], out.variance[run, begin - first : end - first], distance,
                 out.gnss_nis[run], gnss_code, residual, out.heading_nis[run], heading_code, innovation, state.P,
             )  # fmt: skip
-            filter_rows(data, begin, end, state, parameters, rows, nodes)
+            filter_rows(data, begin, end, state, parameters, rows, None)
             out.P[run, s] = state.P
             begin = end
 

@@ -292,7 +292,7 @@ def advance(
 @njit
 def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
     data: Measurements, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
-    nodes: Nodes,
+    nodes: Nodes | None,
 ) -> int:  # fmt: skip
     """Run the filter over wheel samples [begin, end); return the number of events.
 
@@ -300,16 +300,17 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
     ----------
     state : as the rows before left it; changed to what these leave
     out : its x, variance and distance are of these rows (end - begin, ...), the rest is of all measurements
-    nodes : filled with every event; without rows nothing is kept
+    nodes : filled with every event; None: nothing is kept (compiled as a function of its own)
 
     Notes
     -----
     At equal stamps: wheel speeds, terrain changes, GNSS, heading, then the state is recorded.
     """
     x, P, PH = state.x, state.P, np.zeros(6)
+    gnss_run, heading_run = state.rejected[0], state.rejected[1]
     n_gnss, n_heading, n_change = len(data.gnss_t), len(data.heading_t), len(data.change_t)
     t, travelled, j, h, c = state.t[0], state.distance[0], state.place[0], state.place[1], state.place[2]
-    keep, count = len(nodes.row) > 0, 0
+    count = 0
     for k in range(begin, end):
         held = max(k - 1, 0)
         t_wheel = data.wheel_t[k]
@@ -330,27 +331,27 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 for i in range(3, 6):
                     P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
                 c += 1
-            if keep:
+            if nodes is not None:
                 nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
                 nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
                 out.gnss_code[j], out.gnss_nis[j], nu_n, nu_e = take_fix(
                     t, data.gnss_z[j, 0], data.gnss_z[j, 1], data.gnss_r[j, 0], data.gnss_r[j, 1],
-                    x, P, PH, state.rejected[0], parameters, out.gnss_residual[j],
+                    x, P, PH, gnss_run, parameters, out.gnss_residual[j],
                 )  # fmt: skip
-                if keep and out.gnss_code[j] == RECOVERED:
+                if nodes is not None and out.gnss_code[j] == RECOVERED:
                     nodes.P_predicted[count, 0] += nu_n * nu_n
                     nodes.P_predicted[count, 6] += nu_e * nu_e
                 j += 1
             while h < n_heading and data.heading_t[h] <= t:
                 out.heading_code[h], out.heading_nis[h], nu = take_heading(
-                    t, data.heading_z[h], data.heading_r[h], x, P, PH, state.rejected[1], parameters
+                    t, data.heading_z[h], data.heading_r[h], x, P, PH, heading_run, parameters
                 )
                 out.heading_innovation[h] = nu
-                if keep and out.heading_code[h] == RECOVERED:
+                if nodes is not None and out.heading_code[h] == RECOVERED:
                     nodes.P_predicted[count, 11] += nu * nu
                 h += 1
-            if keep:
+            if nodes is not None:
                 nodes.x[count], nodes.P[count] = x, P
                 nodes.row[count] = k - begin if t >= t_wheel else -1
             count += 1
@@ -371,10 +372,10 @@ def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
-    state, out, nodes = start_state(data, t0, x0, P0), empty_output(data, last - first), empty_nodes(0)
+    state, out = start_state(data, t0, x0, P0), empty_output(data, last - first)
     events = last + len(data.gnss_t) + len(data.heading_t)
     for begin, end in pairwise((*range(first, last, max(last * BLOCK_EVENTS // max(events, 1), 1)), last)):
-        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), nodes)
+        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), None)
     return out._replace(P=state.P)
 
 

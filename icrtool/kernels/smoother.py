@@ -163,11 +163,11 @@ def run_smoother(
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
     borders = [*range(first, last, chunk_rows), last]
     state, forward = start_state(data, t0, x0, P0), empty_output(data, min(chunk_rows, last - first))
-    saved, nodes = [], empty_nodes(0)
+    saved = []
     for begin, end in pairwise(borders):
         saved.append(state.copy())
         if end < last:
-            filter_rows(data, begin, end, state, parameters, forward, nodes)
+            filter_rows(data, begin, end, state, parameters, forward, None)
     out = Smoothed(np.empty((last - first, 6)), np.empty((last - first, 6)))
     later, xs, Ps = np.full(31, np.nan), np.zeros(6), np.zeros((6, 6))
     for (begin, end), state in zip(reversed(list(pairwise(borders))), reversed(saved), strict=True):

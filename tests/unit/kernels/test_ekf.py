@@ -126,7 +126,7 @@ def test_the_kernel_equals_its_python_function() -> None:
     out = run_filter(data, t0, x0, P0, parameters())
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
     state, again = ekf.start_state(data, t0, x0, P0), ekf.empty_output(data, last - first)
-    ekf.filter_rows.py_func(data, first, last, state, parameters(), again, ekf.empty_nodes(0))  # type: ignore[attr-defined]
+    ekf.filter_rows.py_func(data, first, last, state, parameters(), again, None)  # type: ignore[attr-defined]
     again = again._replace(P=state.P)
     for name in out._fields:
         np.testing.assert_allclose(getattr(out, name), getattr(again, name), rtol=1e-12, atol=1e-12, err_msg=name)
