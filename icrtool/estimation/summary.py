@@ -82,8 +82,9 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     Returns
     -------
     dict
-        By column: seconds at which the estimate has gone 10 % and 90 % of the way from its start to its settled
-        value (median over the second half of the run), or None where it hardly moved or never settled.
+        By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
+        (median over the second half of the run), and time from which on it stays within 10 % of that change for
+        `SETTLED_S`; None where the change is below `SMALLEST_CHANGE_M` or the estimate never settles.
 
     Notes
     -----
