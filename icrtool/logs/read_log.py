@@ -27,6 +27,7 @@ from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_sta
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.records.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
+from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
 
@@ -35,8 +36,8 @@ Progress = Callable[[float], None]
 class Survey:
     """A log after one pass: its channels, all candidates, what was lost, its files."""
 
-    name: str
-    path: str
+    name: LogText
+    path: LogText
     channels: tuple[Channel, ...]
     tables: tuple[TopicTable, ...]
     candidates: Candidates
@@ -70,8 +71,8 @@ def survey_log(path: str | Path, config: Config | None = None, progress: Progres
     finally:
         container.close()
     return Survey(
-        name=log_name(path),
-        path=str(path),
+        name=LogText(log_name(path)),
+        path=LogText(str(path)),
         channels=channels,
         tables=tuple(tables),
         candidates=find_candidates(tables, config, unread),
@@ -140,7 +141,7 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
         _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )
-    unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
+    unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
@@ -245,7 +246,7 @@ def _fixes(
         var_north,
         var_east,
         covariance,
-        told_class=None if source.told_class is None else source.told_class[rows],
+        stated_class=None if source.stated_class is None else source.stated_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 

@@ -19,7 +19,7 @@ Bytes = NDArray[np.uint8]
 Role = Literal["wheels", "gnss", "heading"]
 
 
-NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
+NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
 """What a message says of how its position was solved: nothing, without carrier phase (or unknown), RTK float, RTK
 fixed, RTK without saying which."""
 
@@ -57,7 +57,7 @@ class PositionFixes:
     stamp_ns : int64 (n,), non-decreasing
     north_m, east_m : float64 (n,)
     var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
-    told_class : uint8 (n,), NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
+    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
     """
 
     stamp_ns: Ints
@@ -66,10 +66,10 @@ class PositionFixes:
     var_north_m2: Floats
     var_east_m2: Floats
     cov_north_east_m2: Floats
-    told_class: Bytes | None = None
+    stated_class: Bytes | None = None
 
     def __post_init__(self) -> None:
-        told = () if self.told_class is None else (self.told_class,)
+        told = () if self.stated_class is None else (self.stated_class,)
         _check_lengths(
             self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2, *told
         )

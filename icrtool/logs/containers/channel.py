@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText, escaped, shortened
 
 Bytes = NDArray[np.uint8]
 
-MOST_PROBLEMS = 20
+MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 
 MOST_NAMED = 12
 """Names that a message lists before it says that there are more."""
@@ -38,9 +39,9 @@ class Channel:
     """
 
     id: int
-    topic: str
-    message_type: str
-    encoding: str
+    topic: LogText
+    message_type: LogText
+    encoding: LogText
     definition: str = ""
     definition_format: Literal["msg", "idl"] = "msg"
     count: int | None = None
@@ -100,13 +101,13 @@ class Problems(list[str]):
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        self._name = name
+        self._name = LogText(name)
 
     def say(self, problem: str) -> None:
         """Add a sentence."""
-        text = printable(f"{self._name}: {problem}")
+        text = shortened(escaped(f"{self._name}: {problem}"), LONGEST_PROBLEM)
         if text not in self and len(self) <= MOST_PROBLEMS:
-            self.append(text if len(self) < MOST_PROBLEMS else printable(f"{self._name}: and more of the kind"))
+            self.append(text if len(self) < MOST_PROBLEMS else f"{self._name}: and more of the kind")
 
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
@@ -119,17 +120,13 @@ def with_possible_times(block: Block, problems: Problems) -> Block:
     return Block(block.data, *(column[possible] for column in columns))
 
 
-def printable(text: str) -> str:
-    """Return a text from a log fit for one line: what is no printable character becomes a replacement character."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 def some_of(names: Sequence[str]) -> str:
-    """Return names in a row, the first ones of many."""
-    return ", ".join([*names[:MOST_NAMED], *(["…"] if len(names) > MOST_NAMED else [])])
+    """Return names from a log in a row, the first ones of many."""
+    shown = [str(LogText(name)) for name in names[:MOST_NAMED]]
+    return ", ".join([*shown, *(["…"] if len(names) > MOST_NAMED else [])])
 
 
-def ros_type_name(name: str) -> str:
+def ros_type_name(name: str) -> LogText:
     """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``."""
-    package, _, rest = printable(name).partition("/")
-    return f"{package}/{rest.removeprefix('msg/')}"
+    package, _, rest = name.partition("/")
+    return LogText(f"{package}/{rest.removeprefix('msg/')}")

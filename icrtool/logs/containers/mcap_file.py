@@ -17,12 +17,12 @@ from icrtool.logs.containers.channel import (
     Bytes,
     Channel,
     Problems,
-    printable,
     ros_type_name,
     with_possible_times,
 )
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress, unpack_messages
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from mcap.records import Channel as McapChannel
@@ -117,9 +117,9 @@ class McapFile:
         encoding, written = channel.message_encoding, schema.encoding if schema else ""
         return Channel(
             id=number,
-            topic=printable(channel.topic),
-            message_type=ros_type_name(schema.name) if schema else "",
-            encoding=printable(encoding),
+            topic=LogText(channel.topic),
+            message_type=ros_type_name(schema.name) if schema else LogText(""),
+            encoding=LogText(encoding),
             definition=schema.data.decode("utf-8", "replace") if schema and (encoding, written) in _ENCODINGS else "",
             definition_format="idl" if written == "ros2idl" else "msg",
             count=self._counts.get(number) if self._chunks is not None else None,

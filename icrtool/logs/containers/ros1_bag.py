@@ -10,10 +10,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import Block, Bytes, Channel, Problems, printable, ros_type_name
+from icrtool.logs.containers.channel import Block, Bytes, Channel, Problems, ros_type_name
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress
 from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
@@ -212,9 +213,9 @@ class Ros1Bag:
             return
         self._connections[number] = Channel(
             id=number,
-            topic=printable(topic or fields.get(b"topic", "")),
+            topic=LogText(topic or fields.get(b"topic", "")),
             message_type=ros_type_name(fields[b"type"]),
-            encoding="ros1",
+            encoding=LogText("ros1"),
             definition=fields.get(b"message_definition", ""),
         )
 

@@ -13,8 +13,9 @@ from urllib.parse import quote
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import Block, Channel, Problems, printable, ros_type_name, with_possible_times
+from icrtool.logs.containers.channel import Block, Channel, Problems, ros_type_name, with_possible_times
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
+from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
 _FIRST_ROWS, _MOST_ROWS = 64, 4096
@@ -59,7 +60,7 @@ class SqliteBag:
                 self.close()
                 raise
         except _DAMAGE as err:
-            found = "; ".join([printable(str(err)), *self.problems])
+            found = "; ".join([str(err), *self.problems])
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def share_read(self) -> float:
@@ -123,9 +124,9 @@ class SqliteBag:
             channels.append(
                 Channel(
                     id=number,
-                    topic=printable(str(topic)),
+                    topic=LogText(str(topic)),
                     message_type=ros_type_name(str(name)),
-                    encoding=printable(str(encoding)),
+                    encoding=LogText(str(encoding)),
                     definition=text if written in ("ros2msg", "ros2idl") else "",
                     definition_format="idl" if written == "ros2idl" else "msg",
                 )

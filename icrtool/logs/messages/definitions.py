@@ -9,6 +9,7 @@ from typing import Any
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.schema import BASE, NAME, Definitions
+from icrtool.records.text import LONGEST_NAME, shortened
 
 _SEPARATOR = "=" * 80 + "\n"
 _TIME: Definitions = {
@@ -74,7 +75,7 @@ def parse_definition(channel: Channel) -> Definitions:
         for part in parts:
             types.update(get_types_from_idl(part.split("\n", 1)[1]))
     except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
-        first = str(err).partition("\n")[0]
+        first = shortened(str(err).partition("\n")[0], LONGEST_NAME)
         raise DefinitionError(channel.message_type, "the definition in the log cannot be parsed", first) from err
     return types
 

@@ -14,6 +14,7 @@ from icrtool.logs.messages.decoder import empty_table, walk_into
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText
 
 _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
@@ -36,11 +37,11 @@ class TopicTable:
     definition_source : where the message definition came from
     """
 
-    topic: str
-    message_type: str
+    topic: LogText
+    message_type: LogText
     log_time_ns: Ints
     columns: dict[str, NDArray[Any]]
-    texts: dict[str, list[str]]
+    texts: dict[str, list[LogText]]
     unreadable: int
     definition_source: str
 
@@ -64,7 +65,7 @@ class TopicTable:
             raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
         return values
 
-    def words(self, path: str) -> tuple[Ints, list[str]]:
+    def words(self, path: str) -> tuple[Ints, list[LogText]]:
         """Return a column of texts as indices (n,) or (n, k), -1 where a message has less, and the texts.
 
         Raises
@@ -86,10 +87,10 @@ class TopicTable:
         columns = {path: values[chosen] for path, values in self.columns.items()}
         return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
 
-    def text(self, path: str) -> str:
+    def text(self, path: str) -> LogText:
         """Return the first text of a text field, empty when there is none."""
         texts = self.texts.get(path)
-        return texts[0] if texts else ""
+        return texts[0] if texts else LogText("")
 
 
 @dataclass(slots=True)
@@ -136,7 +137,7 @@ class TopicCollector:
     _rows: _Rows = field(default_factory=_Rows)
     _times: list[Ints] = field(default_factory=list)
     _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
-    _texts: dict[str, dict[int, str]] = field(default_factory=dict)
+    _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
     def __post_init__(self) -> None:
@@ -196,7 +197,8 @@ class TopicCollector:
             for code, row in zip(codes.tolist(), first.tolist(), strict=True):
                 if code not in texts:
                     place, length = int(told[row, 0]), int(told[row, 1])
-                    texts[code] = block.data[place : place + length].tobytes().decode("utf-8", "replace")
+                    raw = block.data[place : place + length].tobytes()
+                    texts[code] = LogText(raw.decode("utf-8", "replace"))
 
     def _settle(self) -> None:
         """Turn the filled rows into columns, and have them free again."""
@@ -237,7 +239,7 @@ class TopicCollector:
         self._times.clear()
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
         columns: dict[str, NDArray[Any]] = {}
-        texts: dict[str, list[str]] = {}
+        texts: dict[str, list[LogText]] = {}
         unreadable, self._unreadable = self._unreadable, 0
         gathered, self._parts = self._parts, {}
         for path, parts in gathered.items():
@@ -272,7 +274,7 @@ def _merged(group: list[TopicTable]) -> TopicTable:
     times = np.concatenate([table.log_time_ns for table in group])
     order = np.argsort(times, kind="stable")
     columns: dict[str, NDArray[Any]] = {}
-    texts: dict[str, list[str]] = {}
+    texts: dict[str, list[LogText]] = {}
     # Publishers may have been built from different versions of the type: what all of them tell is kept.
     for path in group[0].columns:
         if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):
