@@ -47,6 +47,43 @@ class Channel:
     count: int | None = None
 
 
+class Cut(NamedTuple):
+    """The part of a log that is read: log times in [begin_ns, end_ns); the channels in `whole` are read in full."""
+
+    begin_ns: int = 0
+    end_ns: int = LATEST_NS
+    whole: frozenset[int] = frozenset()
+
+    def needs(self, held: frozenset[int] | None, begin_ns: int, end_ns: int, wanted: frozenset[int]) -> bool:
+        """Return whether a chunk has to be read.
+
+        Parameters
+        ----------
+        held : its channels, None where no index says
+        begin_ns, end_ns : its first and last log time by the index; 0 and 0 where that is not known
+        """
+        if held is not None and not held & wanted:
+            return False
+        known = 0 < begin_ns <= end_ns
+        outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
+        return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
+
+    def of(self, block: Block) -> Block:
+        """Return a block without the messages outside the cut."""
+        if self == WHOLE:
+            return block
+        inside = (block.log_time_ns >= self.begin_ns) & (block.log_time_ns < self.end_ns)
+        if self.whole:
+            inside |= np.isin(block.channel, list(self.whole))
+        if inside.all():
+            return block
+        _, *columns = block
+        return Block(block.data, *(column[inside] for column in columns))
+
+
+WHOLE = Cut()
+
+
 class Block(NamedTuple):
     """Messages that share one buffer. Valid until the next block is asked for.
 
@@ -83,8 +120,15 @@ class Container(Protocol):
         """The files that make up this log."""
         ...
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the channels in `wanted` (others may be among them), in file order."""
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+        """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
+
+        What an index shows to be outside the cut is not read.
+        """
+        ...
+
+    def begin_ns(self) -> int | None:
+        """Return the log time of the first message, None where only reading the log shows it."""
         ...
 
     def share_read(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -21,6 +22,13 @@ _LARGEST_CAPACITY = 256
 
 _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: the columns would be such a distance apart, and fall on the same few lines of the cache."""
+
+_FIRST_ROWS = 64
+"""Rows that a topic begins with; they double as its messages come: a log may hold thousands of topics."""
+
+_LARGEST_TABLE = 1 << 22
+_MOST_BYTES_AT_ONCE = 1 << 24
+"""Numbers in a table of rows, and bytes of messages that one compiled call goes through: it cannot be interrupted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +171,11 @@ class TopicCollector:
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
         start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
+        for rows in _pieces(end - start, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1)):
+            self._feed(block, start[rows], end[rows], times[rows])
+
+    def _feed(self, block: Block, start: Ints, end: Ints, times: Ints) -> None:
+        """Add some messages of a block."""
         new = self._walk(block, start, end, times)
         most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
         if self._capacity < min(most, self.largest_capacity):
@@ -179,13 +192,18 @@ class TopicCollector:
         """Walk messages into the rows behind the filled ones; return those rows that are not like the one before."""
         if self._rows.filled + len(start) > len(self._rows.table):
             self._settle()
-        if len(start) > len(self._rows.table):
-            self._rows = _Rows.empty(self.layout, max(len(start), _ROWS_AT_ONCE))
+            if len(self._rows.table) < max(len(start), self._more_rows()):
+                self._rows = _Rows.empty(self.layout, max(len(start), self._more_rows()))
         rows = slice(self._rows.filled, self._rows.filled + len(start))
         table, readable, walked = self._rows.table[rows], self._rows.readable[rows], self._rows.walked[rows]
         walk_into(self.layout, block.data, start, end, table, readable, walked)
         self._rows.times_ns[rows] = times_ns
         return table[readable & walked]
+
+    def _more_rows(self) -> int:
+        """Return the rows of the next table: twice those of the present one, within bounds."""
+        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1))
+        return min(max(2 * len(self._rows.table), _FIRST_ROWS), most)
 
     def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
         """Learn the texts of a text field that are in some rows and were not seen before."""
@@ -257,6 +275,16 @@ class TopicCollector:
             unreadable,
             self._source,
         )
+
+
+def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
+    """Return slices of messages of some sizes [bytes] (n,), each of bounded rows and, but for one message, bytes."""
+    if len(sizes) <= most_rows and int(sizes.sum()) <= _MOST_BYTES_AT_ONCE:
+        return [slice(0, len(sizes))]
+    whole = np.cumsum(sizes) // _MOST_BYTES_AT_ONCE
+    edges = np.flatnonzero(np.diff(whole, prepend=-1))
+    edges = np.unique(np.concatenate([edges, np.arange(0, len(sizes), most_rows), [len(sizes)]]))
+    return [slice(int(begin), int(end)) for begin, end in pairwise(edges)]
 
 
 def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
