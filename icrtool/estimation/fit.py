@@ -12,6 +12,7 @@ from icrtool.alignment.heading_alignment import HeadingCheck, check_heading
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import measure_delays
 from icrtool.alignment.wheel_alignment import check_wheels
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import WarmStart, check_start, wheel_gap_s
 from icrtool.estimation.noise_adaptation import AdaptedRun, run_adaptively
@@ -129,6 +130,7 @@ def fit(
     """
     config = config if config is not None else Config()
     check_start(config)
+    log = with_wheel_speeds(log, config)
     check_streams(log)
     wheels = check_wheels(log, config)
     log = wheels.log

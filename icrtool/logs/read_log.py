@@ -158,14 +158,21 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
             warnings.append(f"{name}: {role}: {stamps.note}; log time is used")
     gnss, datum, rejected = _fixes(position, config, clock, name)
     heading, convention = _headings(source, config, clock, name)
-    samples, how, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, gnss, name)
+    samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
     if source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
+    quantity = "position" if samples.from_position else "speed"
     streams = (
-        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
+        _stream(
+            "wheels",
+            motion,
+            samples.stamp_ns,
+            clock,
+            f"{choice.why['wheels']}; {quantity}",
+        ),
         _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
         _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )

@@ -30,6 +30,9 @@ def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
         raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
 
 
+WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]
+
+
 @dataclass(frozen=True, slots=True)
 class WheelSamples:
     """Speeds of the left and the right side.
@@ -37,15 +40,35 @@ class WheelSamples:
     Attributes
     ----------
     stamp_ns : int64 (n,), strictly increasing
-    v_left_mps, v_right_mps : float64 (n,), forward positive, each held over [k, k+1)
+    left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
+    unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
+        configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
+    from_position : the log sends positions, of which these are the mean speeds to the next sample
     """
 
     stamp_ns: Ints
-    v_left_mps: Floats
-    v_right_mps: Floats
+    left: Floats
+    right: Floats
+    unit: WheelUnit = "mps"
+    from_position: bool = False
 
     def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.v_left_mps, self.v_right_mps)
+        _check_lengths(self.stamp_ns, self.left, self.right)
+
+    @property
+    def v_left_mps(self) -> Floats:
+        """Speed of the left side [m/s], (n,)."""
+        return self._in_mps(self.left)
+
+    @property
+    def v_right_mps(self) -> Floats:
+        """Speed of the right side [m/s], (n,)."""
+        return self._in_mps(self.right)
+
+    def _in_mps(self, speed: Floats) -> Floats:
+        if self.unit not in ("mps", "m"):
+            raise ValueError(f"wheels in {self.unit} per second: icrtool.alignment.wheel_units makes speeds of them")
+        return speed
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,18 +30,19 @@ class Inflation:
     def __init__(self) -> None:
         self._left = LARGEST_CHUNK_BYTES
 
-    def spend(self, packed: int, unpacked: int) -> None:
-        """Count a chunk that is `packed` bytes long and becomes `unpacked`.
+    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
+        """Decompress a chunk as `decompress` does.
 
         Raises
         ------
         DecompressionError
-            More than `LARGEST_RATIO` times what was read so far, and a chunk of the largest size.
+            Damaged data; or the chunks before this one inflated more than `LARGEST_RATIO` times and one chunk.
         """
-        self._left += LARGEST_RATIO * packed - unpacked
         if self._left < 0:
-            self._left -= LARGEST_RATIO * packed - unpacked
-            raise DecompressionError(f"the log would inflate more than {LARGEST_RATIO} times")
+            raise DecompressionError(f"the log inflates more than {LARGEST_RATIO} times")
+        out = decompress(data, compression, size, partial=partial)
+        self._left += LARGEST_RATIO * len(data) - len(out)
+        return out
 
 
 class DecompressionError(Exception):

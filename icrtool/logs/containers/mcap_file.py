@@ -26,7 +26,6 @@ from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     DecompressionError,
     Inflation,
-    decompress,
     unpack_messages,
 )
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
@@ -368,8 +367,7 @@ def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
     packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
     if len(packed) < length and not cut:
         raise DecompressionError("its header is damaged")
-    inflation.spend(len(packed), size)
-    data = decompress(packed, compression, size, partial=cut)
+    data = inflation.decompress(packed, compression, size, partial=cut)
     if checksum and not cut and zlib.crc32(data) != checksum:
         raise DecompressionError("its checksum is wrong")
     return data

@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, Problems, ros_type_name
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, decompress
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
 from icrtool.records.tables import Ints
 from icrtool.records.text import LogText
@@ -201,8 +201,8 @@ class Ros1Bag:
                 raise DecompressionError(f"it claims {record.length} bytes")
             self._stream.seek(record.at)
             packed = self._stream.read(record.length)
-            self._inflation.spend(len(packed), size)
-            data = np.frombuffer(decompress(packed, record.text(b"compression"), size, partial=cut), np.uint8)
+            records = self._inflation.decompress(packed, record.text(b"compression"), size, partial=cut)
+            data = np.frombuffer(records, np.uint8)
         except DecompressionError as err:
             if not cut:
                 self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")

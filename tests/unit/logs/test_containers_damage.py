@@ -660,7 +660,9 @@ def test_an_sqlite_file_that_is_no_bag_is_refused(tmp_path, tables):
     database = sqlite3.connect(path)
     database.executescript(f"{tables}; PRAGMA user_version = 3;")
     database.close()
-    with pytest.raises(LogError, match="not a readable rosbag2 database; its tables are "):
+    with pytest.raises(
+        LogError, match="not a readable rosbag2 database; (its tables are|messages is not a plain table)"
+    ):
         open_log(path)
 
 
@@ -710,7 +712,7 @@ def test_a_compressed_file_that_is_none_is_refused(tmp_path, content):
 def test_a_compressed_file_that_is_a_bomb_does_not_fill_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(bag_directory, "LARGEST_CHUNK_BYTES", 1 << 20)
-    monkeypatch.setattr(bag_directory, "_LARGEST_RATIO", 10)
+    monkeypatch.setattr(bag_directory, "LARGEST_RATIO", 10)
     path = write_directory(tmp_path / "log", make_messages(2), mode=CompressionMode.FILE)
     (file,) = path.glob("*.zstd")
     file.write_bytes(rle_bomb(100_000))
