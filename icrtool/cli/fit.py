@@ -31,6 +31,8 @@ class FitRequest(NamedTuple):
     smooths: bool
     quiet: bool
     verbose: bool
+    start: str | None = None
+    end: str | None = None
 
 
 @click.command("fit")
@@ -56,11 +58,12 @@ class FitRequest(NamedTuple):
     help="Inflate the ICR covariance T seconds after the start; auto: where the ICRs are found to change. Repeatable.",
 )
 @click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
+@options.cut
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[str, ...], smooths: bool,
+    warm_start: Path | None, changes: tuple[str, ...], smooths: bool, start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -78,7 +81,7 @@ def command(
     config = options.load(config_file, robot, sets)
     request = FitRequest(
         config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
-        change_times(changes), AUTO in changes, smooths, quiet, verbose,
+        change_times(changes), AUTO in changes, smooths, quiet, verbose, start, end,
     )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
@@ -171,7 +174,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         from icrtool.logs import read_log
 
         options.load_ahead("pymap3d", "icrtool.estimation.fit")
-        measured = read_log(log, request.config, progress)
+        measured = read_log(log, request.config, progress, start=request.start, end=request.end)
     from icrtool.estimation.fit import fit
 
     run = fit(

@@ -56,14 +56,15 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     first = 0
     if isinstance(start, float) or isinstance(end, float):
         first = _first_ns(container)
-    begin_ns = max(_log_time(start, first), 0) if start is not None else 0
-    end_ns = _log_time(end, first) if end is not None else LATEST_NS
+    begin_ns = max(nanoseconds(start, first), 0) if start is not None else 0
+    end_ns = nanoseconds(end, first) if end is not None else LATEST_NS
     if begin_ns >= end_ns:
         raise DataError(log, "the part to read ends before it begins", "give an end later than the start")
     return Cut(begin_ns, min(end_ns, LATEST_NS))
 
 
-def _log_time(given: float | datetime, first_ns: int) -> int:
+def nanoseconds(given: float | datetime, first_ns: int) -> int:
+    """Return a moment as log time [ns]."""
     if isinstance(given, datetime):
         passed = given - datetime(1970, 1, 1, tzinfo=UTC)
         return (passed.days * 86_400 + passed.seconds) * 1_000_000_000 + passed.microseconds * 1000

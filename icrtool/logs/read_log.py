@@ -24,11 +24,22 @@ from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
-from icrtool.logs.streams.stamps import increasing, rate_and_jitter
+from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
-from icrtool.records.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
+from icrtool.logs.table_file import is_table, read_table
+from icrtool.records.tables import (
+    Datum,
+    HeadingSamples,
+    InputFile,
+    Ints,
+    PositionFixes,
+    RobotLog,
+    Role,
+    StreamChoice,
+    rate_and_jitter,
+)
 from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
@@ -111,7 +122,7 @@ def read_log(
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the log read so far, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -129,6 +140,8 @@ def read_log(
         Streams without usable samples.
     """
     config = config if config is not None else Config()
+    if is_table(Path(path)):
+        return read_table(Path(path), start, end)
     return assemble(survey_log(path, config, progress, start=start, end=end), config)
 
 

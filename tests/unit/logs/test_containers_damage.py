@@ -661,7 +661,7 @@ def test_an_sqlite_file_that_is_no_bag_is_refused(tmp_path, tables):
     database.executescript(f"{tables}; PRAGMA user_version = 3;")
     database.close()
     with pytest.raises(
-        LogError, match="not a readable rosbag2 database; (its tables are|messages is not a plain table)"
+        LogError, match=r"not a readable rosbag2 database; (its tables are|messages is not a plain table)"
     ):
         open_log(path)
 
