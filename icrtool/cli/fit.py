@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import click
 
 from icrtool.cli import options
+from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -170,7 +171,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     check_target(directory)
     before = log_of_run(directory)
     start = read_warm_start(request.warm_start) if request.warm_start is not None else None
-    with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
+    with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
         options.load_ahead("pymap3d", "icrtool.estimation.fit")
@@ -197,7 +198,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         from icrtool.output.tables.run import format_run
 
         click.echo(format_run(run))
-        click.echo(f"\nwritten to {directory}{_beside(request)}")
+        click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
     for stream in measured.streams:
         if request.verbose or ("chosen over" in stream.why and not request.quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

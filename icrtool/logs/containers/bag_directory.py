@@ -18,7 +18,7 @@ from icrtool.logs.containers.one_recording import Span, check_spans, storage_fil
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.records.tables import Ints
 
-_LARGEST_METADATA_BYTES, _MOST_FILES = 1 << 18, 10_000
+_LARGEST_METADATA_BYTES, _MOST_FILES, _DEEPEST = 1 << 18, 10_000, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
 
 
@@ -214,7 +214,7 @@ def _metadata(text: str) -> _Metadata:
     )
 
 
-def _plain_yaml(text: str) -> object:
+def _plain_yaml(text: str) -> object:  # noqa: PLR0912 - one branch for each kind of event
     """Return a YAML text as dicts, lists and strings.
 
     An alias, with which a short text can stand for gigabytes, is refused; merge keys are keys like any other.
@@ -259,6 +259,8 @@ def _plain_yaml(text: str) -> object:
                 raise ValueError("a key is no text")
             if isinstance(value, dict | list):
                 open_ones.append((value, []))
+                if len(open_ones) > _DEEPEST:
+                    raise ValueError("nested too deeply")
     except YAMLError as err:
         raise ValueError("no YAML") from err
     documents = open_ones[0][0]

@@ -141,7 +141,7 @@ class SqliteBag:
         sqlite3.DatabaseError
             A table of a recorder is a view, a virtual table, or has computed columns.
         """
-        query = "SELECT name, type FROM pragma_table_list WHERE schema = 'main'"
+        query = "SELECT name, type FROM pragma_table_list WHERE schema = 'main' AND NOT wr"
         kinds = {name: kind for name, kind in self._database.execute(query).fetchmany(_MOST_TOPICS) if name in _TABLES}
         for name, kind in kinds.items():
             columns = self._database.execute(f"PRAGMA table_xinfo({name})").fetchall()

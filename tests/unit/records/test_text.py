@@ -23,12 +23,12 @@ def test_whatever_is_made_of_it_is_printable(raw: str) -> None:
         str(text),
         f"{text}",
         f"{text:>9}",
-        "%s" % text,
+        "{}".format(text),  # noqa: UP032 - what is tested
         "".join(iter([text, text])),
         text + "",
         text[:],
         repr(text),
-    ]  # noqa: UP031
+    ]
     made += [*text.partition("a"), text.strip(), f"{LogError(text, text, text)}", f"{[text]}", f"{LogError(raw, raw)}"]
     assert all(each.isprintable() for each in made)
     assert text.raw == raw
