@@ -13,6 +13,7 @@ from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import StreamDelays, measure_delays
 from icrtool.alignment.wheel_alignment import WheelCheck, check_wheels
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
 from icrtool.records.tables import PositionFixes, RobotLog
@@ -36,6 +37,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
+    log = with_wheel_speeds(log, config)
     check_streams(log)
     wheels = check_wheels(log, config)
     heading = check_heading(wheels.log, config, wheels.course)
@@ -66,6 +68,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
             "heading": heading.summary() | delays.heading_summary(),
             "gnss": delays.gnss_summary(),
         },
+        streams=log.streams,
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",

@@ -82,8 +82,8 @@ def busiest_part(log: RobotLog) -> RobotLog:
         wheels=replace(
             wheels,
             stamp_ns=wheels.stamp_ns[rows],
-            v_left_mps=wheels.v_left_mps[rows],
-            v_right_mps=wheels.v_right_mps[rows],
+            left=wheels.left[rows],
+            right=wheels.right[rows],
         ),
         gnss=log.gnss.cut(fixes),
         heading=HeadingSamples(*(getattr(log.heading, name)[samples] for name in HeadingSamples.__slots__)),

@@ -20,7 +20,7 @@ from icrtool.records.run import Run
 from icrtool.records.tables import (
     FIXED_FIX,
     FLOAT_FIX,
-    NOT_TOLD,
+    NOT_STATED,
     OTHER_FIX,
     RTK_FIX,
     Bools,
@@ -74,8 +74,8 @@ def confess(log: RobotLog, float_: Bools, how: str) -> RobotLog:
     if how == "status":
         told[float_] = OTHER_FIX
     if how == "not":
-        told = np.full(len(float_), NOT_TOLD, np.uint8)
-    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), told_class=told))
+        told = np.full(len(float_), NOT_STATED, np.uint8)
+    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), stated_class=told))
 
 
 def icrs(run: Run) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_outliers_are_no_jumps_and_no_float() -> None:
 def test_float_throughout_is_no_loss_and_keeps_the_variance_it_states() -> None:
     log = clean()
     told = np.full(len(log.gnss.stamp_ns), FLOAT_FIX, np.uint8)
-    run = fit(replace(log, gnss=replace(log.gnss, told_class=told)), load_config(sets=[WIDTH]))
+    run = fit(replace(log, gnss=replace(log.gnss, stated_class=told)), load_config(sets=[WIDTH]))
     assert not run.sensors.fixes.down_weighted.any()
     assert not len(run.outages_ns)
     assert np.array_equal(run.sensors.fixes.var_north_m2, log.gnss.var_north_m2)
@@ -208,7 +208,7 @@ def park_then_drive(told: int, jitter_s: float = 0.03) -> RobotLog:
     )
 
 
-@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_TOLD])
+@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_STATED])
 def test_stamps_that_jitter_are_no_float_where_a_robot_parks_and_then_drives(told: int) -> None:
     log = park_then_drive(told)
     run = fit(log, load_config(sets=[WIDTH]))
@@ -242,8 +242,8 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
 def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float, real_m: float, words: str) -> None:
     log = replace(make_log(3, seconds=60.0, gnss_std=real_m), datum=clean().datum)
     count = len(log.gnss.stamp_ns)
-    said, told_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
-    log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, told_class=told_class))
+    said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
     quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
     assert quality.warnings == (f"made: {words}",)
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
@@ -266,7 +266,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> 
     log, float_ = lose_rtk(clean(), at_once=True)
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
-    log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, told_class=told))
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
     quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
     assert quality.sold.any()
     assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]

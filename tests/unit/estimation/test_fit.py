@@ -156,7 +156,7 @@ def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() 
 
 def test_a_parked_robot_is_said_to_have_learned_nothing() -> None:
     log = make_log()
-    still = replace(log.wheels, v_left_mps=0 * log.wheels.v_left_mps, v_right_mps=0 * log.wheels.v_right_mps)
+    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
     n = len(log.gnss.stamp_ns)
     gnss = PositionFixes(
         log.gnss.stamp_ns, np.zeros(n), np.zeros(n), *(np.full(n, 1e-4) for _ in range(2)), np.zeros(n)
@@ -184,7 +184,7 @@ def test_a_robot_that_spun_on_the_spot_has_learned_its_icrs_and_is_told_no_less(
 
 def test_a_parked_robot_whose_heading_drifts_has_learned_nothing() -> None:
     log = spun(60.0)
-    still = replace(log.wheels, v_left_mps=0 * log.wheels.v_left_mps, v_right_mps=0 * log.wheels.v_right_mps)
+    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
     run = fit(replace(log, wheels=still), load_config(sets=[WIDTH]))
     assert any("nothing was learned" in warning for warning in run.warnings)
 
