@@ -104,7 +104,7 @@ def calibrate(
         raise ConfigError("robot.track_width_m", f"{found} in the logs given", "calibrate one robot at a time")
     known = [one for one in recordings if one.sha256]
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
-        raise ConfigError(sorted(twice)[0], "given twice", "name each log once: it would be tested on itself")
+        raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     wheels, gyro = hold_out(recordings)
     best = wheels.fits[wheels.recommended]
     logs = tuple(
