@@ -20,7 +20,7 @@ from icrtool.kernels.trials import Summary
 from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import MODELS, MotionModel
 from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.motion.trials import Trials, cut_trials, trial_errors, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Bools, Floats
 
@@ -29,6 +29,9 @@ HORIZONS_M = (5.0, 10.0, 20.0)
 SHORTEST_BLOCK_M, MOST_BLOCKS = 25.0, 5
 
 FEWEST_RESIDUALS = 20
+
+LONGEST_DELAY_S = 1.0
+"""States kept beside a block, for wheels that are read later or earlier."""
 
 FEWEST_TO_CHOOSE = 3
 """With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
@@ -180,8 +183,8 @@ class _Tester:
     """What all models are fitted to and tested by."""
 
     def __init__(self, recordings: Sequence[Recording], folds: Sequence[Fold], horizons_m: Sequence[float]) -> None:
-        self._recordings, self._folds = recordings, folds
-        self._windows = [cut_windows(one) for one in recordings]
+        self._folds = folds
+        self._windows = [cut_windows(one, pooled=recordings) for one in recordings]
         self._widths = [one.width_m for one in recordings]
         self._clear, self._inside = _masks(self._windows, folds)
         for fold, kept in zip(folds, self._clear, strict=True):
@@ -189,10 +192,7 @@ class _Tester:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
         trials = [cut_trials(one, horizons_m) for one in recordings]
-        self._trials = [
-            trials[fold.recording].within(recordings[fold.recording].drive.distance, fold.begin_m, fold.end_m)
-            for fold in folds
-        ]
+        self._tested = [_within(recordings[fold.recording], trials[fold.recording], fold) for fold in folds]
 
     def test(self, model: MotionModel, wheels: _Tested | None = None) -> _Tested:
         """Fit and test a model; one with a gyro weighs the turn rates of the same fits for wheels alone."""
@@ -224,8 +224,22 @@ class _Tester:
         whole_recording = self._folds[f].begin_m == -np.inf and self._folds[f].end_m == np.inf
         own = pool.own_constants(i, fit.parameters) if whole_recording else fit.constants[i]
         turn = None if wheels is None else wheels.turning
-        rates = twist_rates(self._recordings[i], fit.model, fit.parameters, turn, float(own[2]))
-        return trial_errors(self._recordings[i], self._trials[f], rates, float(own[1]))
+        recording, trials = self._tested[f]
+        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]))
+        return trial_errors(recording, trials, rates, float(own[1]))
+
+
+def _within(recording: Recording, trials: Trials, fold: Fold) -> tuple[Recording, Trials]:
+    """Return the part of a recording that a fold's trials need, delays included, and the trials in it."""
+    mine = trials.within(recording.drive.distance, fold.begin_m, fold.end_m)
+    if not len(mine.starts):
+        return recording, mine
+    last = max(int(mine.ends.max()), int(mine.starts[-1]))
+    t = recording.t_s
+    first = int(np.searchsorted(t, t[mine.starts[0]] - LONGEST_DELAY_S))
+    stop = min(int(np.searchsorted(t, t[last] + LONGEST_DELAY_S)) + 1, len(t))
+    shifted = Trials(mine.starts - first, np.where(mine.ends >= 0, mine.ends - first, -1))
+    return recording.part(first, stop), shifted
 
 
 class _Choice(NamedTuple):
