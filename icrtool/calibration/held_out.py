@@ -186,7 +186,7 @@ class _Tester:
         self._folds = folds
         self._windows = [cut_windows(one, pooled=recordings) for one in recordings]
         self._widths = [one.width_m for one in recordings]
-        self._clear, self._inside = _masks(self._windows, folds)
+        self._clear, self._inside = mask_windows(self._windows, folds)
         for fold, kept in zip(folds, self._clear, strict=True):
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
@@ -227,6 +227,13 @@ class _Tester:
         recording, trials = self._tested[f]
         rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]))
         return trial_errors(recording, trials, rates, float(own[1]))
+
+
+def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequence[float]) -> Trials:
+    """Return the trials of a recording that lie within one of its blocks."""
+    trials = cut_trials(recording, horizons_m)
+    parts = [trials.within(recording.drive.distance, fold.begin_m, fold.end_m) for fold in folds]
+    return Trials(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _within(recording: Recording, trials: Trials, fold: Fold) -> tuple[Recording, Trials]:
@@ -307,7 +314,7 @@ def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> t
     return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
 
 
-def _masks(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
+def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
     """Return, by fold, the residuals that share no distance with it, and those of 10 m that lie within it."""
     clear, inside = [], []
     for fold in folds:

@@ -110,7 +110,7 @@ def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> Calibr
 
 def _source(source: Path, config: Config) -> _Source:
     """Read a run, or fit a log."""
-    from icrtool.calibration.pooled import recording_of
+    from icrtool.calibration.pooled import gyro_recording_of
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
@@ -118,14 +118,14 @@ def _source(source: Path, config: Config) -> _Source:
         from icrtool.output.run_source import read_source
 
         stored = read_source(source)
-        recording, summary = recording_of(stored, read_measured_headings(stored)), stored.summary
+        recording, summary = gyro_recording_of(stored, read_measured_headings(stored)), stored.summary
     else:
         from icrtool.estimation.fit import fit
         from icrtool.estimation.measured_heading import measured_headings
         from icrtool.logs import read_log
 
         run = fit(read_log(source, config), config)
-        recording, summary = recording_of(run, measured_headings(run)), run.summary
+        recording, summary = gyro_recording_of(run, measured_headings(run)), run.summary
     robot = summary["config"]["robot"]
     return _Source(recording, robot["name"], robot["wheel_radius_m"])
 
