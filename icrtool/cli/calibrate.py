@@ -98,13 +98,22 @@ class _Source(NamedTuple):
 def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> CalibrationResult:
     """Fit and test the motion models on all sources."""
     from icrtool.calibration.pooled import calibrate
+    from icrtool.errors import ConfigError
+    from icrtool.output.run_directory import is_run_directory
 
+    if config.given_sections and all(is_run_directory(source) for source in sources):
+        section = min(config.given_sections)
+        advice = "name the logs instead"
+        raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
     with options.progress_bar("reading", quiet=quiet) as progress:
         found = []
         for i, source in enumerate(sources):
             found.append(_source(source, config))
             if progress is not None:
                 progress((i + 1) / len(sources))
+    if len(radii := {one.wheel_radius_m for one in found}) > 1:
+        why = f"{' and '.join(sorted(map(str, radii)))} in the logs given"
+        raise ConfigError("robot.wheel_radius_m", why, "fit them with one radius: parameters refer to it")
     return calibrate([one.recording for one in found], found[0].robot, found[0].wheel_radius_m)
 
 

@@ -23,7 +23,6 @@ from icrtool.kernels.error_statistics import (
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.kernels.window_errors import NEUTRAL, move, window_misses
 from icrtool.records.dropout import DEFAULT_SEED, DropoutReport, ModelResult
 from icrtool.records.run import DrivenRun, drive_of, toy_drive
 from icrtool.records.tables import Floats
@@ -177,10 +176,6 @@ def load_kernels() -> None:
     errors = open_loop_errors(drive, icrs, ends)
     bootstrap_intervals(errors, [cut_blocks(way < way[-1], way, 0.5)], DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
-    motion = move(
-        way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
-    )
-    window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
 
 
 def models_of(run: DrivenRun) -> tuple[Model, ...]:
