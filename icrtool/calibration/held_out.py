@@ -36,6 +36,9 @@ LONGEST_DELAY_S = 1.0
 FEWEST_TO_CHOOSE = 3
 """With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
 
+UNCHOSEN = "icr"
+"""The paper's model stands where there are too few folds to choose."""
+
 BASELINE = "multiplier"
 """What is worse than this one is never recommended."""
 
@@ -205,12 +208,27 @@ class _Tester:
             fit = pool.fit(self._clear[f], pool.without(whole, ~self._clear[f]))
             fits.append(fit)
             errors.append(self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f]))
-            inner[f, f] = _window_error(fit.residuals[self._inside[f]])
+            inner[f, f] = self._window_error(fit, f, fit.solution.x)
             for g in range(count):
                 if g != f and count >= FEWEST_TO_CHOOSE:
-                    x, rows = pool.without(fit, ~self._clear[g]), self._inside[g]
-                    inner[f, g] = _window_error(fit.residuals[rows] + fit.jacobian[rows] @ (x - fit.solution.x))
+                    inner[f, g] = self._window_error(fit, g, pool.without(fit, ~self._clear[g]))
         return _Tested(model, whole, fits, errors, inner)
+
+    def _window_error(self, fit: PooledFit, f: int, x: Floats) -> float:
+        """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit.
+
+        Notes
+        -----
+        Without the recording's heading offset: trials start with the heading of the reference as it is.
+        """
+        rows, offset = self._inside[f], len(fit.model.terms) + 3 * self._folds[f].recording
+        away = x - fit.solution.x
+        away[offset] = -fit.solution.x[offset]
+        residuals = fit.residuals[rows] + fit.jacobian[rows] @ away
+        half = len(residuals) // 2
+        if not half:
+            return float("nan")
+        return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
     def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> Floats:
         """Return the errors of a fold's trials.
@@ -263,7 +281,9 @@ def _nested_choice(tested: Sequence[_Tested], folds: Sequence[Fold]) -> _Choice:
     sizes = {name: len(one.model.terms) for name, one in by_name.items()}
     baseline = BASELINE if BASELINE in by_name else next(iter(by_name))
     recommended, why = choose({name: np.diag(one.inner) for name, one in by_name.items()}, sizes, baseline)
-    chosen = [baseline] * len(folds)
+    chosen = [UNCHOSEN if UNCHOSEN in by_name else baseline] * len(folds)
+    if len(folds) < FEWEST_TO_CHOOSE and folds[0].recording == folds[-1].recording:
+        return _Choice(chosen[0], f"{len(folds)} blocks are too few to choose a model", tuple(chosen))
     if len(folds) >= FEWEST_TO_CHOOSE:
         for f in range(len(folds)):
             others = [g for g in range(len(folds)) if g != f]
@@ -327,14 +347,6 @@ def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[lis
         clear.append(np.concatenate(apart))
         inside.append(np.concatenate(within))
     return clear, inside
-
-
-def _window_error(residuals: Floats) -> float:
-    """Return the expected error [m] of windows of `CHOICE_HORIZON_M` from their residuals, forward then right."""
-    half = len(residuals) // 2
-    if not half:
-        return float("nan")
-    return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
 
 def _scores(name: str, label: str, errors: Sequence[Floats]) -> ModelScores:

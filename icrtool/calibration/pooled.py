@@ -24,6 +24,9 @@ from icrtool.records.tables import Floats
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
+GYRO_PRIOR_STD = np.array([10.0, 0.02])
+"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this tells one from the other."""
+
 GYRO_SCALE_RANGE = 0.1
 """A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
 
@@ -100,7 +103,7 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
     turned = np.diff(recording.drive.heading[every])
     columns = np.column_stack([np.diff(sums[every]), np.diff(t[every])])
     found = robust_least_squares(
-        lambda x: (columns @ x - turned, columns), np.zeros(2), np.zeros(2), np.array([10.0, 1.0])
+        lambda x: (columns @ x - turned, columns), np.zeros(2), np.zeros(2), GYRO_PRIOR_STD, overlap=10.0
     )
     return float(found.x[0]), float(found.x[1])
 
