@@ -223,7 +223,7 @@ def spoilt(log: RobotLog, stream: str, column: str, value: float) -> RobotLog:
 @pytest.mark.parametrize(
     ("stream", "column", "value", "why"),
     [
-        ("wheels", "v_left_mps", math.nan, "1 wheel samples are not finite numbers, the first at row 500"),
+        ("wheels", "left", math.nan, "1 wheel samples are not finite numbers, the first at row 500"),
         ("wheels", "v_right_mps", 1e160, r"a wheel speed of 1e\+160 m/s"),
         ("gnss", "east_m", math.inf, "1 position samples are not finite"),
         ("heading", "heading_rad", math.nan, "1 heading samples are not finite"),
