@@ -156,6 +156,10 @@ class Windows(NamedTuple):
         """Reference minus model (w, 3): ahead, aside, turned [m]."""
         return self.residual_of(slice(None))
 
+    def rows(self, kept: Bools) -> Windows:
+        """Return the windows marked in `kept` (w,)."""
+        return Windows(*(column[kept] for column in self))
+
     def residual_of(self, rows: slice) -> Floats:
         """Return the residual of some windows (k, 3) [m]."""
         return np.column_stack([self.ahead[rows], self.aside[rows], self.turned[rows]])
