@@ -49,6 +49,9 @@ JUMP_SIGMAS = 6.0
 JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
 """A step beyond the noise by so many deviations, and beyond what wheels and a slide can do, is no motion."""
 
+RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
+"""A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
+
 TURNING_MPS = 0.05
 """Wheels slower than this do not turn."""
 
@@ -165,11 +168,16 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         excess.append(_exceeds(windows))
         stuck.append(windows.made < STUCK_SHARE * windows.path_m)
         doubled.append(_from_doubled(windows) < STUCK_SHARE * windows.path_m)
+    first, last = np.concatenate(begin), np.concatenate(end)
     square, beyond, still, twice = (np.concatenate(parts) for parts in (distance2, excess, stuck, doubled))
-    rate = np.where(beyond, np.inf, _false_rate(square, ~beyond, beyond))
+
+    def clearest(kind: Bools) -> Floats:
+        return _clearest_of_runs(first[kind], last[kind], square[kind])
+
     # what stands still is rarer than any slip, and so is its opposite
-    rate = np.where(still, np.minimum(rate, _false_rate(square, still, twice)), rate)
-    return _Evidence(np.concatenate(begin), np.concatenate(end), square, rate), error
+    of_stuck = _false_rate(square, clearest(still), clearest(twice))
+    of_others = _false_rate(square, clearest(~beyond & ~still), clearest(beyond))
+    return _Evidence(first, last, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others))), error
 
 
 def _durations(knots: Knots) -> list[float]:
@@ -219,13 +227,20 @@ def _from_doubled(windows: Windows) -> Floats:
     return np.maximum(place, np.abs(windows.turned - windows.model_turned))
 
 
-def _false_rate(distance2: Floats, target: Bools, decoy: Bools) -> Floats:
+def _clearest_of_runs(begin: Ints, end: Ints, distance2: Floats) -> Floats:
+    """Return the largest squared distance of each run of windows that overlap (r,), ascending."""
+    if not len(begin):
+        return np.empty(0)
+    order = np.argsort(begin, kind="stable")
+    begin, end, distance2 = begin[order], end[order], distance2[order]
+    apart = np.flatnonzero(begin[1:] >= np.maximum.accumulate(end)[:-1]) + 1
+    return np.sort(np.maximum.reduceat(distance2, np.concatenate([[0], apart])))
+
+
+def _false_rate(distance2: Floats, targets: Floats, decoys: Floats) -> Floats:
     """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,)."""
-    order = np.argsort(-distance2, kind="stable")
-    decoys, targets = np.cumsum(decoy[order]), np.cumsum(target[order])
-    rate = np.empty(len(order))
-    rate[order] = np.minimum.accumulate((decoys / np.maximum(targets, 1))[::-1])[::-1]
-    return rate
+    beyond = [len(values) - np.searchsorted(values, distance2) for values in (decoys, targets)]
+    return np.asarray(beyond[0] / np.maximum(beyond[1], 1))
 
 
 def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) -> list[tuple[Extent, int]]:
@@ -239,10 +254,28 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
         if evidence.false_rate[at] > MOST_FALSE or not free[core].all():
             continue
         extent = find_extent(knots.t, steps, error, whole & free, core)
-        if extent is not None and extent.severity >= LEAST_SHARE:
+        if extent is not None and extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent):
             free[extent.first : extent.last] = False
             found.append((extent, int(at)))
     return found
+
+
+def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
+    """Say whether the reference makes up, shortly before or after, for the distance that the event misses.
+
+    A position that is wrong for a while comes back; distance lost by slip does not.
+    """
+    middle = (knots.heading[1:] + knots.heading[:-1]) / 2
+    low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
+    rows = np.arange(max(int(low), 0), min(int(high), len(steps.begin)))
+    step = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
+    inside = (rows >= extent.first) & (rows < extent.last)
+    missed = complex(step[inside].sum())
+    if abs(missed) < RETURN_SIGMAS * math.sqrt(float(knots.variance[extent.first] + knots.variance[extent.last])):
+        return False
+    made_up = -(step * np.conj(missed)).real / abs(missed) ** 2
+    after, before = np.cumsum(made_up[rows >= extent.last]), np.cumsum(made_up[rows < extent.first][::-1])
+    return max(after.max(initial=0.0), before.max(initial=0.0)) > RETURNED_SHARE
 
 
 def _event(knots: Knots, extent: Extent, distance2: float, false_rate: float) -> SlipEvent:
