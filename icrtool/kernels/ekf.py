@@ -1,37 +1,34 @@
 """The ICR EKF, compiled: event-driven propagation and updates (Pentzer 2014, Section 3, Eqs. 13-25).
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
-`icrtool.kernels.ekf_plain` is the same filter in matrix form, the one to read; the tests hold this one to it.
+The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
+`filter_rows` is the one event loop: the filter, the smoother's forward pass and the runs of a study call it.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.ekf_step import (
-    DIAGONAL,
-    EAST,
-    HEADING,
-    NORTH,
-    Floats,
-    correct,
-    measured_column,
-    predict,
-    wrap,
-)
+from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, measured_column, predict, wrap
+from icrtool.kernels.kinematics import GUARDED, Floats
 
 Codes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
 """What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
+
+BLOCK_EVENTS = 500_000
+"""Events in one compiled call of `run_filter`: some 0.2 s, between which Ctrl-C and SIGTERM are acted on."""
 
 
 class FilterParameters(NamedTuple):
@@ -51,6 +48,7 @@ class FilterParameters(NamedTuple):
     recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
     icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
     least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
+    guard : sign guard of the kinematics, of `icrtool.kernels.kinematics`; other than GUARDED in studies only
     """
 
     process_variance: tuple[float, float, float, float, float, float]
@@ -68,6 +66,7 @@ class FilterParameters(NamedTuple):
     recovery_s: float
     icr_inflation_m2: float
     least_icr: float
+    guard: int = GUARDED
 
 
 class Measurements(NamedTuple):
@@ -119,6 +118,48 @@ class FilterOutput(NamedTuple):
     P: Floats
 
 
+class FilterState(NamedTuple):
+    """All that a run needs to go on from the rows before. Changed in place.
+
+    Attributes
+    ----------
+    t : (1,) time reached [s]; distance : (1,) path length up to there [m]
+    place : (3,) next fix, next heading, next terrain change
+    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
+    x : (6,); P : (21,) upper triangle of the covariance, row by row
+    """
+
+    t: Floats
+    distance: Floats
+    place: Ints
+    rejected: Floats
+    x: Floats
+    P: Floats
+
+    def copy(self) -> FilterState:
+        """Return a state that later rows do not change."""
+        t, distance, place, rejected, x, P = self
+        return FilterState(t.copy(), distance.copy(), place.copy(), rejected.copy(), x.copy(), P.copy())
+
+
+class Nodes(NamedTuple):
+    """Events in order, for the smoother; (m, ...) each.
+
+    Attributes
+    ----------
+    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
+    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap of the wheel data
+    row : int64 (m,), row of the state recorded here, -1 where none is
+    """
+
+    x_predicted: Floats
+    P_predicted: Floats
+    x: Floats
+    P: Floats
+    step: Floats
+    row: Ints
+
+
 @njit
 def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
     """Remember a rejected innovation; say whether the run of rejected ones has been right all along.
@@ -168,8 +209,8 @@ def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
 def take_fix(
     t: float, z_n: float, z_e: float, r_n: float, r_e: float, x: Floats, P: Floats, PH: Floats, run: Floats,
     parameters: FilterParameters, residual: Floats,
-) -> tuple[int, float]:  # fmt: skip
-    """Gate and apply one fix z [m] of variances r [m^2]; return what became of it, and its NIS.
+) -> tuple[int, float, float, float]:  # fmt: skip
+    """Gate and apply one fix z [m] of variances r [m^2]; return its code, its NIS and its innovation [m].
 
     North and east are applied one after the other, which equals the joint update since their noises are independent.
     """
@@ -198,7 +239,7 @@ def take_fix(
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
     residual[0] = z_n - x[0] - a_n
     residual[1] = z_e - x[1] - a_e
-    return code, nis
+    return code, nis, nu_n, nu_e
 
 
 @njit
@@ -241,7 +282,7 @@ def advance(
         P[6] += parameters.gap_speed_variance * dt
         P[11] += parameters.gap_turn_variance * dt
     else:
-        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading)
+        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading, parameters.guard)
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]
@@ -249,16 +290,27 @@ def advance(
 
 
 @njit
-def filter_loop(  # noqa: C901 - the order of events, in one place
-    data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
-    parameters: FilterParameters, out: FilterOutput,
-) -> None:  # fmt: skip
-    """Run from time t0 over all wheel samples from `first` on, filling `out`; x and P end as the last state."""
-    j, h, c = start
+def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
+    data: Measurements, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
+    nodes: Nodes,
+) -> int:  # fmt: skip
+    """Run the filter over wheel samples [begin, end); return the number of events.
+
+    Parameters
+    ----------
+    state : as the rows before left it; changed to what these leave
+    out : its x, variance and distance are of these rows (end - begin, ...), the rest is of all measurements
+    nodes : filled with every event; without rows nothing is kept
+
+    Notes
+    -----
+    At equal stamps: wheel speeds, terrain changes, GNSS, heading, then the state is recorded.
+    """
+    x, P, PH = state.x, state.P, np.zeros(6)
     n_gnss, n_heading, n_change = len(data.gnss_t), len(data.heading_t), len(data.change_t)
-    gnss_run, heading_run, PH = np.zeros(4), np.zeros(4), np.zeros(6)
-    t, travelled = t0, 0.0
-    for k in range(first, len(data.wheel_t)):
+    t, travelled, j, h, c = state.t[0], state.distance[0], state.place[0], state.place[1], state.place[2]
+    keep, count = len(nodes.row) > 0, 0
+    for k in range(begin, end):
         held = max(k - 1, 0)
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
@@ -270,48 +322,78 @@ def filter_loop(  # noqa: C901 - the order of events, in one place
                 t_next = min(t_next, data.heading_t[h])
             if c < n_change:
                 t_next = min(t_next, data.change_t[c])
-            if t_next > t:
-                travelled += advance(t_next - t, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
+            dt = max(t_next - t, 0.0)
+            if dt > 0.0:
+                travelled += advance(dt, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
                     P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
                 c += 1
+            if keep:
+                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
+                nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
-                out.gnss_code[j], out.gnss_nis[j] = take_fix(
+                out.gnss_code[j], out.gnss_nis[j], nu_n, nu_e = take_fix(
                     t, data.gnss_z[j, 0], data.gnss_z[j, 1], data.gnss_r[j, 0], data.gnss_r[j, 1],
-                    x, P, PH, gnss_run, parameters, out.gnss_residual[j],
+                    x, P, PH, state.rejected[0], parameters, out.gnss_residual[j],
                 )  # fmt: skip
+                if keep and out.gnss_code[j] == RECOVERED:
+                    nodes.P_predicted[count, 0] += nu_n * nu_n
+                    nodes.P_predicted[count, 6] += nu_e * nu_e
                 j += 1
             while h < n_heading and data.heading_t[h] <= t:
-                out.heading_code[h], out.heading_nis[h], out.heading_innovation[h] = take_heading(
-                    t, data.heading_z[h], data.heading_r[h], x, P, PH, heading_run, parameters
+                out.heading_code[h], out.heading_nis[h], nu = take_heading(
+                    t, data.heading_z[h], data.heading_r[h], x, P, PH, state.rejected[1], parameters
                 )
+                out.heading_innovation[h] = nu
+                if keep and out.heading_code[h] == RECOVERED:
+                    nodes.P_predicted[count, 11] += nu * nu
                 h += 1
+            if keep:
+                nodes.x[count], nodes.P[count] = x, P
+                nodes.row[count] = k - begin if t >= t_wheel else -1
+            count += 1
             if t >= t_wheel:
                 break
         for i in range(6):
-            out.x[k - first, i] = x[i]
-            out.variance[k - first, i] = P[DIAGONAL[i]]
-        out.distance[k - first] = travelled
+            out.x[k - begin, i] = x[i]
+            out.variance[k - begin, i] = P[DIAGONAL[i]]
+        out.distance[k - begin] = travelled
+    state.t[0], state.distance[0], state.place[0], state.place[1], state.place[2] = t, travelled, j, h, c
+    return count
 
 
 def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
-    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 over all that follows.
+    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
 
     Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
-    first = int(np.searchsorted(data.wheel_t, t0))
-    j, h, c = (int(np.searchsorted(times, t0, side="right")) for times in (data.gnss_t, data.heading_t, data.change_t))
-    out = empty_output(data, first, P0)
-    filter_loop(data, t0, first, (j, h, c), x0.astype(np.float64), out.P, parameters, out)
-    return out
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    state, out, nodes = start_state(data, t0, x0, P0), empty_output(data, last - first), empty_nodes(0)
+    events = last + len(data.gnss_t) + len(data.heading_t)
+    for begin, end in pairwise((*range(first, last, max(last * BLOCK_EVENTS // max(events, 1), 1)), last)):
+        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), nodes)
+    return out._replace(P=state.P)
 
 
-def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
-    """Return the output of a run from wheel sample `first` on, before it has run; its P holds P0 (6, 6)."""
-    rows, n_gnss, n_heading = len(data.wheel_t) - first, len(data.gnss_t), len(data.heading_t)
+def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> FilterState:
+    """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
+    times = (data.gnss_t, data.heading_t, data.change_t)
+    return FilterState(
+        t=np.array([t0], np.float64),
+        distance=np.zeros(1),
+        place=np.array([np.searchsorted(stamps, t0, side="right") for stamps in times], np.int64),
+        rejected=np.zeros((2, 4)),
+        x=x0.astype(np.float64),
+        P=P0[np.triu_indices(6)].astype(np.float64),
+    )
+
+
+def empty_output(data: Measurements, rows: int) -> FilterOutput:
+    """Return the output of a run of so many recorded states, before it has run."""
+    n_gnss, n_heading = len(data.gnss_t), len(data.heading_t)
     return FilterOutput(
         x=np.empty((rows, 6)),
         variance=np.empty((rows, 6)),
@@ -322,5 +404,23 @@ def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
         heading_nis=np.full(n_heading, np.nan),
         heading_code=np.zeros(n_heading, np.uint8),
         heading_innovation=np.full(n_heading, np.nan),
-        P=P0[np.triu_indices(6)].astype(np.float64),
+        P=np.empty(21),
+    )
+
+
+def output_rows(out: FilterOutput, begin: int, end: int) -> FilterOutput:
+    """Return a view of an output that holds its recorded states [begin, end) only."""
+    rows = slice(begin, end)
+    return out._replace(x=out.x[rows], variance=out.variance[rows], distance=out.distance[rows])
+
+
+def empty_nodes(events: int) -> Nodes:
+    """Return nodes for so many events, to be filled."""
+    return Nodes(
+        x_predicted=np.empty((events, 6)),
+        P_predicted=np.empty((events, 21)),
+        x=np.empty((events, 6)),
+        P=np.empty((events, 21)),
+        step=np.empty((events, 4)),
+        row=np.empty(events, np.int64),
     )

@@ -13,8 +13,8 @@ from icrtool.alignment import stream_delays
 from icrtool.alignment.stream_delays import heading_delay
 from icrtool.config import load_config
 from icrtool.estimation.fit import FilterRun, fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from support.matrix_filter import step_state
 
 START_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)

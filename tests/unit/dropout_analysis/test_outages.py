@@ -14,7 +14,7 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.filter_setup import WarmStart
 from icrtool.estimation.fit import STATE_COLUMNS, FilterRun, fit
-from icrtool.kernels.ekf_plain import step_state
+from support.matrix_filter import step_state
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.estimation.fit import FilterRun, fit
 from icrtool.estimation.smooth import smooth
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.tables import States
 from support.drives import ICRS, make_log
+from support.matrix_filter import step_state
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 NOISY_M = 0.3
