@@ -14,7 +14,8 @@ import numpy as np
 from icrtool.alignment.slip_extent import Extent, find_extent
 from icrtool.alignment.wheel_motion import MOVING_SHARE, Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
 from icrtool.records.events import SlipEvent
-from icrtool.records.tables import Bools, Floats, GyroSamples, HeadingSamples, Ints, PositionFixes, WheelSamples
+from icrtool.records.measurements import SensorData
+from icrtool.records.tables import Bools, Floats, Ints
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_WINDOW_S = 16.0
@@ -72,21 +73,12 @@ class _Evidence(NamedTuple):
     false_rate: Floats
 
 
-def find_slip_events(
-    wheels: WheelSamples,
-    fixes: PositionFixes,
-    heading: HeadingSamples,
-    *,
-    gyro: GyroSamples | None = None,
-    width_m: float,
-    motion: Motion | None = None,
-) -> tuple[SlipEvent, ...]:
+def find_slip_events(sensors: SensorData, width_m: float, motion: Motion | None = None) -> tuple[SlipEvent, ...]:
     """Find the spans in which the robot did not do what its wheels did.
 
     Parameters
     ----------
-    wheels, fixes, heading : aligned: sides, signs, scale, conventions and delays corrected
-    gyro : turn rates, used for turns where they agree with the heading and scatter less
+    sensors : aligned: sides, signs, scale, conventions and delays corrected
     width_m : distance b between the track centre lines, or what stands for it
     motion : of the robot without slip; default: fitted to the log itself
 
@@ -106,7 +98,7 @@ def find_slip_events(
     does more than its wheels, which no slip can cause, are counted: where there are many, the others are not believed
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
     """
-    knots = lay_knots(wheels, fixes, heading, gyro, width_m)
+    knots = lay_knots(sensors, width_m)
     if knots is None:
         return ()
     knots = _without_jumps(knots)
@@ -207,7 +199,7 @@ def _model_error(windows: Windows, quiet: Bools, quantile: float) -> Floats:
         return np.full(3, LEAST_MODEL_ERROR)
     excess = (windows.residual[used] / NORMAL_QUANTILE[quantile]) ** 2 - windows.sensor[used]
     square = np.quantile(excess / windows.path_m[used, None] ** 2, quantile, axis=0)
-    return np.sqrt(np.maximum(square, LEAST_MODEL_ERROR**2))
+    return np.asarray(np.sqrt(np.maximum(square, LEAST_MODEL_ERROR**2)))
 
 
 def _exceeds(windows: Windows) -> Bools:
@@ -275,7 +267,7 @@ def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
         return False
     made_up = -(step * np.conj(missed)).real / abs(missed) ** 2
     after, before = np.cumsum(made_up[rows >= extent.last]), np.cumsum(made_up[rows < extent.first][::-1])
-    return max(after.max(initial=0.0), before.max(initial=0.0)) > RETURNED_SHARE
+    return float(max(after.max(initial=0.0), before.max(initial=0.0))) > RETURNED_SHARE
 
 
 def _event(knots: Knots, extent: Extent, distance2: float, false_rate: float) -> SlipEvent:

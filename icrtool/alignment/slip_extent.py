@@ -141,7 +141,7 @@ def _evidence(steps: Windows, error: Floats, shares: Floats, rows: slice) -> Flo
     seen = steps.residual_of(rows)
     variance = steps.sensor[rows] + (error * steps.path_m[rows, None]) ** 2
     ratio = ((seen**2 - (seen - _expected(steps, shares, rows)) ** 2) / (2 * variance)).sum(axis=1)
-    return np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE)
+    return np.asarray(np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE))
 
 
 def _best_part(evidence: Floats) -> tuple[int, int]:

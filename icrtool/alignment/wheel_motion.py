@@ -6,22 +6,13 @@ and by themselves for the turn. Everything is then linear in the parameters of t
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.gnss_steps import bend_std_m
 from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares
-from icrtool.records.tables import (
-    Bools,
-    Complexes,
-    Floats,
-    GyroSamples,
-    HeadingSamples,
-    Ints,
-    PositionFixes,
-    WheelSamples,
-)
+from icrtool.records.measurements import SensorData
+from icrtool.records.tables import Bools, Complexes, Floats, GyroSamples, Ints
 
 KNOT_S = 0.1
 """Fixes closer together than this are thinned: they say little more, and their noise much."""
@@ -46,7 +37,6 @@ SAME_TURN = 0.1
 FIT_MODEL_ERROR = 0.05
 """Residuals of the fit are weighted by sensor noise and this part of the wheels' motion."""
 
-UNKNOWN_STD_M = 0.02
 LEAST_STD_M = 0.01
 SIDE_GAIN, SIDE_GAIN_STD, SIDEWAYS_STD, CENTRIPETAL_STD_S, DELAY_STD_S = 0.5, 0.2, 0.4, 0.1, 0.2
 SEPARATION, TURN_GAIN_STD, VEER_STD = 1.6, 0.25, 0.03
@@ -95,9 +85,10 @@ class Knots(NamedTuple):
 
     def rows(self, kept: Bools) -> Knots:
         """Return the knots marked in `kept` (m,)."""
-        return self._replace(**{
+        columns: dict[str, Any] = {
             name: value[kept] for name, value in self._asdict().items() if isinstance(value, np.ndarray)
-        })
+        }
+        return self._replace(**columns)
 
 
 class Motion(NamedTuple):
@@ -158,22 +149,18 @@ class Windows(NamedTuple):
 
     def rows(self, kept: Bools) -> Windows:
         """Return the windows marked in `kept` (w,)."""
-        return Windows(*(column[kept] for column in self))
+        columns: dict[str, Any] = {name: column[kept] for name, column in self._asdict().items()}
+        return self._replace(**columns)
 
     def residual_of(self, rows: slice) -> Floats:
         """Return the residual of some windows (k, 3) [m]."""
         return np.column_stack([self.ahead[rows], self.aside[rows], self.turned[rows]])
 
 
-def lay_knots(
-    wheels: WheelSamples,
-    fixes: PositionFixes,
-    heading: HeadingSamples,
-    gyro: GyroSamples | None,
-    width_m: float,
-) -> Knots | None:
-    """Integrate the wheels to the times of the fixes; None where the streams share no time."""
-    if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(heading.stamp_ns)) < 3:
+def lay_knots(sensors: SensorData, width_m: float) -> Knots | None:
+    """Integrate the wheels to the times of the fixes; None where the streams share too little time."""
+    wheels, fixes, heading = sensors.wheels, sensors.fixes, sensors.headings
+    if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(heading.stamp_ns)) < FEWEST_WINDOWS:
         return None
     epoch = int(wheels.stamp_ns[0])
     t_wheel, t_fix, t_heading = ((s.stamp_ns - epoch) / 1e9 for s in (wheels, fixes, heading))
@@ -197,7 +184,7 @@ def lay_knots(
     fix_gap = np.diff(t) > max(LONGEST_HOLE_S, HOLE_IN_INTERVALS * float(np.median(np.diff(t))))
     holes = holes + np.concatenate([[0], np.cumsum(fix_gap)])
     knots = Knots(
-        epoch_ns=epoch, t=t, place=(fixes.north_m + 1j * fixes.east_m)[rows], variance=_fix_variance(fixes)[rows],
+        epoch_ns=epoch, t=t, place=(fixes.north_m + 1j * fixes.east_m)[rows], variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2) / 2, LEAST_STD_M**2)[rows],
         heading=heading_at, turn=heading_at, turn_variance=_white_variance(heading_at),
         turn_bias_std=HEADING_BIAS_STD_RADPS,
         left=at(v_left * nose), right=at(v_right * nose), left_m=at(v_left).real, right_m=at(v_right).real,
@@ -206,7 +193,7 @@ def lay_knots(
         held_m2=np.interp(t, t_wheel[:-1], _held_variance(t_wheel[:-1], v_left, v_right)),
         v_left=speed_at(v_left), v_right=speed_at(v_right), holes=holes, width_m=width_m,
     )  # fmt: skip
-    return knots if gyro is None else _with_better_turn(knots, gyro)
+    return knots if sensors.gyro is None else _with_better_turn(knots, sensors.gyro)
 
 
 def cut(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
@@ -251,7 +238,8 @@ def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: f
     """
     level = np.exp(-0.5j * (knots.heading[first] + knots.heading[last]))
     left, right, bent, change, place = (
-        level * (column[last] - column[first]) for column in (knots.left, knots.right, knots.bent, _velocity(knots), knots.place)
+        level * (column[last] - column[first])
+        for column in (knots.left, knots.right, knots.bent, _velocity(knots), knots.place)
     )
     model = motion.left * left + motion.right * right + motion.centripetal_s * bent - motion.place_delay_s * change
     lever = 0.5 / max(abs(motion.turn_gain), 1e-3)
@@ -291,13 +279,6 @@ def _holes(t: Floats, sampled: Floats) -> Ints:
     return np.asarray(np.searchsorted(holes, t, side="left"))
 
 
-def _fix_variance(fixes: PositionFixes) -> Floats:
-    seen = bend_std_m(fixes)
-    unknown = max(seen if np.isfinite(seen) else UNKNOWN_STD_M, LEAST_STD_M) ** 2
-    variance = (fixes.var_north_m2 + fixes.var_east_m2) / 2
-    return np.where(np.isfinite(variance) & (variance > 0), np.maximum(variance, LEAST_STD_M**2), unknown)
-
-
 def _white_variance(values: Floats) -> float:
     """Return the variance of values (m,) from their second differences: at most this is noise."""
     return mad_std(np.diff(values, 2), 0.0) ** 2 / 6 if len(values) > 2 else 0.0
@@ -331,7 +312,8 @@ def _turn_columns(knots: Knots, first: Ints, last: Ints) -> tuple[Floats, Floats
 def _fit_place(knots: Knots, first: Ints, last: Ints) -> RobustFit:
     level = np.exp(-0.5j * (knots.heading[first] + knots.heading[last]))
     left, right, bent, change, place = (
-        level * (column[last] - column[first]) for column in (knots.left, knots.right, knots.bent, _velocity(knots), knots.place)
+        level * (column[last] - column[first])
+        for column in (knots.left, knots.right, knots.bent, _velocity(knots), knots.place)
     )
     path = knots.path_m[last] - knots.path_m[first]
     weight = 1.0 / np.sqrt(knots.variance[first] + knots.variance[last] + (FIT_MODEL_ERROR * path) ** 2)

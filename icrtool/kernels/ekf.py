@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, measured_column, predict, wrap
-from icrtool.kernels.kinematics import GUARDED, Floats
+from icrtool.kernels.kinematics import GUARDED, Floats, body_velocity
 
 Codes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
@@ -78,6 +79,7 @@ class Measurements(NamedTuple):
     gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
     heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
     change_t : (c,) times of terrain changes
+    slipping : (n,) intervals [k, k+1) in which the robot does not do what its wheels do; empty for none
     """
 
     wheel_t: Floats
@@ -90,6 +92,7 @@ class Measurements(NamedTuple):
     heading_z: Floats
     heading_r: Floats
     change_t: Floats
+    slipping: Flags = np.zeros(0, np.bool_)
 
 
 class FilterOutput(NamedTuple):
@@ -148,7 +151,7 @@ class Nodes(NamedTuple):
     Attributes
     ----------
     x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
-    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap of the wheel data
+    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap or in slip
     row : int64 (m,), row of the state recorded here, -1 where none is
     """
 
@@ -270,14 +273,19 @@ def take_heading(
 
 @njit
 def advance(
-    dt: float, in_gap: bool, v_left: float, v_right: float, x: Floats, P: Floats, parameters: FilterParameters
-) -> float:
-    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length [m].
+    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, x: Floats, P: Floats,
+    parameters: FilterParameters,
+) -> float:  # fmt: skip
+    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
 
-    Through a gap in the wheel data nothing is dead-reckoned: the pose only grows uncertain.
+    Through a gap in the wheel data and through slip nothing is dead-reckoned: the pose only grows uncertain, and what
+    is measured next does not change the ICRs.
     """
     travelled = 0.0
-    if in_gap:
+    if in_gap or slips:
+        if slips:
+            v_x, v_y, _ = body_velocity(v_left, v_right, x[3], x[4], x[5])
+            travelled = 0.0 if in_gap else dt * math.sqrt(v_x * v_x + v_y * v_y)
         P[0] += parameters.gap_speed_variance * dt
         P[6] += parameters.gap_speed_variance * dt
         P[11] += parameters.gap_turn_variance * dt
@@ -314,6 +322,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
         held = max(k - 1, 0)
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
+        slips = held < len(data.slipping) and data.slipping[held]
         while True:
             t_next = t_wheel
             if j < n_gnss:
@@ -324,14 +333,14 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 t_next = min(t_next, data.change_t[c])
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
-                travelled += advance(dt, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
+                travelled += advance(dt, in_gap, slips, data.v_left[held], data.v_right[held], x, P, parameters)
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
                     P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
                 c += 1
             if keep:
-                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
+                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap or slips else 0.0
                 nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
                 out.gnss_code[j], out.gnss_nis[j], nu_n, nu_e = take_fix(
