@@ -180,11 +180,12 @@ def lay_knots(sensors: SensorData, width_m: float) -> Knots | None:
         return np.asarray((at(speed, SPEED_S / 2) - at(speed, -SPEED_S / 2)).real / SPEED_S, np.float64)
 
     heading_at = np.interp(t, t_heading, psi)
+    variance = np.maximum((fixes.var_north_m2 + fixes.var_east_m2) / 2, LEAST_STD_M**2)
     holes = _holes(t, t_wheel) + _holes(t, t_heading)
     fix_gap = np.diff(t) > max(LONGEST_HOLE_S, HOLE_IN_INTERVALS * float(np.median(np.diff(t))))
     holes = holes + np.concatenate([[0], np.cumsum(fix_gap)])
     knots = Knots(
-        epoch_ns=epoch, t=t, place=(fixes.north_m + 1j * fixes.east_m)[rows], variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2) / 2, LEAST_STD_M**2)[rows],
+        epoch_ns=epoch, t=t, place=(fixes.north_m + 1j * fixes.east_m)[rows], variance=variance[rows],
         heading=heading_at, turn=heading_at, turn_variance=_white_variance(heading_at),
         turn_bias_std=HEADING_BIAS_STD_RADPS,
         left=at(v_left * nose), right=at(v_right * nose), left_m=at(v_left).real, right_m=at(v_right).real,
