@@ -203,14 +203,19 @@ def _model_error(windows: Windows, quiet: Bools, quantile: float) -> Floats:
 
 
 def _exceeds(windows: Windows) -> Bools:
-    """Return which windows show a side that does more than its wheels, or goes against them."""
-    beyond = np.zeros(len(windows.begin), np.bool_)
+    """Return which windows show more motion than the wheels', of a side and of distance or turn, or the opposite.
+
+    A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
+    """
     least = LEAST_SHARE * windows.path_m
-    for sign in (1.0, -1.0):
-        side = windows.model_ahead + sign * windows.model_turned
-        missed = -np.sign(side) * (windows.ahead + sign * windows.turned)
-        beyond |= (missed < -least) | (missed > np.abs(side) + least)
-    return beyond
+    ahead, turned = (windows.model_ahead, windows.ahead), (windows.model_turned, windows.turned)
+    left, right = ([one + sign * other for one, other in zip(ahead, turned, strict=True)] for sign in (1.0, -1.0))
+
+    def beyond(model: Floats, residual: Floats) -> Bools:
+        missed = -np.sign(model) * residual
+        return np.asarray((missed < -least) | (missed > np.abs(model) + least))
+
+    return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned))
 
 
 def _from_doubled(windows: Windows) -> Floats:

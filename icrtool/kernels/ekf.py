@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, measured_column, predict, wrap
+from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, keep_sides, measured_column, predict, wrap
 from icrtool.kernels.kinematics import GUARDED, Floats, body_velocity
 
 Codes = NDArray[np.uint8]
@@ -180,22 +180,6 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
     run[2] = nu_n
     run[3] = nu_e
     return bool(run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s)
-
-
-@njit
-def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
-    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
-
-    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
-    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
-    """
-    for _ in range(2):
-        for place, bound in ((3, least), (4, -least)):
-            beyond = bound - x[place]
-            if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
-                variance = measured_column(P, place, 0.0, PH)
-                for i in range(6):
-                    x[i] += PH[i] / variance * beyond
 
 
 @njit
