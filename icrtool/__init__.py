@@ -15,7 +15,7 @@ Time
     A speed stamped k holds over [k, k+1).
 Tables
     ``RobotLog``: what was measured (wheels, position, heading), in this frame, by stamp.
-    ``Run``: what the filter made of it, one recorded state per wheel sample; read back from its directory it is the same.
+    ``Run``: what the filter made of it, one recorded state per wheel sample; equal when read back from its directory.
     ``DropoutReport``: open-loop errors over distance, from every recorded state.
 Source of the method
     Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of

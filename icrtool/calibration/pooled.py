@@ -12,12 +12,12 @@ from icrtool import __version__
 from icrtool.calibration.held_out import HeldOut, hold_out
 from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
 from icrtool.errors import ConfigError
-from icrtool.estimation.measured_heading import MeasuredHeading
+from icrtool.estimation.measured_heading import measured_headings
 from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import GYRO_TERMS, typical_drive, wheel_motion
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, trial_errors, twist_rates
-from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
 
 GYRO_SCALE_RANGE = 0.2
@@ -34,12 +34,10 @@ class CalibrationResult:
     notes: tuple[str, ...]
 
 
-def recording_of(run: DrivenRun, headings: Sequence[MeasuredHeading] = ()) -> Recording:
+def recording_of(run: Run) -> Recording:
     """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
 
-    Parameters
-    ----------
-    headings : the measured headings of the run; a gyro's is used where it turns as the reference does
+    A gyro is used where it turns as the reference does.
 
     Raises
     ------
@@ -50,7 +48,7 @@ def recording_of(run: DrivenRun, headings: Sequence[MeasuredHeading] = ()) -> Re
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
     drive, inputs = drive_of(run), run.summary.get("inputs", [])
     scale = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
-    gyro = next((one.angle_rad for one in headings if one.kind == "gyro"), None)
+    gyro = next((one.angle_rad for one in measured_headings(run) if one.kind == "gyro"), None)
     return Recording(
         name=run.name,
         t_s=run.table.t_s,
@@ -104,7 +102,7 @@ def calibrate(
         raise ConfigError("robot.track_width_m", f"{found} in the logs given", "calibrate one robot at a time")
     known = [one for one in recordings if one.sha256]
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
-        raise ConfigError(sorted(twice)[0], "given twice", "name each log once: it would be tested on itself")
+        raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     wheels, gyro = hold_out(recordings)
     best = wheels.fits[wheels.recommended]
     logs = tuple(

@@ -114,20 +114,16 @@ def _source(source: Path, config: Config) -> _Source:
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
-        from icrtool.output.run_directory import read_measured_headings
-        from icrtool.output.run_source import read_source
+        from icrtool.output.stored_run import open_run
 
-        stored = read_source(source)
-        recording, summary = recording_of(stored, read_measured_headings(stored)), stored.summary
+        run = open_run(source)
     else:
         from icrtool.estimation.fit import fit
-        from icrtool.estimation.measured_heading import measured_headings
         from icrtool.logs import read_log
 
         run = fit(read_log(source, config), config)
-        recording, summary = recording_of(run, measured_headings(run)), run.summary
-    robot = summary["config"]["robot"]
-    return _Source(recording, robot["name"], robot["wheel_radius_m"])
+    robot = run.config.robot
+    return _Source(recording_of(run), robot.name, robot.wheel_radius_m)
 
 
 def _findings(source: Path, config: Config, x_icr: float | None, *, quiet: bool, verbose: bool) -> Findings:

@@ -73,7 +73,7 @@ def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_rea
         heading, place = np.interp(later, t, heading), np.interp(later, t, place)
     reference = drive.north + 1j * drive.east
     turn = np.exp(1j * (drive.heading - heading))
-    for h in range(errors.shape[1]):
+    for h in range(trials.ends.shape[-1]):
         some = trials.ends[:, h] >= 0
         s, e = trials.starts[some], trials.ends[some, h]
         errors[some, h] = np.abs(turn[s] * (place[e] - place[s]) - (reference[e] - reference[s]))
