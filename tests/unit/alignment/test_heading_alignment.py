@@ -12,13 +12,8 @@ import pytest
 from icrtool.alignment.heading_alignment import check_heading
 from icrtool.config import load_config
 from icrtool.errors import DataError
-<<<<<<< HEAD
-from icrtool.estimation.fit import FilterRun, fit
-=======
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
->>>>>>> main
 from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from support.drives import ICRS, make_log
 from support.matrix_filter import step_state

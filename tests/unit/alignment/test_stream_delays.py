@@ -12,13 +12,8 @@ import pytest
 from icrtool.alignment import stream_delays
 from icrtool.alignment.stream_delays import heading_delay
 from icrtool.config import load_config
-<<<<<<< HEAD
-from icrtool.estimation.fit import FilterRun, fit
-=======
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
->>>>>>> main
 from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
 from support.matrix_filter import step_state
 

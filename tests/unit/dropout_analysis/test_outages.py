@@ -12,16 +12,10 @@ import pytest
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
-<<<<<<< HEAD
-from icrtool.estimation.filter_setup import WarmStart
-from icrtool.estimation.fit import STATE_COLUMNS, FilterRun, fit
-from support.matrix_filter import step_state
-=======
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart
 from support.barn import simulate
->>>>>>> main
+from support.matrix_filter import step_state
 
 
 @pytest.fixture(scope="module")
