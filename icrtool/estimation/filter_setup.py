@@ -11,9 +11,10 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.filter_records import FilterParameters, Measurements
+from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart, half_width_m
-from icrtool.records.tables import Floats, Ints
+from icrtool.records.tables import Bools, Floats, Ints
 
 PAPER_PROCESS_POSITION_MPS = 0.2
 """Pentzer 2014, Eq. 30; its text says 0.1 m/s, its matrix prints 0.2 squared: the matrix is used."""
@@ -39,6 +40,9 @@ GAP_IN_INTERVALS = 2.5
 
 LEAST_ICR_IN_HALF_WIDTHS = 0.2
 """The ICRs lie outside the tracks (Pentzer 2014, Section 2); an antenna that is off centre may move them in by this."""
+
+EVENT_MARGIN_S = 0.2
+"""A slip event is taken to begin and end by so much earlier and later: where it does is known no better."""
 
 RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
@@ -133,6 +137,7 @@ def set_up_filter(
         heading_z=headings.heading_rad[heading_index],
         heading_r=headings.var_rad2[heading_index],
         change_t=np.empty(0),
+        slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
     )
     t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
@@ -160,6 +165,22 @@ def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
     for begin, end in outages_ns:
         kept &= (stamps_ns < begin) | (stamps_ns >= end)
     return np.flatnonzero(kept)
+
+
+def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[tuple[int, int], ...]) -> Bools:
+    """Return the intervals after wheel samples (n,) that lie in an event.
+
+    None in an outage that is made: what a run does there must not know what only the fixes showed.
+    """
+    slipping = np.zeros(len(stamps_ns), np.bool_)
+    ends = np.append(stamps_ns[1:], stamps_ns[-1])
+    margin = round(EVENT_MARGIN_S * 1e9)
+    for event in events:
+        first, last = np.searchsorted(ends, event.begin_ns - margin), np.searchsorted(stamps_ns, event.end_ns + margin)
+        slipping[first:last] = True
+    for begin, end in outages_ns:
+        slipping[(ends > begin) & (stamps_ns < end)] = False
+    return slipping
 
 
 def _start_time(name: str, data: Measurements) -> float:

@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.tables import GyroSamples, HeadingSamples, Ints, States, WheelSamples
@@ -43,6 +44,7 @@ class FilterInputs(NamedTuple):
     heading_correlation_s: float
     antenna_m: tuple[float, float]
     losses_ns: Ints
+    events: tuple[SlipEvent, ...]
 
 
 def write_measurements(run: Run, path: Path) -> None:
@@ -97,6 +99,7 @@ def read_measurements(
             heading_correlation_s=inputs.heading_correlation_s,
             antenna_m=inputs.antenna_m,
             losses_ns=inputs.losses_ns,
+            events=inputs.events,
         )
         outcomes = [
             _outcome(columns, group, stamps_ns, table)

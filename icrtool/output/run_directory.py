@@ -12,10 +12,12 @@ from icrtool.output.atomic_directory import check_place, whole_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.records.events import EVENT_COLUMNS
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 
 RUN_FILE = "run.json"
+EVENTS_FILE = "events.csv"
 CHECKSUM_FILE = "B2SUMS"
 """Sums of all files but the pictures, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
 
@@ -77,7 +79,8 @@ def write_run(
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
         write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE)}
+        (partial / EVENTS_FILE).write_text(events_csv(run.summary["events"]), encoding="utf-8")
+        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE)}
         sums[states_name] = states_sum.result()
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
 
@@ -97,6 +100,12 @@ def is_run_directory(directory: Path) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+
+
+def events_csv(events: list[dict[str, Any]]) -> str:
+    """Return the text of events.csv: a row an event, numbers in full precision."""
+    rows = [EVENT_COLUMNS, *(tuple(str(event[column]) for column in EVENT_COLUMNS) for event in events)]
+    return "".join(f"{','.join(row)}\n" for row in rows)
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

@@ -118,6 +118,21 @@ class SegmentDocument(TypedDict):
     std: MaybeByIcr
 
 
+class EventDocument(TypedDict):
+    """A slip event."""
+
+    kind: Literal["immobilised", "slip", "skid", "spin"]
+    begin_s: float
+    end_s: float
+    begin_ns: int
+    end_ns: int
+    north_m: float
+    east_m: float
+    distance_m: float
+    severity: float
+    confidence: float
+
+
 class ClassDocument(TypedDict):
     """The fixes of one class."""
 
@@ -208,6 +223,7 @@ class RunDocument(TypedDict):
     segments: list[SegmentDocument]
     gnss: GnssDocument
     heading: HeadingDocument
+    events: list[EventDocument]
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans

@@ -23,6 +23,7 @@ from icrtool.output.run_directory import (
 )
 from icrtool.output.run_schema import check_run_document
 from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
+from icrtool.records.events import SlipEvent
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.tables import Ints, States
 
@@ -58,8 +59,9 @@ def open_run(path: str | Path) -> Run:
         facts = document["filter"]
         forward, right = facts["antenna_m"]
         inputs = FilterInputs(
-            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses
-        )
+            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses,
+            tuple(SlipEvent(**{name: event[name] for name in SlipEvent._fields}) for event in document["events"]),
+        )  # fmt: skip
         _check_sum(directory, MEASUREMENTS_FILE, sums)
         sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)

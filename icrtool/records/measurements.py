@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from icrtool.records.events import SlipEvent
 from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
@@ -70,6 +71,7 @@ class SensorData:
     heading_correlation_s : headings closer together than this err alike
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
+    events : spans in which the robot did not do what its wheels did, in order of time
     """
 
     name: str
@@ -81,6 +83,7 @@ class SensorData:
     heading_correlation_s: float
     antenna_m: tuple[float, float]
     losses_ns: Ints
+    events: tuple[SlipEvent, ...] = ()
 
     def earlier(self, delay_s: float) -> SensorData:
         """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""
