@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +36,10 @@ SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parq
 PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
+
+LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, HEADINGS_FILE, "events.csv", "report.html",
+               "plots", "dropout")  # fmt: skip
+"""What a run directory may hold that is icrtool's, though the list of its files does not name it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,7 @@ def write_run(
     plots: tuple[str, ...] = ("png",),
     smoothed: States | None = None,
     drawer: Drawer | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -91,6 +96,7 @@ def write_run(
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     smoothed : the smoother's states, written as ``smoothed`` in the same format
     drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
+    note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
     ------
@@ -100,7 +106,7 @@ def write_run(
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
     with (
-        whole_directory(directory, is_run_directory, kind="run directory") as partial,
+        whole_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
         (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
