@@ -1,0 +1,206 @@
+"""The work on one log of a batch: fit, dropout analysis, run directory, and the row that comes of it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from icrtool import __version__
+from icrtool.config import Config
+from icrtool.errors import IcrToolError, OutputError
+from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text, multiplier_of
+
+if TYPE_CHECKING:
+    from icrtool.output.dropout_content import DropoutContent
+
+Stage = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """All that processing a log needs; travels to the process that does it as JSON. Paths are bytes: of any name.
+
+    Attributes
+    ----------
+    path : of the log
+    row : what is known of it before: names, robot, group, tags, key
+    directory : of the run
+    row_file : where the row is written, for a batch that continues this one
+    """
+
+    path: bytes
+    row: Row
+    directory: bytes
+    row_file: bytes
+    config: Config
+    plots: tuple[str, ...] = ("png",)
+    gates: tuple[str, ...] = ()
+    budgets_m: tuple[float, ...] = (0.5,)
+    ladder: bool = True
+
+    def encode(self) -> bytes:
+        """Return it as one line of JSON."""
+        return msgspec.json.encode(self)
+
+
+def path_of(name: bytes) -> Path:
+    """Return a path of a request."""
+    return Path(os.fsdecode(name))
+
+
+_REQUEST = msgspec.json.Decoder(Request)
+"""Made at import, as in `icrtool.fleet.worker`."""
+
+
+def decode_request(line: bytes) -> Request:
+    """Return what `Request.encode` wrote."""
+    return _REQUEST.decode(line)
+
+
+def process(request: Request, stage: Stage) -> Row:
+    """Fit a log, analyse the run, write both, and return its row; a log that cannot be used gives a row that says why.
+
+    Parameters
+    ----------
+    stage : called with what is done next
+    """
+    from icrtool.output.atomic_file import whole_file
+
+    begun = time.monotonic()
+    try:
+        row = _results(request, stage)
+    except IcrToolError as err:
+        # A full disk may not be full the next time; the log's own errors come again.
+        row = failed(request, str(err), repeatable=not isinstance(err, OutputError))
+    row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
+    row_file = path_of(request.row_file)
+    row_file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(row_file) as file:
+        file.write_bytes(msgspec.json.encode(row))
+    return row
+
+
+def failed(request: Request, reason: str, *, details: str = "", repeatable: bool) -> Row:
+    """Return the row of a log that could not be processed."""
+    inputs = files_of(path_of(request.path)) if repeatable else ()
+    return replace(
+        request.row, status="failed", reason=reason, details=details, repeatable=repeatable, inputs=inputs,
+        tool_version=__version__,
+    )  # fmt: skip
+
+
+def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File, ...]:
+    """Return the files of a log with their sha256; those in `hashes`, by path, are not read again."""
+    import hashlib
+
+    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+    found = []
+    for file in files:
+        digest = (hashes or {}).get(str(file))
+        if digest is None:
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        status = file.stat()
+        found.append(File(as_text(file), status.st_size, status.st_mtime_ns, digest))
+    return tuple(found)
+
+
+def _results(request: Request, stage: Stage) -> Row:
+    summary, content = _analyse(request, stage)
+    first_ns = content[1]
+    report = content[0]
+    icr = summary["icr"]
+    multiplier, multiplier_std = multiplier_of(summary)
+    final, std = icr.get("final") or {}, icr.get("final_std") or {}
+    verdicts = [
+        GateVerdict(one.gate.text, _finite(one.value_m), _finite(one.margin_m), one.passed) for one in report.verdicts
+    ]
+    return replace(
+        request.row,
+        status="done",
+        robot=request.row.robot or request.config.robot.name or "",
+        start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
+        duration_s=summary["drive"]["duration_s"],
+        distance_m=summary["drive"]["distance_m"],
+        icr={name: final.get(name) for name in ICRS} | {f"std_{name}": std.get(name) for name in ICRS},
+        multiplier=multiplier,
+        multiplier_std=multiplier_std,
+        errors=_errors(report),
+        outages=len(report.outages),
+        warnings=len(summary["warnings"]),
+        verdicts=tuple(verdicts),
+        inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
+    )
+
+
+def _analyse(request: Request, stage: Stage) -> tuple[dict[str, Any], tuple[DropoutContent, int]]:
+    """Fit and analyse a log, write run and report; return run.json, the report and the first stamp."""
+    from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate, parse_gate
+    from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
+    from icrtool.dropout_analysis.real_outages import real_outages
+    from icrtool.dropout_analysis.straight_and_turning import split_by_turning
+    from icrtool.dropout_analysis.trials import configured_horizons_m, dropout
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+    from icrtool.output.dropout_content import DropoutContent, title_of
+    from icrtool.output.dropout_directory import dropout_directory, write_content
+    from icrtool.output.dropout_ladder import ladder_of
+    from icrtool.output.figures import dropout_figures as drawing
+    from icrtool.output.figures.drawing_process import DrawingHere
+    from icrtool.output.run_directory import check_target, write_run
+
+    directory = path_of(request.directory)
+    check_target(directory)
+    stage("reading")
+    log = read_log(path_of(request.path), request.config)
+    stage("filtering")
+    run = fit(log, request.config)
+    stage("writing the run")
+    write_run(run, directory, plots=request.plots)
+    stage("dropout analysis")
+    gates = [parse_gate(text) for text in request.gates]
+    horizons = sorted({*configured_horizons_m(run), *(gate.horizon_m for gate in gates)})
+    title = title_of(run)
+    with dropout_directory(directory) as partial, DrawingHere(request.plots).into(partial / "plots") as draw:
+        drawing.draw_examples(draw, title, examples := example_drives(run))
+        drawing.draw_worst(draw, title, worst := worst_drives(run))
+        drawing.draw_outages(draw, title, run.table, outages := real_outages(run))
+        report = dropout(run, horizons)
+        drawing.draw_summary(draw, title, report, outages)
+        ladder, no_ladder = ladder_of(run, run) if request.ladder else (None, "")
+        if ladder is not None:
+            drawing.draw_ladder(draw, title, ladder)
+        content = DropoutContent(
+            title=title, run_summary=run.summary, report=report,
+            budgets=tuple(one for budget in request.budgets_m for one in budget_distances(report, budget)),
+            verdicts=tuple(judge_gate(gate, report) for gate in gates),
+            worst=worst, examples=examples, outages=tuple(outages), by_turning=split_by_turning(run),
+            ladder=ladder, no_ladder=no_ladder,
+        )  # fmt: skip
+        write_content(content, partial)
+    return run.summary, (content, int(run.table.stamp_ns[0]))
+
+
+def _errors(content: DropoutContent) -> dict[str, float | None]:
+    columns = content.report.summary_columns()
+    rows = list(zip(*(columns[name] for name in ("model", "horizon_m", "p95_m", "expected_error_m")), strict=True))
+    errors: dict[str, float | None] = {}
+    for model, horizon_m, p95_m, expected_m in rows:
+        if float(horizon_m) in HORIZONS_M:
+            errors[f"{model}_p95_{float(horizon_m):g}m_m"] = _finite(p95_m)
+            errors[f"{model}_expected_{float(horizon_m):g}m_m"] = _finite(expected_m)
+    for budget in content.budgets:
+        errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = _finite(budget.distance_m)
+    return errors
+
+
+def _finite(value: Any) -> float | None:  # noqa: ANN401 - a number of numpy's or Python's
+    number = float(value)
+    return number if number - number == 0 else None
