@@ -18,7 +18,7 @@ from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text, multiplier_of
 
 if TYPE_CHECKING:
-    from icrtool.output.dropout_content import DropoutContent
+    from icrtool.dropout_analysis.report import DropoutReport
 
 Stage = Callable[[str], None]
 
@@ -113,9 +113,28 @@ def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File,
 
 
 def _results(request: Request, stage: Stage) -> Row:
-    summary, content = _analyse(request, stage)
-    first_ns = content[1]
-    report = content[0]
+    """Fit and analyse a log, write run and report."""
+    from icrtool.dropout_analysis.dropout_report import dropout_report
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+    from icrtool.output.run_directory import check_target
+
+    directory = path_of(request.directory)
+    check_target(directory)
+    stage("reading")
+    log = read_log(path_of(request.path), request.config)
+    stage("filtering")
+    run = fit(log, request.config)
+    stage("writing the run")
+    run.write(directory, plots=request.plots)
+    stage("dropout analysis")
+    report = dropout_report(run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder)
+    stage("writing the report")
+    report.write(directory / "dropout", plots=request.plots)
+    return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
+
+
+def _row(request: Request, summary: dict[str, Any], first_ns: int, report: DropoutReport) -> Row:
     icr = summary["icr"]
     multiplier, multiplier_std = multiplier_of(summary)
     final, std = icr.get("final") or {}, icr.get("final_std") or {}
@@ -140,63 +159,15 @@ def _results(request: Request, stage: Stage) -> Row:
     )
 
 
-def _analyse(request: Request, stage: Stage) -> tuple[dict[str, Any], tuple[DropoutContent, int]]:
-    """Fit and analyse a log, write run and report; return run.json, the report and the first stamp."""
-    from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate, parse_gate
-    from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
-    from icrtool.dropout_analysis.real_outages import real_outages
-    from icrtool.dropout_analysis.straight_and_turning import split_by_turning
-    from icrtool.dropout_analysis.trials import configured_horizons_m, dropout
-    from icrtool.estimation.fit import fit
-    from icrtool.logs import read_log
-    from icrtool.output.dropout_content import DropoutContent, title_of
-    from icrtool.output.dropout_directory import dropout_directory, write_content
-    from icrtool.output.dropout_ladder import ladder_of
-    from icrtool.output.figures import dropout_figures as drawing
-    from icrtool.output.figures.drawing_process import DrawingHere
-    from icrtool.output.run_directory import check_target, write_run
-
-    directory = path_of(request.directory)
-    check_target(directory)
-    stage("reading")
-    log = read_log(path_of(request.path), request.config)
-    stage("filtering")
-    run = fit(log, request.config)
-    stage("writing the run")
-    write_run(run, directory, plots=request.plots)
-    stage("dropout analysis")
-    gates = [parse_gate(text) for text in request.gates]
-    horizons = sorted({*configured_horizons_m(run), *(gate.horizon_m for gate in gates)})
-    title = title_of(run)
-    with dropout_directory(directory) as partial, DrawingHere(request.plots).into(partial / "plots") as draw:
-        drawing.draw_examples(draw, title, examples := example_drives(run))
-        drawing.draw_worst(draw, title, worst := worst_drives(run))
-        drawing.draw_outages(draw, title, run.table, outages := real_outages(run))
-        report = dropout(run, horizons)
-        drawing.draw_summary(draw, title, report, outages)
-        ladder, no_ladder = ladder_of(run, run) if request.ladder else (None, "")
-        if ladder is not None:
-            drawing.draw_ladder(draw, title, ladder)
-        content = DropoutContent(
-            title=title, run_summary=run.summary, report=report,
-            budgets=tuple(one for budget in request.budgets_m for one in budget_distances(report, budget)),
-            verdicts=tuple(judge_gate(gate, report) for gate in gates),
-            worst=worst, examples=examples, outages=tuple(outages), by_turning=split_by_turning(run),
-            ladder=ladder, no_ladder=no_ladder,
-        )  # fmt: skip
-        write_content(content, partial)
-    return run.summary, (content, int(run.table.stamp_ns[0]))
-
-
-def _errors(content: DropoutContent) -> dict[str, float | None]:
-    columns = content.report.summary_columns()
+def _errors(report: DropoutReport) -> dict[str, float | None]:
+    columns = report.summary_columns()
     rows = list(zip(*(columns[name] for name in ("model", "horizon_m", "p95_m", "expected_error_m")), strict=True))
     errors: dict[str, float | None] = {}
     for model, horizon_m, p95_m, expected_m in rows:
         if float(horizon_m) in HORIZONS_M:
             errors[f"{model}_p95_{float(horizon_m):g}m_m"] = _finite(p95_m)
             errors[f"{model}_expected_{float(horizon_m):g}m_m"] = _finite(expected_m)
-    for budget in content.budgets:
+    for budget in report.budgets:
         errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = _finite(budget.distance_m)
     return errors
 
