@@ -15,8 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -31,6 +30,9 @@ LONGEST_DETAILS = 4000
 
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg"}
 """One thread a log: the logs are what runs at the same time."""
+
+
+COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.worker")
 
 
 class Line(NamedTuple):
@@ -86,10 +88,9 @@ class Worker:
         if process is not None:
             process.kill()
             process.wait()
-            for stream in (process.stdin, process.stdout):
-                if stream is not None:
-                    with suppress(OSError):  # its other end is gone
-                        stream.close()
+            if process.stdin is not None:
+                with suppress(OSError):  # its other end is gone
+                    process.stdin.close()
         if self._errors is not None:
             self._errors.close()
             self._errors = None
@@ -103,8 +104,8 @@ class Worker:
         home = str(Path(__file__).resolve().parents[2])
         paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
         # In a session of its own: Ctrl-C reaches the command, which ends its workers.
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "icrtool.fleet.worker"],
+        process = subprocess.Popen(  # noqa: S603 - our own command
+            COMMAND,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
             env={**os.environ, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
         )  # fmt: skip
@@ -125,7 +126,7 @@ def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
 
 
 _mine = threading.local()
-_all: weakref.WeakSet[Worker] = weakref.WeakSet()
+_all: set[Worker] = set()
 
 
 def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> Row:
@@ -146,8 +147,8 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
 
 def close_all() -> None:
     """End the worker processes of all threads."""
-    for worker in list(_all):
-        worker.close()
+    while _all:
+        _all.pop().close()
 
 
 def _unheard(_: str) -> None:
@@ -156,18 +157,16 @@ def _unheard(_: str) -> None:
 
 def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
     """Put the lines of a process into a queue, None at its end."""
-    try:
+    with stream:
         for line in stream:
             lines.put(line)
-    except (OSError, ValueError):
-        pass  # closed with the process
     lines.put(None)
 
 
 def main() -> None:
     """Process the logs that standard input asks for, until it ends."""
-    # What a library prints goes with the errors.
-    output = os.fdopen(os.dup(1), "wb")
+    # What a library prints goes with the errors. Files of our own: Python's are locked by who waits for a line.
+    requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(100_000)
@@ -176,24 +175,23 @@ def main() -> None:
         output.write(msgspec.json.encode(line) + b"\n")
         output.flush()
 
-    for text in _requests():
+    for text in _lines_of(requests):
         say(Line(row=process(decode_request(text), lambda stage: say(Line(stage)))))
 
 
-def _requests() -> Iterator[bytes]:
-    """Yield the lines of standard input; end the process when it is closed, in the middle of a log too."""
+def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:
+    """Yield the lines of a stream; end the process when it is closed, in the middle of a log too."""
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def read() -> None:
-        for line in sys.stdin.buffer:
+        for line in stream:
             lines.put(line)
         # Whoever asked is gone.
         os._exit(1)
 
     threading.Thread(target=read, daemon=True).start()
-    next_line: Callable[[], bytes] = lines.get
     while True:
-        yield next_line()
+        yield lines.get()
 
 
 if __name__ == "__main__":
