@@ -103,7 +103,7 @@ def is_bag_directory(folder: Path) -> bool:
         return False
     # The recorder counts its files up: bag_0, bag_1, … A packed file can be read as part of a directory only.
     stems = [file.name.split(".")[0].rpartition("_") for file in files]
-    numbers = [int(number) if number.isdigit() else -1 for _, _, number in stems]
+    numbers = [int(number) if stem and number.isdecimal() else -1 for stem, _, number in stems]
     counted = len({stem for stem, _, _ in stems}) == 1 and all(b == a + 1 for a, b in pairwise(numbers))
     packed = files[0].suffix not in LOG_SUFFIXES
     return packed or (len(files) > 1 and counted and min(numbers) >= 0)

@@ -16,6 +16,7 @@ pytest.importorskip("distributed", reason="needs the extra icrtool[cluster]")
 pytestmark = pytest.mark.stress
 
 ROOT = Path(__file__).parents[3]
+LOGS = 5
 
 
 def start(*arguments: str, **options: object) -> subprocess.Popen[bytes]:
@@ -44,11 +45,12 @@ def cluster(tmp_path: Path):
 
 def test_a_worker_killed_in_the_middle_loses_no_row_and_doubles_none(tmp_path: Path, cluster) -> None:
     address, processes = cluster
-    for number in range(6):
-        drive = ("--duration", "60", "--seed", str(number), "-o", str(tmp_path / "logs" / f"{number}.mcap"), "-q")
+    for number in range(LOGS):
+        drive = ("--duration", "40", "--seed", str(number), "-o", str(tmp_path / "logs" / f"{number}.mcap"), "-q")
         (tmp_path / "logs").mkdir(exist_ok=True)
         assert start("-m", "icrtool", "simulate", *drive).wait(300) == 0
-    arguments = ("-m", "icrtool", "batch", str(tmp_path / "logs"), "-o", str(tmp_path / "out"), "--plots", "none")
+    arguments = ("-m", "icrtool", "batch", str(tmp_path / "logs"), "-o", str(tmp_path / "out"), "--plots", "none",
+                 "--robot", "pentzer-tracked", "--no-ladder")  # fmt: skip
     batch = start(*arguments, "--json", "--scheduler", address, stdout=subprocess.PIPE)
     rows = tmp_path / "out" / ".rows"
     for _ in range(3000):
@@ -58,5 +60,5 @@ def test_a_worker_killed_in_the_middle_loses_no_row_and_doubles_none(tmp_path: P
     processes[1].send_signal(signal.SIGKILL)
     document = json.loads(batch.communicate(timeout=500)[0])
     assert batch.returncode == 0
-    assert [row["log"] for row in document["logs"]] == [f"{number}.mcap" for number in range(6)]
-    assert document["counts"] == {"done": 6, "failed": 0, "skipped": 0}
+    assert [row["log"] for row in document["logs"]] == [f"{number}.mcap" for number in range(LOGS)]
+    assert document["counts"] == {"done": LOGS, "failed": 0, "skipped": 0}

@@ -46,9 +46,9 @@ def test_bag_directories_and_splits_count_once(tmp_path: Path) -> None:
     make(tmp_path, "bag/metadata.yaml", "packed/metadata.yaml", content=b"rosbag2_bagfile_information:")
     make(tmp_path, "killed/k_0.mcap", "killed/k_1.mcap", "killed/k_2.mcap")
     make(tmp_path, "several/monday.mcap", "several/tuesday.mcap")
-    make(tmp_path, "gap/g_0.mcap", "gap/g_4.mcap")
+    make(tmp_path, "gap/g_0.mcap", "gap/g_4.mcap", "1/0.mcap", "1/1.mcap")
     assert names(tmp_path) == [
-        "bag", "gap/g_0", "gap/g_4", "killed", "packed", "several/monday", "several/tuesday",
+        "1/0", "1/1", "bag", "gap/g_0", "gap/g_4", "killed", "packed", "several/monday", "several/tuesday",
     ]  # fmt: skip
 
 
