@@ -9,7 +9,8 @@ import numpy as np
 from icrtool.alignment.reference_delay import busiest_rows, find_delay
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, configured_process_position_mps, set_up_filter
-from icrtool.kernels.ekf import UNSEEN, FilterOutput, run_filter
+from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.filter_records import UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
 
