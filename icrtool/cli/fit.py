@@ -187,10 +187,11 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         find_changes=request.finds_changes,
         smooth=request.smooths,
     )
-    write_run(run, directory, states=request.states, drawer=drawer)
+    notes: list[str] = []
+    write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
     replaced = before is not None and before != run.summary["inputs"][0]["path"]
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
-    options.warn((*run.warnings, *_other_robot(request, start), *note), quiet=request.quiet)
+    options.warn((*run.warnings, *_other_robot(request, start), *note, *notes), quiet=request.quiet)
     if not request.quiet:
         from icrtool.output.tables.run import format_run
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -146,9 +147,13 @@ def read_log(
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: that of the file without its suffix, or of the directory."""
-    resolved = path.absolute()
-    return resolved.name if resolved.is_dir() else resolved.stem
+    """Return a log's name: that of the file without its suffix, or of the directory; ``log`` where that is only dots.
+
+    Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
+    """
+    named = Path(os.path.normpath(path.absolute()))
+    name = named.name if named.is_dir() else named.stem
+    return name if name.strip(".") else "log"
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:

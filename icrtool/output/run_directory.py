@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,10 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
 
+LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, "events.csv", "report.html",
+               "plots", "dropout")  # fmt: skip
+"""What a run directory may hold that is icrtool's, though the list of its files does not name it."""
+
 
 def check_target(directory: Path) -> None:
     """Refuse a place where a run directory cannot be put, before any work is done for it.
@@ -48,6 +52,7 @@ def write_run(
     states: StatesFormat = "csv",
     plots: tuple[str, ...] = ("png",),
     drawer: Drawer | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -58,6 +63,7 @@ def write_run(
     states : format of the states
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
+    note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
     ------
@@ -67,7 +73,7 @@ def write_run(
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
     with (
-        whole_directory(directory, is_run_directory, kind="run directory") as partial,
+        whole_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
         (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):

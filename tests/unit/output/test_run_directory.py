@@ -25,7 +25,7 @@ def written(tmp_path: Path, run: Run) -> Path:
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file())
+    return sorted(str(path.relative_to(directory)) for path in directory.rglob("[!.]*") if path.is_file())
 
 
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) -> None:
