@@ -1,0 +1,214 @@
+"""Robust statistics and robust least squares: median absolute deviation, loss weights, Gauss-Newton with priors.
+
+The one place for them. Residuals of overlapping windows are not independent of one another: the data count as one
+residual in `overlap` beside the prior, and the covariance takes its spread from groups of residuals (a stretch of
+distance of one log), not from single ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAD_TO_STD = 1.4826
+"""Standard deviation over median absolute deviation, for normal values."""
+
+LOSS_SIGMAS = 2.0
+"""Where the loss turns from square to linear, in robust standard deviations."""
+
+SMALLEST_SCALE = 1e-9
+"""Residuals of an exact fit have no spread; this keeps their weights finite."""
+
+SETTLED = 0.01
+"""A Gauss-Newton step below this share of the standard deviation is the last one."""
+
+MOST_HALVINGS = 6
+
+
+def mad_std(values: Floats, centre: float | None = None) -> float:
+    """Return the robust standard deviation of values (m,): 1.4826 times their median absolute deviation.
+
+    Parameters
+    ----------
+    centre : deviations are from here; default the median. Residuals, which belong about zero, take 0.
+
+    Notes
+    -----
+    Hampel 1974. NaN for no values.
+    """
+    if not len(values):
+        return float("nan")
+    middle = float(np.median(values)) if centre is None else centre
+    return MAD_TO_STD * float(np.median(np.abs(values - middle)))
+
+
+def soft_l1_weights(z: Floats) -> Floats:
+    """Return the weights (m,) of squared residuals that make the soft-L1 loss; `z` (m,) in standard deviations.
+
+    Notes
+    -----
+    rho = 2 c^2 (sqrt(1 + (z/c)^2) - 1) with c = `LOSS_SIGMAS` (Charbonnier et al. 1997); the weight is rho'/(2 z).
+    """
+    weights: Floats = 1.0 / np.sqrt(1.0 + (z / LOSS_SIGMAS) ** 2)
+    return weights
+
+
+def huber_weights(z: Floats, sigmas: float = LOSS_SIGMAS) -> Floats:
+    """Return Huber's weights (m,) of squared residuals; `z` (m,) in standard deviations (Huber 1964)."""
+    weights: Floats = 1.0 / np.maximum(np.abs(z) / sigmas, 1.0)
+    return weights
+
+
+class RobustFit(NamedTuple):
+    """The minimum of a robust least squares problem.
+
+    Attributes
+    ----------
+    x : (k,) parameters
+    covariance : (k, k), from the spread between groups, nowhere less than `information` allows
+    information : (k, k) Gauss-Newton matrix: data, one residual in `overlap`, and prior
+    residuals : (m,), jacobian : (m, k), at `x`, to first order of the last step
+    scale : (m,) robust standard deviation of each residual, that of its kind
+    weights : (m,) of the loss, 0 to 1
+    groups : independent groups of residuals
+    converged : whether the last step was short enough
+    """
+
+    x: Floats
+    covariance: Floats
+    information: Floats
+    residuals: Floats
+    jacobian: Floats
+    scale: Floats
+    weights: Floats
+    groups: int
+    converged: bool
+
+    @property
+    def std(self) -> Floats:
+        """One standard deviation of each parameter (k,)."""
+        deviations: Floats = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+
+Evaluate = Callable[[Floats], tuple[Floats, Floats]]
+"""Maps parameters (k,) to residuals (m,) and their Jacobian (m, k)."""
+
+
+def robust_least_squares(
+    evaluate: Evaluate,
+    start: Floats,
+    prior_mean: Floats,
+    prior_std: Floats,
+    *,
+    kind: Ints | None = None,
+    group: Ints | None = None,
+    overlap: float = 1.0,
+    most_steps: int = 15,
+) -> RobustFit:
+    """Minimise a soft-L1 loss of residuals under a normal prior by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    evaluate : residuals and Jacobian at some parameters
+    start : (k,) where to begin
+    prior_mean, prior_std : (k,); an infinite deviation is no prior
+    kind : (m,) residuals of one kind share one robust scale, which is their own; default one kind
+    group : (m,) residuals of one group depend on one another, others do not; default each its own
+    overlap : so many residuals count as one independent one
+    most_steps : at most this many steps
+
+    Notes
+    -----
+    Iteratively reweighted Gauss-Newton (Holland and Welsch 1977) with step halving; the scale follows the residuals.
+    Covariance: `sandwich_covariance`.
+    """
+    x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
+    kinds = np.zeros(0, np.int64) if kind is None else kind
+    residuals, jacobian = evaluate(x)
+    converged = False
+    for _ in range(most_steps):
+        scale = scale_by_kind(residuals, kinds)
+        information, gradient = normal_equations(residuals, jacobian, scale, overlap)
+        information = information + np.diag(pull)
+        gradient = gradient + pull * (x - prior_mean)
+        step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
+        if np.all(np.abs(step) * np.sqrt(np.diag(information)) < SETTLED):
+            # too short to evaluate for: residuals follow it to first order
+            x, residuals, converged = x + step, residuals + jacobian @ step, True
+            break
+        before = _cost(residuals / scale, overlap, pull, x - prior_mean)
+        tried = evaluate(x + step)
+        for _ in range(MOST_HALVINGS):
+            if _cost(tried[0] / scale, overlap, pull, x + step - prior_mean) <= before:
+                break
+            step = step / 2.0
+            tried = evaluate(x + step)
+        x, (residuals, jacobian) = x + step, tried
+    scale = scale_by_kind(residuals, kinds)
+    groups = np.arange(len(residuals)) if group is None else group
+    covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, pull, overlap)
+    weights = soft_l1_weights(residuals / scale)
+    return RobustFit(x, covariance, information, residuals, jacobian, scale, weights, count, converged)
+
+
+def scale_by_kind(residuals: Floats, kind: Ints) -> Floats:
+    """Return the robust standard deviation about zero of each residual's kind (m,); an empty `kind` is one kind."""
+    if not len(kind):
+        return np.full(len(residuals), max(mad_std(residuals, 0.0), SMALLEST_SCALE))
+    scale = np.empty(len(residuals))
+    for one in np.unique(kind):
+        scale[kind == one] = max(mad_std(residuals[kind == one], 0.0), SMALLEST_SCALE)
+    return scale
+
+
+def normal_equations(residuals: Floats, jacobian: Floats, scale: Floats, overlap: float) -> tuple[Floats, Floats]:
+    """Return the data's part of the information matrix (k, k) and of the gradient (k,), soft-L1 weighted."""
+    z = residuals / scale
+    weights = soft_l1_weights(z) / overlap
+    slopes = jacobian / scale[:, None]
+    pulled = slopes * weights[:, None]
+    return pulled.T @ slopes, pulled.T @ z
+
+
+def sandwich_covariance(
+    residuals: Floats, jacobian: Floats, scale: Floats, group: Ints, pull: Floats, overlap: float = 1.0
+) -> tuple[Floats, Floats, int]:
+    """Return the covariance (k, k) of a robust fit, its information matrix (k, k), and the number of groups.
+
+    Parameters
+    ----------
+    pull : (k,) information of the prior
+
+    Notes
+    -----
+    H^-1 (sum g g^T + P) H^-1 with g the gradient of a group, H the Gauss-Newton matrix and P the prior (White 1982;
+    Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread: no variance is less
+    than that of H^-1.
+    """
+    z, slopes = residuals / scale, jacobian / scale[:, None]
+    influence = soft_l1_weights(z) / overlap
+    information: Floats = (slopes * influence[:, None]).T @ slopes + np.diag(pull)
+    order = np.unique(group, return_inverse=True)[1]
+    count = int(order.max()) + 1 if len(order) else 0
+    gradients = np.zeros((count, slopes.shape[1]))
+    np.add.at(gradients, order, slopes * (influence * z)[:, None])
+    meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
+    inverse = np.linalg.solve(information, np.eye(len(pull)))
+    sandwich = inverse @ meat @ inverse
+    grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
+    covariance: Floats = sandwich * np.outer(grown, grown)
+    return (covariance + covariance.T) / 2.0, information, count
+
+
+def _cost(z: Floats, overlap: float, pull: Floats, away: Floats) -> float:
+    """Return the loss of residuals in standard deviations, prior included; infinite where it is not a number."""
+    loss = 2.0 * LOSS_SIGMAS**2 * float((np.sqrt(1.0 + (z / LOSS_SIGMAS) ** 2) - 1.0).sum()) / overlap
+    cost = loss + float((pull * away**2).sum())
+    return cost if np.isfinite(cost) else float("inf")

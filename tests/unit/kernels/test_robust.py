@@ -1,0 +1,110 @@
+"""Robust statistics against closed forms, scipy and the spread over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from icrtool.kernels.robust import (
+    LOSS_SIGMAS,
+    Floats,
+    RobustFit,
+    huber_weights,
+    mad_std,
+    robust_least_squares,
+    soft_l1_weights,
+)
+
+TRUTH = np.array([1.5, -0.7])
+
+
+def bent_line(rng: np.random.Generator, m: int = 400, outliers: float = 0.0) -> tuple[Floats, Floats]:
+    """Return t and y = a t + exp(b t) with noise 0.1 and a share of outliers."""
+    t = rng.uniform(0.0, 2.0, m)
+    y = TRUTH[0] * t + np.exp(TRUTH[1] * t) + rng.normal(0.0, 0.1, m)
+    y[rng.random(m) < outliers] += 5.0
+    return t, y
+
+
+def residuals_of(t: Floats, y: Floats, x: Floats) -> tuple[Floats, Floats]:
+    bent = np.exp(x[1] * t)
+    return x[0] * t + bent - y, np.column_stack([t, t * bent])
+
+
+START, NO_PRIOR = np.array([1.0, -0.3]), np.full(2, np.inf)
+
+
+def fitted(data: tuple[Floats, Floats], **options: Any) -> RobustFit:
+    return robust_least_squares(lambda x: residuals_of(*data, x), START, START, NO_PRIOR, **options)
+
+
+def test_mad_std_is_the_standard_deviation_of_normal_values_and_ignores_outliers() -> None:
+    values = np.random.default_rng(0).normal(3.0, 2.0, 20_001)
+    values[:1000] = 1e6
+    assert mad_std(values[1000:]) == pytest.approx(2.0, rel=0.03)
+    assert mad_std(values) == pytest.approx(2.0, rel=0.1)
+    assert mad_std(np.array([1.0, 2.0, 3.0]), 0.0) == pytest.approx(2.0 * 1.4826)
+    assert np.isnan(mad_std(np.empty(0)))
+
+
+@pytest.mark.parametrize("weights", [soft_l1_weights, huber_weights])
+def test_weights_are_one_at_zero_and_fall_as_one_over_the_residual(weights: Callable[[Floats], Floats]) -> None:
+    z = np.array([0.0, 1e6, -1e6])
+    np.testing.assert_allclose(weights(z), [1.0, LOSS_SIGMAS / 1e6, LOSS_SIGMAS / 1e6], rtol=1e-9)
+
+
+def test_the_minimum_is_that_of_scipy() -> None:
+    t, y = bent_line(np.random.default_rng(1), outliers=0.1)
+    found = fitted((t, y), most_steps=50)
+    scale = float(found.scale[0])
+    theirs = least_squares(
+        lambda x: residuals_of(t, y, x)[0] / scale, TRUTH, loss="soft_l1", f_scale=LOSS_SIGMAS, xtol=1e-12, ftol=1e-12
+    ).x
+    assert found.converged
+    # a last step below a hundredth of a standard deviation may be missing
+    np.testing.assert_allclose(found.x, theirs, atol=0.02 * float(found.std.min()))
+
+
+def test_outliers_move_the_estimate_by_less_than_its_noise() -> None:
+    clean, dirty = bent_line(np.random.default_rng(2)), bent_line(np.random.default_rng(2), outliers=0.05)
+    plain, robust = fitted(clean), fitted(dirty)
+    assert np.all(np.abs(plain.x - TRUTH) < 3.5 * plain.std)
+    assert np.all(np.abs(robust.x - TRUTH) < 3.5 * robust.std)
+
+
+def test_the_prior_decides_what_the_data_do_not_show() -> None:
+    rng = np.random.default_rng(3)
+    y = 2.0 + rng.normal(0.0, 0.1, 100)
+
+    def evaluate(x: Floats) -> tuple[Floats, Floats]:
+        return x[0] - y, np.column_stack([np.ones(100), np.zeros(100)])
+
+    found = robust_least_squares(evaluate, np.zeros(2), np.array([0.0, 7.0]), np.array([10.0, 0.3]))
+    assert found.x == pytest.approx([2.0, 7.0], abs=0.05)
+    assert found.std[1] == pytest.approx(0.3)
+
+
+def test_each_kind_of_residual_has_its_own_scale() -> None:
+    rng = np.random.default_rng(4)
+    kind = np.repeat([0, 1], 500)
+    y = np.where(kind == 0, rng.normal(1.0, 0.01, 1000), rng.normal(3.0, 10.0, 1000))
+    found = robust_least_squares(
+        lambda x: (x[0] - y, np.ones((1000, 1))), np.zeros(1), np.zeros(1), np.full(1, np.inf), kind=kind
+    )
+    assert found.x[0] == pytest.approx(1.0, abs=0.003)
+
+
+@pytest.mark.parametrize("members", [1, 20])
+def test_the_covariance_holds_where_members_of_a_group_repeat_one_another(members: int) -> None:
+    inside, seeds, independent = 0, 200, 30
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        t, y = (np.repeat(column, members) for column in bent_line(rng, independent))
+        group = np.repeat(np.arange(independent), members)
+        found = fitted((t, y), group=group, overlap=members)
+        inside += int(np.count_nonzero(np.abs(found.x - TRUTH) < 2.0 * found.std))
+    assert 0.90 < inside / (2 * seeds) < 0.99
