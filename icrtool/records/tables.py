@@ -119,6 +119,33 @@ class GyroSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class GyroAxes:
+    """Turn rates about the three axes of an inertial unit, as sent.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rates_radps : float64 (n, 3), about x, y, z of the sensor
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rates_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rates_radps)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherReceiver:
+    """Positions of a further receiver, in the same local plane."""
+
+    topic: str
+    fixes: PositionFixes
+
+
+@dataclass(frozen=True, slots=True)
 class Datum:
     """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
 
@@ -169,6 +196,9 @@ class RobotLog:
     warnings : sentences for the user, in the order they were found
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
     gyro : turn rates of an inertial unit, None without one; the filter does not use them
+    heading : without a row where no topic states one
+    gyros : all inertial units with turn rates, all axes
+    other_receivers : further GNSS receivers
     """
 
     name: str
@@ -182,6 +212,8 @@ class RobotLog:
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] | None = None
     gyro: GyroSamples | None = None
+    gyros: tuple[GyroAxes, ...] = ()
+    other_receivers: tuple[OtherReceiver, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
