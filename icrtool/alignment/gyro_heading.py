@@ -1,11 +1,11 @@
 """Heading from turn rates and positions: course over ground, rate bias and scale, in a Kalman filter and smoother.
 
-Over windows of driven distance the displacement of the fixes is compared with the wheels' speed laid along the
-integrated turn rate; the angle between them is the heading at the window's end:
+Over windows of driven distance the fixes p_i are regressed on the wheels' speed laid along the integrated turn rate,
+S_i = ∫ v e^{jG}: the angle of sum p_i S_i* (about the means) is the heading at the window's end, G being 0 there, plus
 
-    angle = psi + noise + x_icr Im(-(e^{jG_e} - e^{jG_b}) S*)/|S|^2 - tau Im((v_e e^{jG_e} - v_b e^{jG_b}) S*)/|S|^2
+    x_icr Im(sum -e^{jG_i} S_i*)/sum |S_i|^2 + tau Im(sum -v_i e^{jG_i} S_i*)/sum |S_i|^2
 
-with S = ∫ v e^{jG}, G the integrated rate (0 at the end). Wheels that run backwards turn S round. While the robot
+for ICRs ahead of the antenna and positions that lag. Wheels that run backwards turn S round. While the robot
 stands, the rate is its own bias. Absolute headings (an attitude sensor, the bearing between two antennas) enter with an
 offset that wanders slowly. What varies in time has a causal estimate (the past alone) and a smoothed one.
 """
@@ -29,23 +29,28 @@ if TYPE_CHECKING:
 PSI, BIAS, SCALE, X, DELAY, OFFSET = range(6)
 COURSE, STANDING, ATTITUDE = range(3)
 HUBER_SIGMAS = 2.5
+SPIKE_SIGMAS = 8.0
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD = 1.0, 12.0
 LONGEST_COURSE_S = 10.0
 STANDING_S = 0.6
 FEWEST_COURSES = 8
 
-SLIP_STD_RAD = math.radians(1.0)
+SLIP_STD_RAD = math.radians(0.3)
 """What wheels and ground turn a course by, whatever the fixes' noise."""
 
 ANGLE_WALKS = tuple(math.radians(rate) ** 2 for rate in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
 BIAS_WALKS = tuple(math.radians(rate) ** 2 for rate in (0.001, 0.01, 0.03, 0.1, 0.3))
 """Random walks of the integrated rate [rad^2/s] and of its bias [(rad/s)^2/s]: the likelihood chooses."""
 
-PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.5, 0.1, math.pi])
+PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1, math.pi])
 STANDING_RATE_STD = math.radians(0.05)
 ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 """An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
+
+ATTITUDE_WALK = 2 * ATTITUDE_STD_RAD**2 / ATTITUDE_TIME_S
+DELAY_ROUNDS, LONG_DELAY_S = 3, 0.15
+"""A delay of the fixes up to this is linear, and partly a robot's response to its wheels; a longer one takes rounds."""
 
 
 class TurnRate(NamedTuple):
@@ -108,33 +113,47 @@ def measure_courses(drive: DriveArrays, turn: TurnRate) -> Courses:
     laid = np.concatenate([[0.0], np.cumsum((v * nose * drive.wheel_dt)[:-1])])
     gone = np.concatenate([[0.0], np.cumsum((np.abs(v) * drive.wheel_dt)[:-1])])
     length = max(COURSE_WINDOW_M, COURSE_IN_POSITION_STD * min(drive.fix_std_m, 10.0))
-    inside = (drive.fix_t >= max(drive.wheel_t[0], turn.t[0])) & (drive.fix_t <= min(drive.wheel_t[-1], turn.t[-1]))
-    rows = np.flatnonzero(inside)
-    cell = np.floor(np.interp(drive.fix_t[rows], drive.wheel_t, gone) / length)
-    edge = rows[np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0)]
+    t, place = _without_spikes(drive, max(drive.wheel_t[0], turn.t[0]), min(drive.wheel_t[-1], turn.t[-1]))
+    cell = np.floor(np.interp(t, drive.wheel_t, gone) / length)
+    edge = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0)
     begin, end = edge[:-1], edge[1:]
-    t, place = drive.fix_t, drive.fix
-    at = np.interp(t, drive.wheel_t, laid)
     G = np.interp(t, turn.t, angle_at)
-    unwind = np.exp(-1j * G[end])
-    S = (at[end] - at[begin]) * unwind
-    seen = place[end] - place[begin]
-    kept = (t[end] - t[begin] < LONGEST_COURSE_S) & (np.abs(S) > 0.5 * length) & (np.abs(seen) > 0.3 * length)
+    path, swing = np.interp(t, drive.wheel_t, laid), np.exp(1j * G)
+    speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
+
+    def product(values: Complexes, others: Complexes) -> Complexes:
+        """Return the sums of values times conjugate others about their means, both ends of a window included."""
+        sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (values * np.conj(others), values, others)]
+        both, first, second = (one[end + 1] - one[begin] for one in sums)
+        return np.asarray(both - first * np.conj(second) / (end + 1 - begin), np.complex128)
+
+    square = product(path, path).real
+    seen = product(place - place.mean() if len(place) else place, path)
+    kept = (t[end] - t[begin] < LONGEST_COURSE_S) & (np.abs(path[end] - path[begin]) > 0.5 * length)
+    kept &= np.abs(seen) > 0.3 * square
     gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
     kept &= np.searchsorted(gap, t[begin]) == np.searchsorted(gap, t[end])
-    begin, end, S, seen, unwind = begin[kept], end[kept], S[kept], seen[kept], unwind[kept]
-    turned = np.exp(1j * G) 
-    speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
-    size = np.maximum(np.abs(S) ** 2, 1e-9)
-
-    def across(moved: Complexes) -> Floats:
-        return (moved * unwind * np.conj(S)).imag / size
-
+    of_x = product(-swing, path).imag
+    of_delay = product(-speed * swing, path).imag
+    size = np.maximum(square, 1e-12)
     return Courses(
-        t[begin], t[end], np.angle(seen * np.conj(S)),
-        across(-(turned[end] - turned[begin])), across(-(speed[end] * turned[end] - speed[begin] * turned[begin])),
-        math.sqrt(2.0) * drive.fix_std_m / np.abs(S),
+        t[begin][kept], t[end][kept], np.angle(seen * np.exp(1j * G[end]))[kept],
+        (of_x / size)[kept], (of_delay / size)[kept], (drive.fix_std_m / np.sqrt(size))[kept],
     )  # fmt: skip
+
+
+def _without_spikes(drive: DriveArrays, first: float, last: float) -> tuple[Floats, Complexes]:
+    """Return times and places of the fixes in a span, without those that lie far from both neighbours."""
+    rows = np.flatnonzero((drive.fix_t >= first) & (drive.fix_t <= last))
+    t, place = drive.fix_t[rows], drive.fix[rows]
+    if len(rows) < 3:
+        return t, place
+    bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
+    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), drive.fix_std_m)
+    # the neighbours of a spike bend by half as much
+    spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
+    kept = np.concatenate([[True], ~spike, [True]])
+    return t[kept], place[kept]
 
 
 def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
@@ -154,7 +173,7 @@ def estimate_heading(
     turn: TurnRate,
     absolute: tuple[Floats, Floats, Floats] | None = None,
     *,
-    absolute_walk: float = 2 * ATTITUDE_STD_RAD**2 / ATTITUDE_TIME_S,
+    absolute_walk: float = ATTITUDE_WALK,
     stands: bool = True,
 ) -> HeadingEstimate | None:
     """Estimate the heading; None with too few courses.
@@ -166,9 +185,27 @@ def estimate_heading(
     absolute_walk : random walk of that offset [rad^2/s]
     stands : whether the rate is zero while the wheels stand
     """
+    late, found = 0.0, None
+    for _ in range(DELAY_ROUNDS):
+        found = _estimate(drive, late, turn, absolute, absolute_walk, stands=stands)
+        if found is None:
+            return None
+        step = float(found.constants[DELAY]) - late
+        late += step
+        if abs(step) < max(3.0 * float(found.constants_std[DELAY]), LONG_DELAY_S):
+            break
+    return found
+
+
+def _estimate(
+    drive: DriveArrays, late: float, turn: TurnRate, absolute: tuple[Floats, Floats, Floats] | None,
+    absolute_walk: float, *, stands: bool,
+) -> HeadingEstimate | None:  # fmt: skip
+    """Run filter and smoother once about a delay of the fixes of `late` [s]: it is linear here, and takes rounds."""
     from icrtool.kernels.heading_kalman import HeadingEvents, filter_headings, smooth_headings
 
-    courses = measure_courses(drive, turn)
+    courses = measure_courses(drive._replace(fix_t=drive.fix_t - late), turn)
+    courses = courses._replace(angle=courses.angle + late * courses.of_delay)
     if len(courses.end) < FEWEST_COURSES:
         return None
     still_t, still_rate = _standing(drive, turn) if stands else (np.empty(0), np.empty(0))
@@ -181,10 +218,14 @@ def estimate_heading(
     h[kind == STANDING, BIAS] = 1.0
     h[kind == ATTITUDE, OFFSET] = 1.0
     h[kind == COURSE, X], h[kind == COURSE, DELAY] = courses.of_x, courses.of_delay
+    # the angle is that of the window's middle, carried to its end by a rate with bias and scale error
+    G = turn.integrated()
+    middle = (courses.begin + courses.end) / 2
+    h[kind == COURSE, BIAS] = courses.end - middle
+    h[kind == COURSE, SCALE] = np.interp(middle, turn.t, G) - np.interp(courses.end, turn.t, G)
     z = np.concatenate([courses.angle, still_rate, attitude[1]])
     r = np.concatenate([courses.std**2 + SLIP_STD_RAD**2, np.full(len(still_t), STANDING_RATE_STD**2), attitude[2] ** 2])
     t, kind, h, z, r = t[order], kind[order], h[order], z[order], r[order]
-    G = turn.integrated()
     at = np.interp(t, turn.t, G)
     events = HeadingEvents(np.diff(t, prepend=t[:1]), np.diff(at, prepend=at[:1]), z, h, r, kind != STANDING)
     std = PRIOR_STD.copy()
@@ -224,7 +265,7 @@ def _choose(
         passes = run(events, walks)
         z = passes.innovation[course] / np.sqrt(passes.variance[course])
         settled = z[len(z) // 20 + 2 :]
-        spread = float(np.clip(mad_std(settled, 0.0), 0.7, 5.0)) if len(settled) >= FEWEST_COURSES else 1.0
+        spread = float(np.clip(mad_std(settled, 0.0), 0.7, 10.0)) if len(settled) >= FEWEST_COURSES else 1.0
         nominal = np.where(course, nominal * spread**2, nominal)
         weights = np.ones(len(nominal))
         weights[course] = huber_weights(z / spread, HUBER_SIGMAS)
