@@ -24,22 +24,23 @@ from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWin
 from icrtool.kernels.robust import RobustFit, robust_least_squares
 from icrtool.records.tables import Complexes, Floats
 
-NAMES = ("scale", "middle", "x", "slip", "turn", "asymmetry", "drift", "offset", "position_delay", "heading_delay")
+NAMES = ("scale", "middle", "x", "slip", "turn", "asymmetry", "drift", "offset", "position_after_heading", "heading_delay")
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.5, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.5, 0.5])
-"""Wide: they keep apart what a drive does not, and say nothing where it does."""
+PRIOR_STD = np.array([0.5, 0.5, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.1, 0.5])
+"""Wide: they keep apart what a drive does not, and say nothing where it does. Delays of position and heading of one
+robot usually agree to 0.1 s."""
 
-SAME_CLOCK_STD_S = 0.05
-"""Delays of position and heading of one robot usually agree to this; fields of the same messages agree exactly."""
+SAME_CLOCK_STD_S = 1e-3
+"""Fields of the same messages are late together."""
 
 STEP_S = 0.02
 """Delays are differentiated over this step."""
 
 OVERLAP = 8.0
 FEWEST_WINDOWS = 16
-LARGEST_DELAY_S = 1.0
+MOST_STEPS = 15
 
 
 class Geometry(NamedTuple):
@@ -68,13 +69,18 @@ class AlignmentFit(NamedTuple):
     width_m: float
     windows: DriveWindows
 
-    def value(self, name: str) -> float:
-        """Return a parameter."""
-        return float(self.fit.x[NAMES.index(name)])
+    def estimate(self, name: str) -> tuple[float, float]:
+        """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
+        if name == "position_delay":
+            both = self.fit.covariance[np.ix_([TP, TH], [TP, TH])]
+            return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(float(both.sum()))
+        row = NAMES.index(name)
+        return float(self.fit.x[row]), float(self.fit.std[row])
 
-    def std(self, name: str) -> float:
-        """Return a parameter's standard deviation."""
-        return float(self.fit.std[NAMES.index(name)])
+    @property
+    def across_std(self) -> float:
+        """Robust scatter of the displacements across the heading, over the window's length [rad]."""
+        return float(self.fit.scale[len(self.windows.begin)]) / self.windows.length_m
 
     def geometry(self) -> Geometry:
         """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
@@ -116,13 +122,11 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     w, u = len(windows.begin), len(windows.turn_begin)
     kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
-    prior_std = PRIOR_STD
+    prior_std = PRIOR_STD.copy()
+    prior_std[TP] = SAME_CLOCK_STD_S if drive.same_clock else prior_std[TP]
     fit = robust_least_squares(
-        model.evaluate, model.reduced(start), model.reduced(PRIOR_MEAN), model.reduced(prior_std),
-        kind=np.append(kind, 3) if model.has_clock_row else kind,
-        group=np.append(group, -1) if model.has_clock_row else group,
-        overlap=OVERLAP, most_steps=20,
-    )  # fmt: skip
+        model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
+    )
     return AlignmentFit(fit, width_m, windows)
 
 
@@ -136,18 +140,13 @@ class _Model:
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
         self.turn_v, self.turn_w = self._cumulate(self.v).real, self._cumulate(2 * self.u / width_m).real
-        self.has_clock_row = False
-        h = drive
-        # lightly smoothed: single headings are noisy, and their mean over a fifth of a second is not
-        self.turned = np.interp(windows.turn_end, h.heading_t, h.heading) - np.interp(
-            windows.turn_begin, h.heading_t, h.heading
+        self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
+            windows.turn_begin, drive.heading_t, drive.heading
         )
 
-    def reduced(self, x: Floats) -> Floats:
-        return x
-
     def _cumulate(self, rate: Floats | Complexes) -> Complexes:
-        return np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
+        total: Complexes = np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
+        return total
 
     def first_offset(self) -> float:
         """Return the direction of the displacements from wheels laid along the heading [rad]."""
@@ -158,47 +157,57 @@ class _Model:
         return float(np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12))))
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return residuals along, across and of turns, and their Jacobian."""
+        place, place_slopes = self._displacements(x)
+        turn, turn_slopes = self._turns(x)
+        return (
+            np.concatenate([place.real, place.imag, turn]),
+            np.concatenate([place_slopes.real, place_slopes.imag, turn_slopes]),
+        )
+
+    def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
+        """Return predicted minus seen displacements in the frame of the heading (w,), and their slopes (w, k)."""
         drive, windows = self.drive, self.windows
-        a, m, c, slip, k, q, g, offset, late_p, late_h = x
+        offset, late_h, late_p = float(x[D]), float(x[TH]), float(x[TH] + x[TP])
 
         def heading_at(t: Floats) -> Floats:
             return np.interp(t + late_h, drive.heading_t, drive.heading)
 
-        psi = heading_at(self.middle_t)
+        nose = np.exp(1j * (heading_at(self.middle_t) + offset))
         rate = (heading_at(self.middle_t + STEP_S) - heading_at(self.middle_t - STEP_S)) / (2 * STEP_S)
-        nose = np.exp(1j * psi)
-        body = a * self.v + m * self.u + 1j * (c * self.u + slip * self.v * 2 * self.u / self.b)
-        fields = [self.v * nose, self.u * nose, 1j * self.u * nose, 1j * self.v * 2 * self.u / self.b * nose, body * nose, 1j * rate * body * nose]
-        turn = np.exp(1j * offset)
-        cumulated = [self._cumulate(field) for field in fields]
-        begin, end = windows.begin, windows.end
+        sideways = 1j * self.v * 2 * self.u / self.b
+        body = x[A] * self.v + x[M] * self.u + 1j * x[C] * self.u + x[L] * sideways
         t = drive.fix_t - late_p
-        spans = []
-        for one in cumulated:
-            at = np.interp(t, drive.wheel_t, one)
-            spans.append(turn * (at[end] - at[begin]))
-        ahead, back = (np.interp(t + s, drive.wheel_t, cumulated[4]) for s in (-STEP_S, STEP_S))
-        slope = (ahead - back) / (2 * STEP_S)
-        predicted = spans[4]
-        level = np.exp(-1j * (offset + 0.5 * (np.interp(t[begin], drive.heading_t, drive.heading) + np.interp(t[end], drive.heading_t, drive.heading))))
-        left = (predicted - self.seen) * level
-        columns = np.zeros((len(begin), len(x)), np.complex128)
-        columns[:, A], columns[:, M], columns[:, C], columns[:, L] = spans[:4]
-        columns[:, D] = 1j * predicted
-        columns[:, TP] = turn * (slope[end] - slope[begin])
-        columns[:, TH] = spans[5]
-        columns *= level[:, None]
-        # heading changes
-        tb, te = windows.turn_begin - late_h, windows.turn_end - late_h
+        begin, end = windows.begin, windows.end
+
+        def between(velocity: Complexes) -> Complexes:
+            at = np.interp(t, drive.wheel_t, self._cumulate(velocity))
+            return np.asarray(at[end] - at[begin], np.complex128)
+
+        path = self._cumulate(body * nose)
+        at = np.interp(t, drive.wheel_t, path)
+        predicted = at[end] - at[begin]
+        speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
+        slopes = np.zeros((len(begin), len(x)), np.complex128)
+        slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
+        slopes[:, C], slopes[:, L] = 1j * slopes[:, M], between(sideways * nose)
+        slopes[:, D] = 1j * predicted
+        slopes[:, TP] = -(speed[end] - speed[begin])
+        slopes[:, TH] = slopes[:, TP] + between(1j * rate * body * nose)
+        psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + offset
+        level = np.exp(-0.5j * (psi[begin] + psi[end]))
+        return (predicted - self.seen) * level, slopes * level[:, None]
+
+    def _turns(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return predicted minus seen heading changes (u,), and their slopes (u, k)."""
+        windows, t = self.windows, self.drive.wheel_t
+        begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:
-            return np.interp(te + shift, drive.wheel_t, values) - np.interp(tb + shift, drive.wheel_t, values)
+            return np.interp(end + shift, t, values) - np.interp(begin + shift, t, values)
 
-        w, v = over(self.turn_w), over(self.turn_v) / self.b
-        turn_columns = np.zeros((len(tb), len(x)))
-        turn_columns[:, K], turn_columns[:, Q], turn_columns[:, G] = w, v, TURN_WINDOW_S
-        turn_columns[:, TH] = k * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        turn_left = k * w + q * v + g * TURN_WINDOW_S - self.turned
-        residuals = np.concatenate([left.real, left.imag, turn_left])
-        jacobian = np.concatenate([columns.real, columns.imag, turn_columns])
-        return residuals, jacobian
+        slopes = np.zeros((len(begin), len(x)))
+        slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        slopes[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        predicted = x[K] * slopes[:, K] + x[Q] * slopes[:, Q] + x[G] * TURN_WINDOW_S
+        return predicted - self.turned, slopes
