@@ -21,7 +21,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
-from icrtool.records.tables import Floats
+from icrtool.records.tables import Floats, Ints
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 """How far robots lie from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry = 0."""
@@ -166,7 +166,7 @@ def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
     }
 
 
-def _linear(design: Floats, target: Floats, group: Floats, prior_std: float) -> RobustFit:
+def _linear(design: Floats, target: Floats, group: Ints, prior_std: float) -> RobustFit:
     zero = np.zeros(design.shape[1])
     return robust_least_squares(
         lambda x: (design @ x - target, design), zero, zero, np.full(len(zero), prior_std),

@@ -77,7 +77,9 @@ def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveA
     wheels, gnss = log.wheels, log.gnss
     heading = log.heading if heading is None else heading
     epoch = int(wheels.stamp_ns[0])
-    wheel_t, fix_t, heading_t = ((stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns))
+    wheel_t, fix_t, heading_t = (
+        (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
+    )
     dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
     step = dt * (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps)) / 2
     topics = {stream.role: stream.topic for stream in log.streams}

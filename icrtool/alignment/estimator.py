@@ -24,7 +24,18 @@ from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWin
 from icrtool.kernels.robust import RobustFit, robust_least_squares
 from icrtool.records.tables import Complexes, Floats
 
-NAMES = ("scale", "middle", "x", "slip", "turn", "asymmetry", "drift", "offset", "position_after_heading", "heading_delay")
+NAMES = (
+    "scale",
+    "middle",
+    "x",
+    "slip",
+    "turn",
+    "asymmetry",
+    "drift",
+    "offset",
+    "position_after_heading",
+    "heading_delay",
+)
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -224,7 +224,9 @@ def _estimate(
     h[kind == COURSE, BIAS] = courses.end - middle
     h[kind == COURSE, SCALE] = np.interp(middle, turn.t, G) - np.interp(courses.end, turn.t, G)
     z = np.concatenate([courses.angle, still_rate, attitude[1]])
-    r = np.concatenate([courses.std**2 + SLIP_STD_RAD**2, np.full(len(still_t), STANDING_RATE_STD**2), attitude[2] ** 2])
+    r = np.concatenate(
+        [courses.std**2 + SLIP_STD_RAD**2, np.full(len(still_t), STANDING_RATE_STD**2), attitude[2] ** 2]
+    )
     t, kind, h, z, r = t[order], kind[order], h[order], z[order], r[order]
     at = np.interp(t, turn.t, G)
     events = HeadingEvents(np.diff(t, prepend=t[:1]), np.diff(at, prepend=at[:1]), z, h, r, kind != STANDING)
@@ -252,7 +254,7 @@ def _estimate(
     x1[known] = constants[known]
     P1[known, known] = variances[known]
     causal = filter_headings(events, x1, P1, q(walks))
-    return _at_rate_samples(turn, G, t, causal.x, causal.P, states, covariances, constants, variances, walks)
+    return _at_rate_samples(turn, G, _Passes(t, causal.x, causal.P, states, covariances, walks))
 
 
 def _choose(
@@ -277,8 +279,21 @@ def _choose(
     return events, walks
 
 
-def _at_rate_samples(turn, G, t, x, P, states, covariances, constants, variances, walks):  # type: ignore[no-untyped-def]
+class _Passes(NamedTuple):
+    """Events (n,) [s] with the causal filter's states (n, 6) and covariances, the smoother's, and their walks."""
+
+    t: Floats
+    x: Floats
+    P: Floats
+    states: Floats
+    covariances: Floats
+    walks: tuple[float, float]
+
+
+def _at_rate_samples(turn: TurnRate, G: Floats, passes: _Passes) -> HeadingEstimate:
     """Return the estimates at the rate's samples: carried on by the rate from the last event, or between events."""
+    t, x, P, states, covariances, walks = passes
+    constants, variances = states[-1], np.diagonal(covariances[-1])
     rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))
     s = turn.t[rows]
     last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)

@@ -121,8 +121,8 @@ def check_heading(log: RobotLog, config: Config, course: Course | None = None) -
     course = course if course is not None else measure_course(log)
     free = given == "auto" and not paper
     if free:
-        _refuse_stuck(log)
-        _refuse_unexplained(log, course)
+        refuse_stuck(log)
+        refuse_unexplained(log, course)
     if len(course.angle) < FEWEST_WINDOWS:
         return HeadingCheck(len(course.angle), *(math.nan,) * 5, False, fixed, 0.0, 0.0, NO_NAME, ())
     agreement, mirrored = course.agreement, course.mirrored_agreement
@@ -177,7 +177,7 @@ def _disagreement(agreement: float, mirrored: float) -> list[str]:
     return [] if agreement >= EXPLAINED else [text]
 
 
-def _refuse_unexplained(log: RobotLog, course: Course) -> None:
+def refuse_unexplained(log: RobotLog, course: Course) -> None:
     """Raise where the heading points nowhere, or no convention and no offset makes it follow the course."""
     windows = len(course.angle)
     if course.scattered >= FEWEST_WINDOWS and course.scattered > windows:
@@ -193,7 +193,7 @@ def _refuse_unexplained(log: RobotLog, course: Course) -> None:
         raise _no_heading(log, "has nothing to do with the course", tried)
 
 
-def _refuse_stuck(log: RobotLog) -> None:
+def refuse_stuck(log: RobotLog) -> None:
     """Raise where the heading stays the very same over much of the way while the wheels turn the robot."""
     stamps, heading, wheels = log.heading.stamp_ns, log.heading.heading_rad, log.wheels
     if len(stamps) < 2 or len(wheels.stamp_ns) < 2:

@@ -29,6 +29,9 @@ PAIR_S = 0.25
 WHEEL_TURN = 0.6
 """Skid-steer robots turn about this much of what their wheels would without slip."""
 
+RESPONSE_S = 0.15
+"""How late robots answer their wheels; measured on rigid-body simulated ones: 0.1 s."""
+
 BETTER = 0.01
 """A sensor axis other than z up is taken where successive courses agree by this much more (mean cosine)."""
 
@@ -78,9 +81,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         source = "gyro"
     pairs = [pair for pair in (_baseline(log, other.fixes) for other in log.other_receivers) if pair is not None]
     pair = max(pairs, key=lambda one: one[0]) if pairs else None
-    found = estimate_heading(
-        drive, turn, None if pair is None else pair[1], absolute_walk=0.0, stands=source == "gyro"
-    )
+    found = estimate_heading(drive, turn, None if pair is None else pair[1], absolute_walk=0.0, stands=source == "gyro")
     if found is None:
         raise DataError(
             log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
@@ -95,8 +96,20 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         "wheels": "course over ground and wheels: no inertial unit in the log",
     }
     why = f"{words[source]}, σ {std:.2f}°"
+    if source == "wheels":
+        found = _with_response(found, turn)
     causal, smoothed = _samples(found, epoch)
     return DerivedHeading(source, f"{topic} + {places}", found, causal, smoothed, why)  # type: ignore[arg-type]
+
+
+def _with_response(found: HeadingEstimate, turn: TurnRate) -> HeadingEstimate:
+    """Add what a robot's late response to its wheels turns a heading by."""
+    extra = RESPONSE_S * np.abs(np.interp(found.t, turn.t, turn.rate))
+    return replace(
+        found,
+        causal_std=np.hypot(found.causal_std, extra),
+        smoothed_std=np.hypot(found.smoothed_std, extra),
+    )
 
 
 def _samples(found: HeadingEstimate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
@@ -127,7 +140,7 @@ def _vertical_rate(drive: DriveArrays, gyro: GyroAxes, epoch: int) -> tuple[floa
     Each axis of the sensor is tried in both senses: z up, z down, mounted on its side.
     """
     t = (gyro.stamp_ns - epoch) / 1e9
-    found = []
+    found: list[tuple[float, TurnRate, str]] = []
     for axis in (2, 0, 1):
         for sign in (-1.0, 1.0):
             turn = TurnRate(t, sign * gyro.rates_radps[:, axis])
@@ -137,7 +150,9 @@ def _vertical_rate(drive: DriveArrays, gyro: GyroAxes, epoch: int) -> tuple[floa
             near = np.diff(courses.begin) < 30.0
             change = np.diff(courses.angle - np.interp(courses.end, t, turn.integrated()))
             score = float(np.cos(change[near]).mean()) if near.any() else -1.0
-            found.append((score - (0.0 if not found else BETTER), turn, f"{'xyz'[axis]} {'up' if sign < 0 else 'down'}"))
+            found.append(
+                (score - (0.0 if not found else BETTER), turn, f"{'xyz'[axis]} {'up' if sign < 0 else 'down'}")
+            )
     if not found:
         return None
     score, turn, axis_text = max(found, key=lambda one: one[0])

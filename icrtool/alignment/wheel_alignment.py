@@ -80,7 +80,7 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
     ``wheels.right_scale`` left on ``auto``) are corrected and said; the rest is said.
     """
     corrects = config.filter.preset == "field"
-    notes = [f"{log.name}: {note}" for note in _dead_or_copied(log)]
+    notes = [f"{log.name}: {note}" for note in dead_or_copied(log)]
     sound = not notes
     course = measure_course(log)
     found = _reversed_or_swapped(log, course)
@@ -109,10 +109,8 @@ def check_wheels(log: RobotLog, config: Config) -> WheelCheck:
             notes.append(f"{log.name}: {text}{_likely(scale)}: taken out; wheels.left_scale and right_scale set it")
         else:
             notes.append(f"{log.name}: {text}: check wheel radius, encoder resolution and units{_likely(scale)}")
-    held = _held_share(log.wheels)
-    if held > HELD_SHARE:
-        rate = (1.0 - held) * 1e9 / float(np.median(np.diff(log.wheels.stamp_ns)))
-        notes.append(f"{log.name}: wheel values are held: they change {rate:.1f} times a second while moving")
+    held = held_share(log.wheels)
+    notes += [f"{log.name}: {note}" for note in held_note(log.wheels, held)]
     return WheelCheck(log, scale, sigma, applied, held, tuple(notes), course if applied == 1.0 else None)
 
 
@@ -144,7 +142,7 @@ def _likely(scale: float) -> str:
     return ""
 
 
-def _dead_or_copied(log: RobotLog) -> list[str]:
+def dead_or_copied(log: RobotLog) -> list[str]:
     """Say when a side never moves while the other does, or is a copy of the other while the robot turns."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
     way_left, way_right = float(np.abs(left).sum()), float(np.abs(right).sum())
@@ -238,7 +236,7 @@ def _turns(log: RobotLog) -> tuple[Floats, Floats]:
     return turned[moved], told[moved]
 
 
-def _held_share(wheels: WheelSamples) -> float:
+def held_share(wheels: WheelSamples) -> float:
     """Return the share of samples, while moving, that repeat the one before on both sides."""
     left, right = wheels.v_left_mps, wheels.v_right_mps
     moving = (np.abs(left) + np.abs(right))[1:] > 0
@@ -246,3 +244,11 @@ def _held_share(wheels: WheelSamples) -> float:
         return 0.0
     same = (np.diff(left) == 0) & (np.diff(right) == 0)
     return float(np.count_nonzero(same & moving) / np.count_nonzero(moving))
+
+
+def held_note(wheels: WheelSamples, share: float) -> list[str]:
+    """Say how often held wheel values change."""
+    if share <= HELD_SHARE:
+        return []
+    rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
+    return [f"wheel values are held: they change {rate:.1f} times a second while moving"]

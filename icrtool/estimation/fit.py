@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from icrtool.alignment.gnss_quality import FixQuality, judge_fixes
-from icrtool.alignment.heading_alignment import HeadingCheck, check_heading
-from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.stream_delays import measure_delays
-from icrtool.alignment.wheel_alignment import check_wheels
+from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.heading_alignment import HeadingCheck
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import WarmStart, check_start, wheel_gap_s
 from icrtool.estimation.noise_adaptation import AdaptedRun, run_adaptively
@@ -129,12 +127,9 @@ def fit(
     """
     config = config if config is not None else Config()
     check_start(config)
-    check_streams(log)
-    wheels = check_wheels(log, config)
-    log = wheels.log
-    check = check_heading(log, config, wheels.course)
-    delays = measure_delays(log, config, check)
-    fixes = judge_fixes(delays.log, config, check)
+    aligned = align_streams(log, config)
+    log, wheels, check, delays = aligned.log, aligned.wheels, aligned.heading, aligned.delays
+    fixes = judge_fixes(log, config, check)
     done = _run(fixes, config, check, warm_start, given_changes(changes_s))
     if find_changes:
         terrain = _find_changes(done)

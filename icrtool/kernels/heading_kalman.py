@@ -55,7 +55,9 @@ class HeadingPasses(NamedTuple):
 def filter_headings(events: HeadingEvents, x0: Floats, P0: Floats, q: Floats) -> HeadingPasses:
     """Run the filter; `q` (k,) is the process variance per second of each state."""
     n, k = events.h.shape
-    out = HeadingPasses(np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n))
+    out = HeadingPasses(
+        np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n)
+    )
     _forward(events, np.array(x0, np.float64), np.array(P0, np.float64), q, out)
     return out
 
@@ -101,7 +103,8 @@ def smooth_headings(events: HeadingEvents, passes: HeadingPasses) -> tuple[Float
     k = events.h.shape[1]
     F = np.tile(np.eye(k), (len(events.z) - 1, 1, 1))
     F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.dG[1:]
-    gains = np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]).transpose(0, 2, 1).copy()
+    solved: Floats = np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1])
+    gains = np.ascontiguousarray(solved.transpose(0, 2, 1))
     x, P = passes.x.copy(), passes.P.copy()
     _backward(gains, passes.x_predicted, passes.P_predicted, x, P)
     return x, P
