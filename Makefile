@@ -13,7 +13,7 @@ READY := $(VENV)/.ready
 PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo format format-check lint types test stress bench samples wheel-check check constraints clean
+.PHONY: help setup demo format format-check lint words types test stress bench samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,8 +42,12 @@ format: $(READY)  ## format the code and sort the imports
 format-check: $(READY)
 	$(BIN)/ruff format --check .
 
-lint: $(READY)  ## ruff
+lint: $(READY)  ## ruff, and the spelling
 	$(BIN)/ruff check .
+	$(BIN)/codespell
+
+words: $(READY)  ## count the words that docs/glossary.md asks to avoid, by package
+	@$(BIN)/python tests/test_language.py
 
 types: $(READY)  ## mypy, strict
 	$(BIN)/mypy

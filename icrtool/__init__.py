@@ -1,6 +1,6 @@
-"""Learn the track ICRs of a skid-steer robot from its field logs, and say how far it can go blind.
+"""Learn the track ICRs of a skid-steer robot from its field logs, and how far it can go without GNSS.
 
-The charter: every name, frame, sign and unit in this package means what stands here.
+Every name, frame, sign and unit in this package means what stands here.
 
 Frames and signs
     World: local plane, north and east [m] about a datum, z down. Body: x forward, y right, z down.
@@ -15,7 +15,7 @@ Time
     A speed stamped k holds over [k, k+1).
 Tables
     ``RobotLog``: what was measured (wheels, position, heading), in this frame, by stamp.
-    ``FilterRun``: what the filter made of it, one recorded state per wheel sample.
+    ``Run``: what the filter made of it, one recorded state per wheel sample; equal when read back from its directory.
     ``DropoutReport``: open-loop errors over distance, from every recorded state.
 Source of the method
     Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of
@@ -28,12 +28,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from icrtool import figures
     from icrtool.config import Config, load_config
+    from icrtool.dropout_analysis.dropout_report import dropout_report
+    from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
-    from icrtool.estimation.fit import FilterRun, fit
+    from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
-    from icrtool.records.dropout import DropoutReport
+    from icrtool.output.stored_run import open_run
+    from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
 
 __version__ = "0.1.0"
@@ -41,31 +45,40 @@ __version__ = "0.1.0"
 __all__ = [
     "Config",
     "DropoutReport",
-    "FilterRun",
     "IcrToolError",
     "RobotLog",
+    "Run",
+    "WarmStart",
     "__version__",
     "dropout",
+    "dropout_report",
+    "figures",
     "fit",
     "load_config",
+    "open_run",
     "read_log",
 ]
 
 _HOMES = {
     "Config": "icrtool.config",
-    "DropoutReport": "icrtool.records.dropout",
-    "FilterRun": "icrtool.estimation.fit",
+    "DropoutReport": "icrtool.dropout_analysis.report",
     "IcrToolError": "icrtool.errors",
     "RobotLog": "icrtool.records.tables",
+    "Run": "icrtool.records.run",
+    "WarmStart": "icrtool.records.run",
     "dropout": "icrtool.dropout_analysis.trials",
+    "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.estimation.fit",
     "load_config": "icrtool.config",
+    "open_run": "icrtool.output.stored_run",
     "read_log": "icrtool.logs",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``icrtool --help`` loads no numba."""
+    if name == "figures":
+        return importlib.import_module("icrtool.figures")
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'icrtool' has no attribute {name!r}")

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import inspect
+import itertools
 import re
+import shlex
 import tomllib
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
-from icrtool.cli.commands import icrtool
+import icrtool
+from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import SECTIONS, builtin_robots, load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
 EXAMPLE = CONFIGURATION.split("```toml\n")[1].split("```")[0]
 
 
@@ -32,9 +43,9 @@ def test_the_configuration_page_names_every_key() -> None:
             assert key.name in example[section] or key.name in CONFIGURATION, f"{section}.{key.name}"
 
 
-@pytest.mark.parametrize("command", sorted(icrtool.list_commands(None)))  # type: ignore[arg-type]
+@pytest.mark.parametrize("command", sorted(command_line.list_commands(None)))  # type: ignore[arg-type]
 def test_every_command_has_help_and_stands_in_the_documentation(command: str) -> None:
-    result = CliRunner().invoke(icrtool, [command, "--help"])
+    result = CliRunner().invoke(command_line, [command, "--help"])
     assert result.exit_code == 0
     assert "Usage" in result.output
     assert "\\b" not in result.output
@@ -47,6 +58,128 @@ def test_the_readme_names_every_built_in_robot() -> None:
         assert f"`{robot}`" in README
 
 
-def test_the_files_the_readme_links_to_are_there() -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (ROOT / target).exists(), target
+@pytest.mark.parametrize("page", PAGES)
+def test_the_files_a_page_links_to_are_there(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (ROOT / page).parent.joinpath(target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_files_a_page_names_are_there(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:icrtool|tests|docs|scripts|benchmarks|sample_logs)/[\w./-]*)`", text):
+        assert (ROOT / name).exists(), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_public_names_of_a_page_exist(page: str) -> None:
+    for name in re.findall(r"\bicrtool\.([a-z]\w+)\b(?!\.)", (ROOT / page).read_text(encoding="utf-8")):
+        assert hasattr(icrtool, name), name
+
+
+def functions_in(path: Path) -> Iterator[str]:
+    """List the functions of a module and the methods of its classes."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef):
+            yield node.name
+
+
+@pytest.mark.parametrize(("folder", "column"), [("icrtool", -2), ("tests", -1)])
+def test_every_function_and_test_of_the_equation_index_exists(folder: str, column: int) -> None:
+    rows = [line.strip("| ").split(" | ") for line in EQUATIONS.splitlines() if "::" in line]
+    assert len(rows) > 30
+    missing = []
+    for row in rows:
+        named = re.findall(r"`([\w/]+\.py)::(\w+)`", row[column])
+        assert named, row
+        for module, function in named:
+            path = ROOT / folder / module
+            if not path.is_file() or function not in functions_in(path):
+                missing.append(f"{row[0]}: {folder}/{module}::{function}")
+    assert not missing, "\n".join(missing)
+
+
+def test_every_equation_of_the_paper_stands_in_the_index() -> None:
+    listed: set[int] = set()
+    for row in re.findall(r"^\| Eqs?\. ([\d, -]+)", EQUATIONS, re.MULTILINE):
+        for part in row.strip(" ,").split(","):
+            first, _, last = part.strip().partition("-")
+            listed |= set(range(int(first), int(last or first) + 1))
+    assert listed == set(range(1, 40))
+
+
+def test_every_package_stands_in_the_architecture_page() -> None:
+    for package in (path.parent for path in (ROOT / "icrtool").glob("*/__init__.py")):
+        assert f"| `icrtool/{package.name}/` |" in ARCHITECTURE
+
+
+@pytest.mark.parametrize("name", sorted(name for name in icrtool.__all__ if name.islower() and name.isidentifier()))
+def test_a_public_function_documents_every_parameter(name: str) -> None:
+    function = getattr(icrtool, name)
+    if not inspect.isfunction(function):
+        pytest.skip(f"{name} is no function")
+    text = inspect.getdoc(function) or ""
+    section = text.partition("Parameters\n----------\n")[2].partition("\n\n")[0]
+    documented = {word for names in re.findall(r"^(\w[\w, ]*?) :", section, re.MULTILINE) for word in names.split(", ")}
+    assert documented == set(inspect.signature(function).parameters)
+
+
+COMMANDS = [
+    (page, line)
+    for page in PAGES
+    for block in re.findall(r"```sh\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("icrtool ")
+]
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS)
+def test_a_command_that_a_page_shows_has_these_arguments(
+    page: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    for log in ("field.mcap", "field.bag"):
+        (tmp_path / log).touch()
+    for run in ("RUN", "icrtool-runs/field"):
+        (tmp_path / run).mkdir(parents=True)
+    name, *arguments = shlex.split(line, comments=True)[1:]
+    command = command_line.get_command(None, name)  # type: ignore[arg-type]
+    assert command is not None
+    command.make_context(name, arguments)
+
+
+@pytest.fixture(scope="module")
+def readme_session() -> dict[str, Any]:
+    """Return what the README's Python block leaves behind."""
+    names: dict[str, Any] = {}
+    with contextlib.chdir(ROOT):
+        exec(README.split("```python\n")[1].split("```")[0], names)
+    return names
+
+
+def readme_table(first_cell: str) -> list[list[str]]:
+    """Return the rows below the header of the README's table whose header begins with `first_cell`."""
+    lines = README.partition(f"\n| {first_cell} |")[2].splitlines()[2:]
+    rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
+
+
+def test_the_readmes_errors_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+    summary = readme_session["report"].summary.set_index(["model", "horizon_m"])
+    rows = readme_table("model")
+    for model, row in zip(("no_slip", "icr", "icr_final"), rows, strict=True):
+        found = [f"{summary.loc[(model, horizon), 'p95_m']:.3f}" for horizon in (1, 5, 10, 20)]
+        assert found == row[1:]
+    assert f"{summary['trials'].min():,} trials or more" in README
+
+
+def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+    run = readme_session["run"]
+    last = run.states.iloc[-1]
+    rows = dict(row[:2] for row in readme_table("ICR"))
+    for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x", "x_icr_m")):
+        assert rows[label] == f"{last[column]:+.3f} ± {last['std_' + column]:.3f} m"
+    width = last["y_icr_right_m"] - last["y_icr_left_m"]
+    assert rows["multiplier"] == f"{width / readme_session['config'].robot.track_width_m:.2f}"

@@ -70,6 +70,14 @@ def test_newest_change_log_heading_is_the_version_of_the_package() -> None:
     assert headings[0] == icrtool.__version__
 
 
+def test_the_citation_has_the_version_of_the_package() -> None:
+    from ruamel.yaml import YAML
+
+    citation = YAML(typ="safe").load(ROOT / "CITATION.cff")
+    assert citation["version"] == icrtool.__version__
+    assert citation["preferred-citation"]["doi"] == "10.1002/rob.21509"
+
+
 def test_every_dependency_is_pinned_within_its_bounds() -> None:
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name

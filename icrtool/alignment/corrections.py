@@ -7,8 +7,8 @@ reported. Preset ``paper`` corrects nothing.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from icrtool.alignment.stream_delays import UNKNOWN, Delay, StreamDelays
 from icrtool.alignment.wheel_alignment import WheelCheck, dead_or_copied, held_note, held_share
 from icrtool.config import Config
 from icrtool.errors import DataError
+from icrtool.records.measurements import Finding, IcrStart
 from icrtool.records.run import half_width_m
 from icrtool.records.tables import HeadingSamples, RobotLog, WheelSamples
 
@@ -47,26 +48,17 @@ correction, one that lags does."""
 STANDS_SHARE, STILL = 0.8, 0.2
 """The robot does not move where in this share of the windows displacement and turn are below this part of the wheels'."""
 
+LEAST_START_STD, INFLATION = 0.15, 3.0
+"""The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
+
+LARGEST_WIDTH_STD, WIDTHS = 0.2, (0.7, 6.0)
+"""The ICRs are shown where W is known to this share, and lies between so many b."""
+
+USUAL_WIDTH = 1.5
+"""Most skid-steer robots turn as if they were this much wider than they are."""
+
 FUSED_CORRELATION = 0.9995
 """A turn rate of the wheels that follows the gyro this closely was made of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """One number of the alignment, for a reader.
-
-    Attributes
-    ----------
-    value, std : in the unit that the name ends in; NaN where the drive does not show it
-    applied : what was corrected by
-    why : why it was corrected or not
-    """
-
-    name: str
-    value: float
-    std: float
-    applied: float
-    why: str
 
 
 class AlignedStreams(NamedTuple):
@@ -77,7 +69,6 @@ class AlignedStreams(NamedTuple):
     log : corrected; the heading's offset and handedness stand in `heading`, which the filter applies
     fit : the estimate; None where the drive is too short
     derived : the heading where it was estimated, else None
-    estimates : what was found
     """
 
     log: RobotLog
@@ -86,13 +77,36 @@ class AlignedStreams(NamedTuple):
     delays: StreamDelays
     fit: AlignmentFit | None
     derived: DerivedHeading | None
-    estimates: tuple[Estimate, ...]
     warnings: tuple[str, ...]
 
     @property
     def geometry(self) -> Geometry | None:
         """ICRs with covariance, from the same estimate; None without one."""
         return None if self.fit is None else self.fit.geometry()
+
+    @property
+    def source(self) -> str:
+        """What the heading was made of."""
+        return "orientation" if self.derived is None else self.derived.source
+
+    def robot_findings(self) -> dict[str, Finding]:
+        """Return side scales and ICRs, as the alignment estimates them."""
+        found = self.geometry
+        if found is None:
+            return {}
+        std = np.sqrt(np.diag(found.covariance))
+        scale = self.wheels.applied_scale
+        rows = {
+            "left_scale": (3, scale, "both sides are scaled alike"),
+            "right_scale": (4, scale, "both sides are scaled alike"),
+            "y_icr_right_m": (0, 0.0, "start of the filter"),
+            "y_icr_left_m": (1, 0.0, "start of the filter"),
+            "x_icr_m": (2, 0.0, "start of the filter"),
+        }
+        return {
+            name: Finding(float(found.values[row]), float(std[row]), applied, why)
+            for name, (row, applied, why) in rows.items()
+        }
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
@@ -138,9 +152,8 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored)
     delays = _delays(log, config, fit, derived)
     log = delays.log
-    estimates = _estimates(fit, wheels, heading, delays)
     return AlignedStreams(
-        log, replace(wheels, log=log), heading, delays, fit, derived, estimates,
+        log, replace(wheels, log=log), heading, delays, fit, derived,
         (*wheels.warnings, *heading.warnings, *delays.warnings),
     )  # fmt: skip
 
@@ -387,45 +400,22 @@ def _is_clear(delay: Delay) -> bool:
     return delay.value_s > SMALLEST_DELAY_S or delay.value_s < -SMALLEST_LEAD_S
 
 
-def _estimates(
-    fit: AlignmentFit | None, wheels: WheelCheck, heading: HeadingCheck, delays: StreamDelays
-) -> tuple[Estimate, ...]:
-    """Return all numbers with their standard deviations and what was done."""
-    if fit is None:
-        return ()
-    geometry = fit.geometry()
-    std = np.sqrt(np.diag(geometry.covariance))
-    done = {True: "corrected", False: "too small, or not certain enough, to correct"}
+def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:
+    """Return the ICRs to start the filter from; None in preset ``paper``.
 
-    def one(name: str, value: float, sigma: float, applied: float, neutral: float = 0.0) -> Estimate:
-        return Estimate(name, value, sigma, applied, done[applied != neutral])
-
-    found = [
-        one("wheel_scale", wheels.scale, wheels.scale_std, wheels.applied_scale, 1.0),
-        one("left_scale", float(geometry.values[3]), float(std[3]), wheels.applied_scale, 1.0),
-        one("right_scale", float(geometry.values[4]), float(std[4]), wheels.applied_scale, 1.0),
-        one("heading_offset_deg", math.degrees(heading.offset_rad), math.degrees(heading.offset_std_rad),
-            math.degrees(heading.applied_offset_rad)),
-        one("heading_delay_s", *delays.heading, delays.applied_heading_s),
-        one("gnss_delay_s", *delays.gnss, delays.applied_gnss_s),
-    ]  # fmt: skip
-    names = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
-    return (
-        *found,
-        *(
-            Estimate(name, float(geometry.values[i]), float(std[i]), 0.0, "start of the filter")
-            for i, name in enumerate(names)
-        ),
-    )
-
-
-def summary(aligned: AlignedStreams) -> dict[str, Any]:
-    """Return the estimates as plain data for run.json."""
-    return {
-        one.name: {"value": _known(one.value), "std": _known(one.std), "applied": one.applied, "why": one.why}
-        for one in aligned.estimates
-    }
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    They are those of the alignment with an inflated standard deviation, where the drive shows them; else those of
+    most skid-steer robots, as uncertain as those differ.
+    """
+    if config.filter.preset == "paper":
+        return None
+    b = 2.0 * half_width_m(config.robot.track_width_m)
+    least = LEAST_START_STD * b
+    if found is not None:
+        right, left, x = found.values[:3].tolist()
+        std, width = np.sqrt(np.diag(found.covariance)), float(found.values[5])
+        shown = std[5] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
+        icrs = (right + antenna_m[1], left + antenna_m[1], x + antenna_m[0])
+        if shown and icrs[0] > least > -least > icrs[1] and float(std[:3].max()) < b:
+            inflated = [max(INFLATION * float(one), least) for one in std[:3]]
+            return IcrStart(icrs, (inflated[0], inflated[1], inflated[2]))
+    return IcrStart((USUAL_WIDTH * b / 2, -USUAL_WIDTH * b / 2, 0.0), (b / 2, b / 2, b / 2))

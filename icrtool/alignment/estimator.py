@@ -39,8 +39,9 @@ NAMES = (
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.5, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.1, 0.5])
-"""Wide: they keep apart what a drive does not, and say nothing where it does. Delays of position and heading of one
+PRIOR_STD = np.array([0.5, 0.15, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.1, 0.5])
+"""They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
+far to either side (middle: 0.15 W). Delays of position and heading of one
 robot usually agree to 0.1 s."""
 
 SAME_CLOCK_STD_S = 1e-3
@@ -215,7 +216,7 @@ class _Model:
         begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:
-            return np.interp(end + shift, t, values) - np.interp(begin + shift, t, values)
+            return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
 
         slopes = np.zeros((len(begin), len(x)))
         slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S

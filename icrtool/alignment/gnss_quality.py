@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from icrtool.alignment.gnss_steps import FixSteps, measure_steps
 from icrtool.alignment.heading_alignment import HeadingCheck
 from icrtool.alignment.misreported_fixes import find_sold
-from icrtool.alignment.reference_delay import delayed
 from icrtool.config import Config
 from icrtool.records.tables import (
     FIXED_FIX,
@@ -56,7 +54,6 @@ NOISIER = 1.5
 """White noise from step to step that is this many times what the messages state is believed instead."""
 
 SHORTEST_LOSS_S = 2.0
-MOST_LISTED = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,43 +80,6 @@ class FixQuality:
     jump_m: Floats
     losses_ns: Ints
     warnings: tuple[str, ...]
-
-    def summary(self, used: Bools, rejected: Bools) -> dict[str, Any]:
-        """Return classes and jumps for run.json; `used` and `rejected` (m,) are what became of the fixes."""
-        gnss, classes = self.log.gnss, {}
-        std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-        for code, name in CLASSES.items():
-            rows = self.fix_class == code
-            if not rows.any():
-                continue
-            step, given = self.step_std_m[name], std[rows & np.isfinite(std)]
-            classes[name] = {
-                "fixes": int(np.count_nonzero(rows)),
-                "used": int(np.count_nonzero(rows & used)),
-                "rejected": int(np.count_nonzero(rows & rejected)),
-                "down_weighted": int(np.count_nonzero(rows & self.down_weighted)),
-                "sold_as_fixed": int(np.count_nonzero(rows & self.sold)),
-                "std_m": float(np.median(given)) if len(given) else None,
-                "step_std_m": step if math.isfinite(step) else None,
-            }
-        return {
-            "classes": classes,
-            "jumps": len(self.jump_m),
-            "jump_list": [
-                {"stamp_ns": int(stamp), "size_m": float(size)}
-                for stamp, size in list(zip(self.jump_stamp_ns, self.jump_m, strict=True))[:MOST_LISTED]
-            ],
-        }
-
-    def earlier(self, delay_s: float) -> FixQuality:
-        """Return the same of fixes that are taken `delay_s` earlier."""
-        shift = round(delay_s * 1e9)
-        return replace(
-            self,
-            log=delayed(self.log, delay_s),
-            jump_stamp_ns=self.jump_stamp_ns - shift,
-            losses_ns=self.losses_ns - shift,
-        )
 
 
 def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQuality:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
+from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
 
 LONGEST_DELAY_S = 0.4
 DELAY_STEP_S = 0.05
@@ -34,22 +34,22 @@ def delayed(log: RobotLog, delay_s: float) -> RobotLog:
     return replace(log, gnss=gnss, heading=heading)
 
 
-def find_delay(log: RobotLog, contradiction: Callable[[RobotLog], float]) -> float:
-    """Return the delay of the position reference against the wheels [s], positive when it is late; 0 without a find.
+def find_delay(contradiction: Callable[[float], float]) -> float:
+    """Return the delay of the position reference against the wheels [s], positive when it lags; 0 without a find.
 
     Parameters
     ----------
-    contradiction : how badly a run over a log contradicts itself (mean NIS, each counted up to its gate)
+    contradiction : by delay [s] taken from the reference, how badly a run then contradicts itself (mean NIS, each
+        counted up to its gate)
 
     Notes
     -----
     On recorded robots the clocks of the streams matter as much as the model. A grid search, then the vertex of the
     parabola through the best three.
     """
-    part = busiest_part(log)
     steps = round(LONGEST_DELAY_S / DELAY_STEP_S)
     delays = DELAY_STEP_S * np.arange(-steps, steps + 1)
-    found = np.array([contradiction(delayed(part, float(delay))) for delay in delays])
+    found = np.array([contradiction(float(delay)) for delay in delays])
     best = int(np.argmin(found))
     if best in (0, len(delays) - 1) or found[best] > WORTHWHILE_SHARE * found[steps]:
         return 0.0
@@ -59,14 +59,21 @@ def find_delay(log: RobotLog, contradiction: Callable[[RobotLog], float]) -> flo
     return round(float(delays[best] + DELAY_STEP_S * vertex), 3)
 
 
+def busiest_rows(wheels: WheelSamples) -> slice | None:
+    """Return the `MOST_SAMPLES` rows in which the wheels travel most, None where there are no more than those."""
+    if len(wheels.stamp_ns) <= MOST_SAMPLES:
+        return None
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))])
+    first = int(np.argmax(travel[MOST_SAMPLES:] - travel[:-MOST_SAMPLES]))
+    return slice(first, first + MOST_SAMPLES)
+
+
 def busiest_part(log: RobotLog) -> RobotLog:
     """Return the stretch of the log, at most `MOST_SAMPLES` long, in which the wheels travel most."""
     wheels = log.wheels
-    if len(wheels.stamp_ns) <= MOST_SAMPLES:
+    rows = busiest_rows(wheels)
+    if rows is None:
         return log
-    travel = np.concatenate([[0.0], np.cumsum(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))])
-    first = int(np.argmax(travel[MOST_SAMPLES:] - travel[:-MOST_SAMPLES]))
-    rows = slice(first, first + MOST_SAMPLES)
     begin, end = wheels.stamp_ns[rows][[0, -1]]
     fixes = slice(*np.searchsorted(log.gnss.stamp_ns, [begin, end]))
     samples = slice(*np.searchsorted(log.heading.stamp_ns, [begin, end]))

@@ -11,11 +11,11 @@ import numpy as np
 from icrtool.calibration.held_out_fits import clear_of
 from icrtool.calibration.model_comparison import count_blocks
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.observability import judge_excitation
+from icrtool.estimation.observability import find_excitation
 from icrtool.kernels.window_errors import displace, move
 from icrtool.motion.window_fit import WindowFit, Windows, cut_windows, fit_windows
 from icrtool.motion.window_models import EXTENDED, WindowModel
-from icrtool.records.run import DrivenRun
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
 
 CONTROLLER = WindowModel("controller", "what a controller can be told", ("separation", "scale", "scale_difference"))
@@ -68,7 +68,7 @@ class ExportNumbers:
     doubts: tuple[str, ...]
 
 
-def export_numbers(run: DrivenRun) -> ExportNumbers:
+def export_numbers(run: Run) -> ExportNumbers:
     """Return what a controller can be told of a run.
 
     Raises
@@ -119,7 +119,7 @@ def export_numbers(run: DrivenRun) -> ExportNumbers:
     )
 
 
-def _held_out_fits(run: DrivenRun, windows: Windows) -> list[tuple[float, float, WindowFit]]:
+def _held_out_fits(run: Run, windows: Windows) -> list[tuple[float, float, WindowFit]]:
     """Return, for each block of way, its borders [m] and the controller's fit without it."""
     total = float(run.table.distance_m[-1])
     edges = np.linspace(0.0, total, count_blocks(total) + 1)
@@ -133,7 +133,7 @@ def _held_out_fits(run: DrivenRun, windows: Windows) -> list[tuple[float, float,
     return fits
 
 
-def _misses(run: DrivenRun, windows: Windows, fits: list[tuple[float, float, WindowFit]]) -> Floats:
+def _misses(run: Run, windows: Windows, fits: list[tuple[float, float, WindowFit]]) -> Floats:
     """Return (m, 6): miss along, across [m] and in heading [rad], duration [s], turn [rad], way [m] of each window."""
     rows = []
     heading = np.interp(windows.knot_t, run.table.t_s, run.table.heading_rad)
@@ -165,7 +165,7 @@ def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     return max(float(shares[0]), SMALLEST_VARIANCE), max(float(shares[1]), SMALLEST_VARIANCE)
 
 
-def _scales(run: DrivenRun, fit: WindowFit) -> tuple[tuple[float, float], tuple[float, float]]:
+def _scales(run: Run, fit: WindowFit) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return radius multipliers of left and right, what the run had applied included, and their deviations."""
     config: dict[str, Any] = run.summary["config"]["wheels"]
     applied = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
@@ -179,9 +179,9 @@ def _scales(run: DrivenRun, fit: WindowFit) -> tuple[tuple[float, float], tuple[
     )
 
 
-def _doubts(run: DrivenRun, fit: WindowFit, width: float) -> tuple[str, ...]:
+def _doubts(run: Run, fit: WindowFit, width: float) -> tuple[str, ...]:
     """Return what to know before pasting."""
-    doubts = list(judge_excitation(run).sentences)
+    doubts = list(find_excitation(run.table, drive_of(run), run.track_width_m).sentences)
     multiplier = float(fit.terms[0]) / width
     if multiplier < 1.0:
         doubts.append(

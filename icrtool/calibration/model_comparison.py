@@ -15,14 +15,13 @@ import numpy as np
 from icrtool.calibration.held_out_fits import BlockFits, clear_of, fit_blocks
 from icrtool.calibration.model_trials import Along, Trials, calibrate_gyro, cut_trials, predict
 from icrtool.errors import DataError
-from icrtool.estimation.measured_heading import MeasuredHeading
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs
 from icrtool.kernels.window_errors import NEUTRAL
 from icrtool.motion.window_fit import WindowFit, Windows, cut_windows, window_spacing_m
-from icrtool.records.dropout import CHOICE_HORIZON_M, Rung
-from icrtool.records.run import DrivenRun
+from icrtool.records.dropout import CHOICE_HORIZON_M, MeasuredHeading, Rung
+from icrtool.records.run import Run
 from icrtool.records.tables import Bools, Floats
 
 HORIZONS_M = (5.0, 10.0, 20.0)
@@ -84,7 +83,7 @@ def count_blocks(distance_m: float) -> int:
 
 
 def judge_ladder(
-    run: DrivenRun, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
+    run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
 ) -> Ladder:
     """Judge every model on way it was not fitted to.
 
@@ -134,7 +133,7 @@ def judge_ladder(
     )
 
 
-def _icrs_of(run: DrivenRun, name: str) -> FrozenIcrs | None:
+def _icrs_of(run: Run, name: str) -> FrozenIcrs | None:
     """Return the ICRs of a model that is not fitted here; None for no slip where b is not known."""
     table, width = run.table, run.track_width_m
     if name == "no_slip":
@@ -144,7 +143,7 @@ def _icrs_of(run: DrivenRun, name: str) -> FrozenIcrs | None:
     return FrozenIcrs(table.y_icr_right_m[-1:], table.y_icr_left_m[-1:], table.x_icr_m[-1:])
 
 
-def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> Rung | None:
+def _judge_plain(run: Run, trials: Trials, fits: BlockFits, name: str) -> Rung | None:
     if name in fits.held_out:
         errors = predict(trials, fits.held_out[name])
     elif (icrs := _icrs_of(run, name)) is not None:
@@ -154,7 +153,7 @@ def _judge_plain(run: DrivenRun, trials: Trials, fits: BlockFits, name: str) -> 
     return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors[trials.starts]))
 
 
-def _judge_along(run: DrivenRun, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
+def _judge_along(run: Run, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
     """Judge the models along a measured heading; a multiplier says nothing of the way along one."""
     along = Along(trials, heading.angle_rad, from_reference=heading.kind == "gyro")
     neutral = np.tile([*NEUTRAL, 0.0], (len(fits.chosen), 1))

@@ -13,7 +13,7 @@ from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs
 from icrtool.motion.window_fit import Windows, coarse_rows
-from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Complexes, Floats, Ints
 
 GYRO_SCALE_PRIOR = 0.02
@@ -46,7 +46,7 @@ class Trials(NamedTuple):
         return slice(int(first), int(last))
 
 
-def cut_trials(run: DrivenRun, edges_m: Floats, horizons_m: Sequence[float]) -> Trials:
+def cut_trials(run: Run, edges_m: Floats, horizons_m: Sequence[float]) -> Trials:
     """Return the trials within blocks of way, `edges_m` their inner borders [m].
 
     Starts are as far apart as the steps of the fits are long: nearer ones are copies of one another.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,16 +16,11 @@ from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.dropout_analysis.acceptance_limits import Gate
-    from icrtool.dropout_analysis.trials import ErrorSink
-    from icrtool.estimation.fit import FilterRun
-    from icrtool.output.dropout_content import DropoutContent
+    from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.output.exports.acceptance import Outcome
     from icrtool.output.figures.drawing_process import DrawingProcess
-    from icrtool.output.run_directory import StoredRun
-    from icrtool.records.dropout import Outage
-    from icrtool.records.run import DrivenRun
-    from icrtool.records.tables import Ints
+    from icrtool.records.dropout import Gate
+    from icrtool.records.run import Run
 
 EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
 
@@ -62,8 +56,8 @@ class Request:
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
 )
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
-              help="Say how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
-@click.option("--horizons", metavar="M,M,...", help="Distances driven blind [m], in place of the configured ones.")
+              help="Report how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
+@click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
 @click.option(
     "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
 )
@@ -72,9 +66,9 @@ class Request:
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
               help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
-              help="Judge all models on way they were not fitted to, gyro included.")  # fmt: skip
+              help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
-              help="Judge by the filter's states, or by the smoother's (fit --smooth).")  # fmt: skip
+              help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -90,7 +84,7 @@ def command(
     ladder: bool, reference: str, trials: bool, junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Say how far a robot can go blind: open loop from every recorded state, over 1 to 20 m.
+    """Report how far a robot can go without GNSS: open loop from every recorded state, over 1 to 20 m.
 
     RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
     icrtool-runs/. The report is written into the run directory, as dropout/.
@@ -148,7 +142,7 @@ def plan_sources(
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
-    from icrtool.output.run_source import newest_run
+    from icrtool.output.stored_run import newest_run
 
     for export in exports:
         if export is not None:
@@ -206,21 +200,18 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
         raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
 
 
-def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutContent:
+def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
-    if place is None:
-        run: StoredRun | FilterRun = _read(source)
-        directory = source
-    else:
-        run, directory = _fit(source, place, request, drawer), place
-    content = _analyse(run, directory, request, drawer)
+    run = _read(source) if place is None else _fit(source, place, request, drawer)
+    directory = source if place is None else place
+    report = _analyse(run, directory, request, drawer)
     if not request.quiet:
         from icrtool.output.tables.dropout import format_dropout
 
-        click.echo(format_dropout(content))
+        click.echo(format_dropout(report))
         click.echo(f"\nwritten to {directory / 'dropout'}")
     else:
-        for verdict in content.verdicts:
+        for verdict in report.verdicts:
             if not verdict.passed:
                 click.echo(verdict.line(), err=True)
     if request.verbose:
@@ -228,26 +219,26 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
         from icrtool.kernels.open_loop_fast import TOLERANCE_M
 
         blocks = "moving blocks as long as the horizon"
-        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {content.report.seed}", err=True)
+        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {report.seed}", err=True)
         click.echo(f"errors: equal to direct integration, {TOLERANCE_M:g} m left out at most", err=True)
-    return content
+    return report
 
 
-def _read(directory: Path) -> StoredRun:
+def _read(directory: Path) -> Run:
     """Read a run; what the analysis needs is loaded beside it."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from icrtool.output.run_source import read_source
+    from icrtool.output.stored_run import open_run
 
     with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(read_source, directory)
+        reading = pool.submit(open_run, directory)
         from icrtool.dropout_analysis.trials import load_kernels
 
         load_kernels()
         return reading.result()
 
 
-def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> FilterRun:
+def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> Run:
     """Fit a log and write its run directory, as `icrtool fit` does."""
     from icrtool.output.run_directory import check_target, write_run
 
@@ -257,10 +248,9 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
 
         measured = read_log(log, request.config, progress)
     from icrtool.estimation.fit import fit
-    from icrtool.estimation.smooth import smooth
 
-    run = fit(measured, request.config)
-    write_run(run, directory, smoothed=smooth(run) if request.smoothed else None, drawer=drawer)
+    run = fit(measured, request.config, smooth=request.smoothed)
+    write_run(run, directory, drawer=drawer)
     options.warn(run.warnings, quiet=request.quiet)
     if request.verbose:
         for stream in measured.streams:
@@ -268,118 +258,30 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     return run
 
 
-def _analyse(
-    filtered: StoredRun | FilterRun, directory: Path, request: Request, drawer: DrawingProcess
-) -> DropoutContent:
-    """Compute the report of a run, have its pictures drawn meanwhile, and write it all."""
-    from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate
-    from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
-    from icrtool.dropout_analysis.real_outages import real_outages
-    from icrtool.dropout_analysis.straight_and_turning import split_by_turning
-    from icrtool.dropout_analysis.trials import dropout, models_of
-    from icrtool.output.dropout_content import DropoutContent, title_of
-    from icrtool.output.dropout_directory import dropout_directory, write_content
-    from icrtool.output.dropout_ladder import ladder_of
-    from icrtool.output.figures import dropout_figures as dropout_drawing
-    from icrtool.output.run_source import judged_run
+def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess) -> DropoutReport:
+    """Compute the report of a run, have its figures drawn meanwhile, and write it all."""
+    from icrtool.dropout_analysis.dropout_report import dropout_report, forced_lengths_s
+    from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, report_writer
 
-    run = judged_run(filtered, directory) if request.smoothed else filtered
-    title = title_of(run)
-    outages = (*_forced_outages(filtered, request), *real_outages(run))
-    with (
-        dropout_directory(directory) as partial,
-        drawer.into(partial / "plots") as draw,
-        _trials_sink(partial, run.table.stamp_ns, wanted=request.trials) as sink,
-    ):
-        dropout_drawing.draw_examples(draw, title, examples := example_drives(run))
-        dropout_drawing.draw_worst(draw, title, worst := worst_drives(run))
-        dropout_drawing.draw_outages(draw, title, run.table, outages)
-        horizons = _horizons(run, request)
-        models = models_of(run)
-        watch = dropout_drawing.watch_for_histograms(draw, title, [model.name for model in models])
-        report = dropout(run, horizons, models=models, seed=request.seed, sink=sink, watch=watch)
-        dropout_drawing.draw_summary(draw, title, report, outages)
-        ladder, no_ladder = ladder_of(run, filtered) if request.ladder else (None, "")
-        if ladder is not None:
-            dropout_drawing.draw_ladder(draw, title, ladder)
-        content = DropoutContent(
-            title=title,
-            run_summary=run.summary,
-            report=report,
-            budgets=tuple(one for budget in request.budgets_m for one in budget_distances(report, budget)),
-            verdicts=tuple(judge_gate(gate, report) for gate in request.gates),
-            worst=worst,
-            examples=examples,
-            outages=outages,
-            by_turning=split_by_turning(run),
-            ladder=ladder,
-            no_ladder=no_ladder,
-            smoothed=request.smoothed,
+    dropout, given = request.config.dropout, request.config.given
+    horizons = request.horizons_m or (dropout.horizons_m if "dropout.horizons_m" in given else None)
+    outages = request.outage_s or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None)
+    if request.outage_at_s and not forced_lengths_s(run, outages):
+        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+    stamps = run.table.stamp_ns if request.trials else None
+    with report_writer(directory / DROPOUT_DIRECTORY, drawer, stamps) as writer:
+        report = dropout_report(
+            run,
+            horizons_m=horizons,
+            budgets_m=request.budgets_m,
+            gates=request.gates,
+            outage_s=outages,
+            outage_at_s=request.outage_at_s,
+            comparison=request.ladder,
+            reference="smoothed" if request.smoothed else "filter",
+            seed=request.seed,
+            sink=writer.sink,
+            watch=writer.watch,
         )
-        write_content(content, partial)
-    return content
-
-
-def _horizons(run: DrivenRun, request: Request) -> list[float]:
-    """Return the horizons asked for: by option, else configured; and those that gates name."""
-    from icrtool.dropout_analysis.trials import configured_horizons_m
-
-    config = request.config
-    configured = config.dropout.horizons_m if "dropout.horizons_m" in config.given else configured_horizons_m(run)
-    horizons = list(request.horizons_m or configured)
-    for gate in request.gates:
-        if not any(math.isclose(gate.horizon_m, horizon, rel_tol=1e-9) for horizon in horizons):
-            horizons.append(gate.horizon_m)
-    return horizons
-
-
-def _forced_outages(run: StoredRun | FilterRun, request: Request) -> tuple[Outage, ...]:
-    """Force the outages asked for, by option or configuration; a stored run's log is read again for them."""
-    config = request.config
-    stored = tuple(run.summary["config"]["dropout"]["forced_outage_s"])
-    configured = config.dropout.forced_outage_s if "dropout.forced_outage_s" in config.given else stored
-    lengths = request.outage_s or configured
-    if request.outage_at_s and not lengths:
-        raise click.UsageError("--outage-at says when, and needs --outage to say how long")
-    if not lengths:
-        return ()
-    from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
-    from icrtool.output.run_directory import StoredRun
-
-    filtered = _fit_again(run, quiet=request.quiet) if isinstance(run, StoredRun) else run
-    plans = [plan_outages(filtered, length, request.outage_at_s) for length in lengths]
-    return tuple(outage for plan in plans for outage in force_outages(filtered, plan))
-
-
-def _fit_again(run: StoredRun, *, quiet: bool) -> FilterRun:
-    """Filter a stored run's log once more, for what the run directory does not hold: the measurements."""
-    from icrtool.estimation.fit import fit
-    from icrtool.logs import read_log
-    from icrtool.output.run_source import (
-        check_same_log,
-        check_same_states,
-        log_of,
-        stored_config,
-        terrain_changes_s,
-        warm_start_of,
-    )
-
-    config, path = stored_config(run), log_of(run)
-    with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
-        log = read_log(path, config, progress)
-    check_same_log(run, log)
-    again = fit(log, config, warm_start=warm_start_of(run), changes_s=terrain_changes_s(run))
-    check_same_states(run, again)
-    return again
-
-
-@contextmanager
-def _trials_sink(directory: Path, stamp_ns: Ints, *, wanted: bool) -> Iterator[ErrorSink | None]:
-    """Give a sink that writes trials.parquet, or None where it is not wanted."""
-    if not wanted:
-        yield None
-        return
-    from icrtool.output.trials_file import trials_file
-
-    with trials_file(directory / "trials.parquet", stamp_ns) as sink:
-        yield sink
+        writer.finish(report)
+    return report

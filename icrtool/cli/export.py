@@ -22,7 +22,7 @@ def command(run: Path | None, target: str) -> None:
     """Print a run's calibration, ready to paste into a robot's controller or filter.
 
     RUN is a directory that `icrtool fit` wrote; without it, the newest below icrtool-runs/. The multipliers are fitted
-    to predict the place after 5 to 10 m of way, the covariances measured on way held out of the fit.
+    to predict the place after 5 to 10 m, the covariances measured on distance held out of the fit.
 
     \b
     Example:
@@ -31,7 +31,7 @@ def command(run: Path | None, target: str) -> None:
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.controller_numbers import export_numbers
     from icrtool.output.exports.controllers import format_export
-    from icrtool.output.run_source import newest_run, read_source
+    from icrtool.output.stored_run import newest_run, open_run
 
-    stored = read_source(run if run is not None else newest_run(RUNS))
-    click.echo(format_export(export_numbers(stored), cast("Target", target)))
+    numbers = export_numbers(open_run(run if run is not None else newest_run(RUNS)))
+    click.echo(format_export(numbers, cast("Target", target)))

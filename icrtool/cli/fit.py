@@ -12,8 +12,8 @@ from icrtool.cli import options
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.estimation.filter_setup import WarmStart
     from icrtool.output.figures.drawing_process import DrawingProcess
+    from icrtool.records.run import WarmStart
 
 RUNS = Path("icrtool-runs")
 AUTO = "auto"
@@ -66,7 +66,7 @@ def command(
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
-    robot.wheel_radius_m=… tell what the messages do not.
+    robot.wheel_radius_m=… give what the messages do not.
 
     \b
     Example:
@@ -145,7 +145,7 @@ def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
 
 
 def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...]:
-    """Say that the run to start from was made with another track width."""
+    """Warn where the run to start from was made with another track width."""
     theirs, ours = start.track_width_m if start is not None else None, request.config.robot.track_width_m
     if theirs is None or ours is None or math.isclose(theirs, ours, rel_tol=0.01):
         return ()
@@ -155,18 +155,19 @@ def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...
 
 
 def _beside(request: FitRequest) -> str:
-    """Say what else the options did."""
+    """Return what else the options did."""
     done = [f"started from {request.warm_start}"] if request.warm_start is not None else []
     done += ["with the smoother's states"] if request.smooths else []
     return f" ({', '.join(done)})" if done else ""
 
 
 def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> None:
-    from icrtool.output.run_directory import check_target, log_of_run, read_warm_start, write_run
+    from icrtool.output.run_directory import check_target, log_of_run, write_run
+    from icrtool.output.stored_run import open_run
 
     check_target(directory)
     before = log_of_run(directory)
-    start = read_warm_start(request.warm_start) if request.warm_start is not None else None
+    start = open_run(request.warm_start).ended_with if request.warm_start is not None else None
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
@@ -180,13 +181,9 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         warm_start=start,
         changes_s=request.changes_s,
         find_changes=request.finds_changes,
+        smooth=request.smooths,
     )
-    smoothed = None
-    if request.smooths:
-        from icrtool.estimation.smooth import smooth
-
-        smoothed = smooth(run)
-    write_run(run, directory, states=request.states, smoothed=smoothed, drawer=drawer)
+    write_run(run, directory, states=request.states, drawer=drawer)
     replaced = before is not None and before != run.summary["inputs"][0]["path"]
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
     options.warn((*run.warnings, *_other_robot(request, start), *note), quiet=request.quiet)

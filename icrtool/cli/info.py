@@ -11,7 +11,7 @@ from icrtool.cli import options
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.estimation.fit import FilterRun
+    from icrtool.records.run import Run
     from icrtool.records.tables import RobotLog
 
 
@@ -75,7 +75,7 @@ def _describe(log: Path, config: Config, *, quiet: bool, verbose: bool) -> bool:
     return run is not None
 
 
-def _try(measured: RobotLog, config: Config) -> FilterRun:
+def _try(measured: RobotLog, config: Config) -> Run:
     """Fit the log: what the drive could show, and what contradicts what, only the filter tells."""
     from icrtool.estimation.fit import fit
 

@@ -1,4 +1,4 @@
-"""Budgets and gates: how far an error stays within a bound, and bounds on the dropout numbers for CI."""
+"""Budgets and acceptance limits: how far an error stays within a bound, and bounds on the dropout numbers for CI."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import math
 import operator
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
-from icrtool.records.dropout import DropoutReport
+from icrtool.records.dropout import BudgetDistance, Gate, Verdict
 from icrtool.records.tables import Floats
 
 _FORM = re.compile(
@@ -22,59 +21,6 @@ _FORM = re.compile(
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
-
-
-class BudgetDistance(NamedTuple):
-    """How far a model's 95th percentile stays within a budget.
-
-    Attributes
-    ----------
-    distance_m : interpolated between horizons, from 0 m at 0 m
-    beyond : the budget still held at `distance_m`, the last horizon with trials
-    between_m : horizons interpolated between
-    """
-
-    model: str
-    label: str
-    budget_m: float
-    distance_m: float
-    beyond: bool
-    between_m: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """One bound: ``icr.p95@10m <= 3.8``."""
-
-    text: str
-    model: str
-    metric: str
-    horizon_m: float
-    relation: str
-    bound_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What a gate found.
-
-    Attributes
-    ----------
-    value_m : NaN where the log has no trial of that length
-    margin_m : negative when the bound was missed
-    """
-
-    gate: Gate
-    value_m: float
-    margin_m: float
-    passed: bool
-
-    def line(self) -> str:
-        """Return the verdict in one line."""
-        word = "pass" if self.passed else "FAIL"
-        if math.isnan(self.value_m):
-            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log"
-        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m"
 
 
 def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDistance, ...]:
@@ -109,8 +55,8 @@ def parse_gate(text: str) -> Gate:
     return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m)
 
 
-def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
-    """Hold a gate against a report.
+def check_gate(gate: Gate, report: DropoutReport) -> Verdict:
+    """Compare a report with an acceptance limit.
 
     Raises
     ------
@@ -134,10 +80,10 @@ def judge_gate(gate: Gate, report: DropoutReport) -> Verdict:
 def _budget_distance(
     horizons_m: Floats, p95_m: Floats, budget_m: float
 ) -> tuple[float, bool, tuple[float, float]] | None:
-    told = np.isfinite(p95_m)
-    if not told.any():
+    known = np.isfinite(p95_m)
+    if not known.any():
         return None
-    distance, p95 = np.concatenate([[0.0], horizons_m[told]]), np.concatenate([[0.0], p95_m[told]])
+    distance, p95 = np.concatenate([[0.0], horizons_m[known]]), np.concatenate([[0.0], p95_m[known]])
     over = np.flatnonzero(p95 > budget_m)
     if not len(over):
         return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))

@@ -1,4 +1,4 @@
-"""Single blind drives worth a picture: the worst, a typical cornering, a typical straight one (Figs. 33-34)."""
+"""Single trials worth a picture: the worst, a typical cornering, a typical straight one (Figs. 33-34)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive
-from icrtool.records.dropout import BlindDrive
-from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.dropout import ExampleTrial
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Ints
 
 WORST_COUNT = 10
@@ -18,13 +18,11 @@ EXAMPLE_HORIZON_M = 15.0
 ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE = 0.05
 TYPICAL_OF = 30
-"""Trials enough to tell which error is the median one."""
+"""Trials enough to find the median error."""
 PICTURED = ("icr", "no_slip")
 
 
-def worst_drives(
-    run: DrivenRun, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT
-) -> tuple[BlindDrive, ...]:
+def worst_trials(run: Run, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT) -> tuple[ExampleTrial, ...]:
     """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
@@ -35,10 +33,10 @@ def worst_drives(
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
         chosen.append(worst)
         left[(starts <= ends[worst]) & (ends >= worst)] = -1.0
-    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+    return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 
-def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[BlindDrive, ...]:
+def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:
     """Return a typical cornering trial and a typical straight one, none when no trial is that long.
 
     Notes
@@ -50,7 +48,7 @@ def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tupl
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
     starts = np.flatnonzero(ends >= 0)
-    # A parked start repeats the same way many times: the last state of each stop stands for it.
+    # A parked start repeats the same path many times: the last state of each stop stands for it.
     moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]
     if not len(moving):
         return ()
@@ -59,7 +57,7 @@ def example_drives(run: DrivenRun, horizon_m: float = EXAMPLE_HORIZON_M) -> tupl
     off = np.abs(np.abs(drive.heading[ends[moving]] - drive.heading[moving]) - np.pi)
     groups = (moving[off <= off.min() + ALIKE_RAD], moving[turning <= np.quantile(turning, STRAIGHT_SHARE)])
     chosen = (_typical(drive, models[0], ends, group) for group in groups)
-    return tuple(_blind_drive(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+    return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 
 def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
@@ -71,9 +69,7 @@ def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
     return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
 
 
-def _blind_drive(
-    run: DrivenRun, drive: Drive, models: tuple[Model, ...], start: int, end: int, horizon_m: float
-) -> BlindDrive:
+def _example(run: Run, drive: Drive, models: tuple[Model, ...], start: int, end: int, horizon_m: float) -> ExampleTrial:
     paths, errors = {}, {}
     for model in models:
         if model.name not in PICTURED:
@@ -84,7 +80,7 @@ def _blind_drive(
         errors[model.name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
     table = run.table
     duration = float(table.t_s[end] - table.t_s[start])
-    return BlindDrive(
+    return ExampleTrial(
         start=start,
         end=end,
         stamp_ns=int(table.stamp_ns[start]),

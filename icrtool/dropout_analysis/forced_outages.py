@@ -9,10 +9,10 @@ import numpy as np
 
 from icrtool.dropout_analysis.trials import STANDING_MPS
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.filter_setup import set_up_filter
-from icrtool.estimation.fit import FilterRun
+from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.ekf import run_filter
 from icrtool.records.dropout import Outage
+from icrtool.records.run import Run
 from icrtool.records.tables import Bools, Floats
 
 LONGEST_SHARE = 0.5
@@ -24,7 +24,7 @@ SAME_M = 1e-6
 """Before the first outage the disturbed run is the undisturbed one, to rounding."""
 
 
-def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
+def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
     """Place outages of one length: at given seconds, or spaced over the time in which the robot moves.
 
     Returns
@@ -58,14 +58,14 @@ def plan_outages(run: FilterRun, length_s: float, at_s: Sequence[float] = ()) ->
             raise ConfigError(
                 "outage",
                 f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own",
-                "there is no estimate to hold it against: choose another time",
+                "there is no estimate to compare it with: choose another time",
             )
     origin = int(run.table.stamp_ns[0])
     return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
 
 
-def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
-    """Run the filter again without GNSS and heading in the spans, and hold it against the undisturbed run.
+def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
+    """Run the filter again without GNSS and heading in the spans, and compare it with the undisturbed run.
 
     Raises
     ------
@@ -74,18 +74,7 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     DataError
         The run cannot be made again.
     """
-    setup = set_up_filter(
-        run.log,
-        run.config,
-        heading_mirrored=run.heading_check.applied_mirror,
-        heading_offset_rad=run.heading_check.applied_offset_rad,
-        heading_std_at_least_rad=run.heading_check.applied_std_rad,
-        heading_correlation_at_least_s=run.heading_check.applied_correlation_s,
-        process_position_mps=run.process_position_mps,
-        changes_s=run.changes_s,
-        warm_start=run.warm_start,
-        outages_ns=tuple(spans_ns),
-    )
+    setup = set_up_again(run, run.config, tuple(spans_ns))
     output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
     rows = min(len(output.x), len(run.table))
@@ -119,8 +108,8 @@ def force_outages(run: FilterRun, spans_ns: Sequence[tuple[int, int]]) -> tuple[
     return tuple(outages)
 
 
-def _in_real_outage(run: FilterRun, begin_s: Floats, length_s: float) -> Bools:
-    """Say which outages of a length, by their begins (k,) [s], share time with one that the log has itself."""
+def _in_real_outage(run: Run, begin_s: Floats, length_s: float) -> Bools:
+    """Return which outages of a length, by their begins (k,) [s], share time with one that the log has itself."""
     origin = int(run.table.stamp_ns[0])
     shared = np.zeros(len(begin_s), np.bool_)
     for begin, end in (run.outages_ns - origin) / 1e9:
@@ -128,7 +117,7 @@ def _in_real_outage(run: FilterRun, begin_s: Floats, length_s: float) -> Bools:
     return shared
 
 
-def _spaced(run: FilterRun, length_s: float) -> list[float]:
+def _spaced(run: Run, length_s: float) -> list[float]:
     """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
 
     Time from which an outage would reach into one of the log's own is none to begin in.
@@ -137,8 +126,7 @@ def _spaced(run: FilterRun, length_s: float) -> list[float]:
     moves = np.diff(run.table.distance_m) >= STANDING_MPS * np.diff(t)
     moves &= ~_in_real_outage(run, t[:-1], length_s)
     moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
-    settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
-    before = float(np.interp(min(settled, last / 4), t, moved))
+    before = float(np.interp(min(run.settled_s, last / 4), t, moved))
     rest = float(moved[-1]) - before
     count = min(MOST_SPACED, int(rest * LONGEST_SHARE / length_s))
     if count < 1:

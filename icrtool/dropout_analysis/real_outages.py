@@ -1,4 +1,4 @@
-"""Outages of GNSS: what there is to say of one, and those a log really had."""
+"""The GNSS outages that a log had itself."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.records.dropout import Outage
-from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.run import Run, drive_of
 
 
-def real_outages(run: DrivenRun) -> tuple[Outage, ...]:
+def real_outages(run: Run) -> tuple[Outage, ...]:
     """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix, missed at the next one.
 
     One that never ends, and one with a gap in the wheel data, has no miss and is left out; so has one that the drive

@@ -1,9 +1,8 @@
-"""Straight and turning trials apart: on a straight way there is no turn for a model to be wrong about."""
+"""Straight and turning trials apart: on a straight path there is no turn for a model to be wrong about."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -12,30 +11,22 @@ from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive
-from icrtool.records.run import DrivenRun, drive_of
+from icrtool.records.dropout import TurningSplit
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
 
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)
 CELLS = 20
-"""Cells of way a horizon is cut into, to find the range of the heading."""
+"""Cells of path a horizon is cut into, to find the range of the heading."""
 
 SPLIT_MODELS = ("icr", "no_slip")
 
 
-class TurningSplit(NamedTuple):
-    """Expected error [m] by model over the trials whose heading stayed within `STRAIGHT_RAD`, or did not."""
+def split_by_turning(run: Run, horizon_m: float = SPLIT_HORIZON_M) -> tuple[TurningSplit, ...]:
+    """Return the errors of straight and turning trials of one horizon (Pentzer 2014, Section 6.4, Figs. 33-34).
 
-    straight: bool
-    horizon_m: float
-    trials: int
-    expected_m: dict[str, float]
-
-
-def split_by_turning(run: DrivenRun, horizon_m: float = SPLIT_HORIZON_M) -> tuple[TurningSplit, ...]:
-    """Judge straight and turning trials of one horizon apart (Pentzer 2014, Section 6.4, Figs. 33-34).
-
-    What counts is the range of the heading over the way, so that an S is a turn. A part without trials is left out.
+    What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
@@ -56,12 +47,12 @@ def split_by_turning(run: DrivenRun, horizon_m: float = SPLIT_HORIZON_M) -> tupl
 
 
 def heading_range(drive: Drive, horizon_m: float) -> Floats:
-    """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of way."""
+    """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
     size = horizon_m / CELLS
     cell = ((drive.distance - drive.distance[0]) / size).astype(np.int64)
     first = np.flatnonzero(np.diff(cell, prepend=-1))
     cells = np.arange(cell[-1] + CELLS + 1)
-    # In a cell without a state the heading is on its way between those around it.
+    # In a cell without a state the heading lies between those around it.
     highest, lowest = (
         sliding_window_view(np.interp(cells, cell[first], extreme.reduceat(drive.heading, first)), CELLS + 1)
         for extreme in (np.maximum, np.minimum)

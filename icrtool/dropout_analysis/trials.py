@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.error_statistics import (
     Blocks,
@@ -24,8 +25,8 @@ from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, ope
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.kernels.window_errors import NEUTRAL, move, window_misses
-from icrtool.records.dropout import DEFAULT_SEED, DropoutReport, ModelResult
-from icrtool.records.run import DrivenRun, drive_of, toy_drive
+from icrtool.records.dropout import DEFAULT_SEED, ModelResult
+from icrtool.records.run import Run, drive_of, straight_drive
 from icrtool.records.tables import Floats
 
 BOOTSTRAP_RESAMPLES = 300
@@ -71,7 +72,7 @@ ReportWatch = Callable[[DropoutReport], None]
 
 
 def dropout(
-    run: DrivenRun,
+    run: Run,
     horizons_m: Sequence[float] | None = None,
     *,
     models: Sequence[Model] | None = None,
@@ -79,16 +80,16 @@ def dropout(
     sink: ErrorSink | None = None,
     watch: ReportWatch | None = None,
 ) -> DropoutReport:
-    """Say how far off the robot is after driving blind, from every recorded state.
+    """Return how far off the robot is after driving without GNSS, from every recorded state.
 
     Parameters
     ----------
-    run : a `FilterRun`, or a run read back from its directory
-    horizons_m : distances driven blind, in any order; default those of the run's configuration
+    run : of `icrtool.fit` or `icrtool.open_run`
+    horizons_m : distances without GNSS, in any order; default those of the run's configuration
     models : what to predict with; default `models_of` of the run
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
-    watch : told of the report as it grows, after each model
+    watch : called with the report as it grows: before the first model, without any result, and after each
 
     Raises
     ------
@@ -102,7 +103,7 @@ def dropout(
     Notes
     -----
     ICRs are frozen at the start, wheel speeds alone drive on, the error is the horizontal distance to the filter's
-    estimate where the path has grown by the horizon. A start with less path left, a way across a gap in the wheel data
+    estimate where the path has grown by the horizon. A start with less path left, a path across a gap in the wheel data
     and an end inside a real GNSS outage are no trials; they are counted. Overlapping trials are not independent: the
     intervals come from a moving-block bootstrap with blocks of the horizon's length.
     """
@@ -118,17 +119,25 @@ def dropout(
     if len(parts) < len(models):
         raise ValueError("two models have the same name")
 
+    none = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
+
     def done() -> DropoutReport:
         return DropoutReport(
             name=run.name,
             horizons_m=horizons,
             results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
-            counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
+            counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))) if counts else none,
             states=len(run.table),
             standing=standing,
             seed=seed,
+            run_summary=run.summary,
+            run_directory=run.directory,
+            reference_north_m=run.table.north_m,
+            reference_east_m=run.table.east_m,
         )
 
+    if watch is not None:
+        watch(done())
     with ThreadPoolExecutor(THREADS) as pool:
         for group in groups:
             ends, count = _ends(drive, horizons[group], pool)
@@ -138,13 +147,13 @@ def dropout(
                 errors = _errors(drive, model.icrs, ends, pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
-                parts[model.name].append(_judge(model, errors, blocks, seed, pool))
+                parts[model.name].append(_summarise(model, errors, blocks, seed, pool))
                 if watch is not None and group is groups[-1]:
                     watch(done())
     return done()
 
 
-def configured_horizons_m(run: DrivenRun) -> tuple[float, ...]:
+def configured_horizons_m(run: Run) -> tuple[float, ...]:
     """Return the horizons [m] of the configuration a run was made with."""
     horizons: Iterable[float] = run.summary["config"]["dropout"]["horizons_m"]
     return tuple(horizons)
@@ -163,27 +172,27 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
         raise ConfigError("horizons", "none is given", "name at least one distance in metres")
     for horizon in horizons:
         if not (math.isfinite(horizon) and horizon >= SHORTEST_HORIZON_M):
-            raise ConfigError("horizons", f"{horizon:g} m is no way", f"give {SHORTEST_HORIZON_M:g} m or more")
+            raise ConfigError("horizons", f"{horizon:g} m is no distance", f"give {SHORTEST_HORIZON_M:g} m or more")
     return horizons
 
 
 def load_kernels() -> None:
-    """Have the compiled kernels ready: a toy drive, to be called while a run is still being read."""
-    drive = toy_drive()
-    way = drive.distance
+    """Have the compiled kernels ready, to be called while a run is still being read."""
+    drive = straight_drive()
+    path = drive.distance
     icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
     ends = trial_ends(drive, np.array([1.0]))
     open_loop_errors_direct(drive, icrs, ends)
     errors = open_loop_errors(drive, icrs, ends)
-    bootstrap_intervals(errors, [cut_blocks(way < way[-1], way, 0.5)], DEFAULT_SEED)
+    bootstrap_intervals(errors, [cut_blocks(path < path[-1], path, 0.5)], DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
     motion = move(
-        way, np.ones_like(way), np.ones_like(way), np.ones_like(way), np.array([1.0, -1.0, *NEUTRAL[2:]]), way
+        path, np.ones_like(path), np.ones_like(path), np.ones_like(path), np.array([1.0, -1.0, *NEUTRAL[2:]]), path
     )
     window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
 
 
-def models_of(run: DrivenRun) -> tuple[Model, ...]:
+def models_of(run: Run) -> tuple[Model, ...]:
     """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
     table = run.table
     models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
@@ -238,10 +247,10 @@ def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Execu
     return errors.T
 
 
-def _judge(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
-    """Say what the errors of one model tell, horizon by horizon."""
+def _summarise(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
+    """Return the errors of one model in numbers, horizon by horizon."""
 
-    def judge(h: int) -> ModelResult:
+    def summarise(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
         summary = summarise_sorted([ordered])
@@ -249,7 +258,7 @@ def _judge(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: 
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         return ModelResult(model.name, model.label, summary, intervals, (bins,))
 
-    return _joined(list(pool.map(judge, range(len(blocks)))))
+    return _joined(list(pool.map(summarise, range(len(blocks)))))
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:

@@ -1,21 +1,19 @@
-"""From a log and a configuration to what the kernel needs: times, noises, the start, the presets."""
+"""From aligned sensors and a configuration to what the kernel needs: times, noises, the start, the presets."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.gnss_quality import LARGEST_SANE_GNSS_STD_M
-from icrtool.alignment.stream_checks import check_streams
-from icrtool.config import Config, FilterConfig
+from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.ekf import FilterParameters, Measurements
-from icrtool.records.run import half_width_m
-from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+from icrtool.records.measurements import IcrStart, SensorData
+from icrtool.records.run import WarmStart, half_width_m
+from icrtool.records.tables import Floats, Ints
 
 PAPER_PROCESS_POSITION_MPS = 0.2
 """Pentzer 2014, Eq. 30; its text says 0.1 m/s, its matrix prints 0.2 squared: the matrix is used."""
@@ -31,9 +29,6 @@ truth on rigid-body simulated robots, with these 90 % and more."""
 PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
 PAPER_INITIAL_ICR_STD_M = 1.0
 """Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
-
-LARGEST_SANE_HEADING_STD_RAD = math.radians(60.0)
-"""What a message claims beyond this says nothing about its noise (1000 or 1e6 stand for "unknown")."""
 
 GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
@@ -58,17 +53,6 @@ PAPER_TERRAIN_ICR_STD_M = 10.0
 width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
-class WarmStart(NamedTuple):
-    """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] at the end of another run (Fig. 18).
-
-    `track_width_m` is b of the robot they were learned on, None where it was not given.
-    """
-
-    icrs_m: Floats
-    covariance_m2: Floats
-    track_width_m: float | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class FilterSetup:
     """One run, ready for the kernel.
@@ -77,7 +61,7 @@ class FilterSetup:
     ----------
     epoch_ns : stamp of time 0 in `data`
     t0 : time of the start [s]; x0 (6,), P0 (6, 6) : state and covariance there
-    gnss_index : (m,) rows of the log's fixes that `data` holds; heading_index likewise
+    gnss_index : (m,) rows of the fixes that `data` holds; heading_index likewise
     """
 
     data: Measurements
@@ -112,13 +96,9 @@ def check_start(config: Config) -> None:
 
 
 def set_up_filter(
-    log: RobotLog,
+    sensors: SensorData,
     config: Config,
     *,
-    heading_mirrored: bool = False,
-    heading_offset_rad: float = 0.0,
-    heading_std_at_least_rad: float = 0.0,
-    heading_correlation_at_least_s: float = 0.0,
     process_position_mps: float | None = None,
     changes_s: tuple[float, ...] = (),
     warm_start: WarmStart | None = None,
@@ -128,9 +108,7 @@ def set_up_filter(
 
     Parameters
     ----------
-    heading_mirrored : take the heading turned the other way
-    heading_offset_rad : subtracted from every heading sample, after that
-    heading_std_at_least_rad, heading_correlation_at_least_s : raise the noise of the heading samples
+    sensors : the aligned streams
     process_position_mps : in place of the configured one
     changes_s : terrain changes, seconds since the first recorded state; the ICR covariance is inflated there
     warm_start : what another run ended with, in place of the configured start
@@ -139,33 +117,30 @@ def set_up_filter(
     Raises
     ------
     DataError
-        Streams that cannot be used together (`check_streams`), or outages that leave nothing of them.
+        No wheel sample after the first fix and heading, or outages that leave no fix or no heading.
     """
-    check_streams(log)
-    epoch = int(log.wheels.stamp_ns[0])
-    gnss_index, heading_index = _kept(log.gnss.stamp_ns, outages_ns), _kept(log.heading.stamp_ns, outages_ns)
-    paper = config.filter.preset == "paper"
-    heading_r = _heading_variance(log.heading, config.filter, heading_std_at_least_rad, paper=paper)
+    wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
+    epoch = int(wheels.stamp_ns[0])
+    gnss_index, heading_index = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
     data = Measurements(
-        wheel_t=_seconds(log.wheels.stamp_ns, epoch),
-        v_left=log.wheels.v_left_mps,
-        v_right=log.wheels.v_right_mps,
-        gnss_t=_seconds(log.gnss.stamp_ns[gnss_index], epoch),
-        gnss_z=np.column_stack([log.gnss.north_m, log.gnss.east_m])[gnss_index],
-        gnss_r=_gnss_variance(log.gnss, config.filter, paper=paper)[gnss_index],
-        heading_t=_seconds(log.heading.stamp_ns[heading_index], epoch),
-        heading_z=(-1.0 if heading_mirrored else 1.0) * log.heading.heading_rad[heading_index] - heading_offset_rad,
-        heading_r=heading_r[heading_index],
+        wheel_t=_seconds(wheels.stamp_ns, epoch),
+        v_left=wheels.v_left_mps,
+        v_right=wheels.v_right_mps,
+        gnss_t=_seconds(fixes.stamp_ns[gnss_index], epoch),
+        gnss_z=np.column_stack([fixes.north_m, fixes.east_m])[gnss_index],
+        gnss_r=np.column_stack([fixes.var_north_m2, fixes.var_east_m2])[gnss_index],
+        heading_t=_seconds(headings.stamp_ns[heading_index], epoch),
+        heading_z=headings.heading_rad[heading_index],
+        heading_r=headings.var_rad2[heading_index],
         change_t=np.empty(0),
     )
-    t0 = _start_time(log, data)
+    t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
-    correlation_s = max(config.filter.heading_correlation_s, heading_correlation_at_least_s)
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
-    alike = _samples_that_err_alike(_seconds(log.heading.stamp_ns, epoch), correlation_s)
-    parameters = _parameters(config, data, antenna_m(log, config), process_position_mps, alike)
-    x0, P0 = _start_state(data, t0, config, parameters, warm_start)
+    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), sensors.heading_correlation_s)
+    parameters = _parameters(config, data, sensors.antenna_m, process_position_mps, alike)
+    x0, P0 = _start_state(data, t0, _initial_icrs(config, sensors.icr_start), parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
 
@@ -187,42 +162,22 @@ def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
     return np.flatnonzero(kept)
 
 
-def _gnss_variance(gnss: PositionFixes, config: FilterConfig, *, paper: bool) -> Floats:
-    """Return the variances of north and east (m, 2): the message's where sane, else the configured."""
-    default = config.gnss_std_m**2
-    if paper:
-        return np.full((len(gnss.stamp_ns), 2), default)
-    # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
-    correlated = np.nan_to_num(np.abs(gnss.cov_north_east_m2))
-    said = np.column_stack([gnss.var_north_m2 + correlated, gnss.var_east_m2 + correlated])
-    sane = np.isfinite(said) & (said > 0) & (said < LARGEST_SANE_GNSS_STD_M**2)
-    return np.maximum(np.where(sane, said, default), config.gnss_std_floor_m**2)
-
-
-def _heading_variance(heading: HeadingSamples, config: FilterConfig, at_least_rad: float, *, paper: bool) -> Floats:
-    default = math.radians(config.heading_std_deg) ** 2
-    if paper:
-        return np.full(len(heading.stamp_ns), default)
-    said = heading.var_rad2
-    sane = np.isfinite(said) & (said > 0) & (said < LARGEST_SANE_HEADING_STD_RAD**2)
-    floor = max(math.radians(config.heading_std_floor_deg), at_least_rad)
-    return np.maximum(np.where(sane, said, default), floor**2)
-
-
-def _start_time(log: RobotLog, data: Measurements) -> float:
+def _start_time(name: str, data: Measurements) -> float:
     """Return the first stamp by which wheel, GNSS and heading have each been seen."""
     if not (len(data.gnss_t) and len(data.heading_t)):
-        raise DataError(log.name, "the outages leave no fix or no heading", "take away less")
+        raise DataError(name, "the outages leave no fix or no heading", "take away less")
     t0 = max(float(data.wheel_t[0]), float(data.gnss_t[0]), float(data.heading_t[0]))
     if t0 >= data.wheel_t[-1]:
-        raise DataError(
-            log.name, "no wheel sample after the first fix and the first heading", "check the streams' clocks"
-        )
+        raise DataError(name, "no wheel sample after the first fix and the first heading", "check the streams' clocks")
     return t0
 
 
 def _start_state(
-    data: Measurements, t0: float, config: Config, parameters: FilterParameters, warm_start: WarmStart | None
+    data: Measurements,
+    t0: float,
+    icrs: tuple[Floats, Floats],
+    parameters: FilterParameters,
+    warm_start: WarmStart | None,
 ) -> tuple[Floats, Floats]:
     fix = int(np.searchsorted(data.gnss_t, t0, side="right")) - 1
     sample = int(np.searchsorted(data.heading_t, t0, side="right")) - 1
@@ -230,30 +185,32 @@ def _start_state(
     forward, right = parameters.antenna_forward, parameters.antenna_right
     north = data.gnss_z[fix, 0] - (forward * math.cos(psi) - right * math.sin(psi))
     east = data.gnss_z[fix, 1] - (forward * math.sin(psi) + right * math.cos(psi))
-    icrs, icr_std = _initial_icrs(config)
-    x0 = np.array([north, east, psi, *icrs])
-    P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], icr_std**2, icr_std**2, icr_std**2])
+    x0 = np.array([north, east, psi, *icrs[0]])
+    P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], *(icrs[1] ** 2)])
     if warm_start is not None:
         x0[3:], P0[3:, 3:] = warm_start.icrs_m, warm_start.covariance_m2
     return x0, P0
 
 
-def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
-    """Return the ICRs at the start and their standard deviation [m].
+def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Floats]:
+    """Return the ICRs at the start (3,) and their standard deviations (3,) [m]: configured, else found, else preset.
 
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
     settings, half = config.filter, half_width_m(config.robot.track_width_m)
     paper = settings.preset == "paper"
-    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
+    std = settings.initial_icr_std_m
+    if found is not None and not paper and given == (None, None, None):
+        return np.array(found.icrs_m), np.array(found.std_m) if std is None else np.full(3, std)
+    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
     if not paper:
         right, left = max(right, half), min(left, -half)
     away = max(abs(right - half), abs(left + half), abs(x))
     default_std = PAPER_INITIAL_ICR_STD_M if paper else max(half, away)
-    return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
+    return np.array([right, left, x]), np.full(3, std if std is not None else default_std)
 
 
 def _terrain_icr_std_m(config: Config) -> float:
@@ -288,16 +245,6 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     """
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
-
-
-def antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
-    """Return the antenna's place in the body frame, forward and right [m]: configured, else the log's own, else 0."""
-    forward, right = log.antenna_m if log.antenna_m is not None else (0.0, 0.0)
-    given = config.frames
-    return (
-        forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
-        right if given.antenna_right_m == "auto" else given.antenna_right_m,
-    )
 
 
 def _parameters(

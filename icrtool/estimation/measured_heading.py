@@ -1,54 +1,31 @@
-"""Headings that a robot still has when it goes blind: its gyro's, or its attitude sensor's, at the states of a run."""
+"""Headings that a robot still has without GNSS: its gyro's, or its attitude sensor's, at the states of a run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
 import numpy as np
 
+from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.run import Run
 from icrtool.records.tables import Floats, Ints
-
-if TYPE_CHECKING:
-    from icrtool.estimation.fit import FilterRun
 
 LONGEST_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredHeading:
-    """Where the robot pointed by a sensor of its own, at the states of a run.
-
-    Attributes
-    ----------
-    kind : ``heading``: an attitude, its direction is taken as told; ``gyro``: an integrated turn rate, which starts
-        from the reference heading and is given scale and bias by the way outside the block
-    angle_rad : (n,), clockwise, unwrapped
-    """
-
-    kind: Literal["heading", "gyro"]
-    angle_rad: Floats
-
-
-def measured_headings(run: FilterRun) -> tuple[MeasuredHeading, ...]:
+def measured_headings(run: Run) -> tuple[MeasuredHeading, ...]:
     """Return the headings measured apart from the position reference, a gyro's before an attitude's.
 
     A heading read from the same topic as the position is the reference's own and is left out, like one that does not
     cover the run.
     """
-    found, log = [], run.log
+    found, sensors = [], run.sensors
     stamps = run.table.stamp_ns
-    if log.gyro is not None and _covers(log.gyro.stamp_ns, stamps):
-        found.append(MeasuredHeading("gyro", _integrate(log.gyro.stamp_ns, log.gyro.rate_radps, stamps)))
-    topics = {stream.role: stream.topic for stream in log.streams}
-    of_reference = "heading" in topics and topics["heading"] == topics.get("gnss")
-    if not of_reference and _covers(log.heading.stamp_ns, stamps):
-        check = run.heading_check
-        told = np.unwrap((-1.0 if check.applied_mirror else 1.0) * log.heading.heading_rad) - check.applied_offset_rad
-        found.append(
-            MeasuredHeading("heading", np.interp(_since(stamps, stamps), _since(log.heading.stamp_ns, stamps), told))
-        )
+    if sensors.gyro is not None and _covers(sensors.gyro.stamp_ns, stamps):
+        found.append(MeasuredHeading("gyro", _integrate(sensors.gyro.stamp_ns, sensors.gyro.rate_radps, stamps)))
+    if not sensors.heading_from_position and _covers(sensors.headings.stamp_ns, stamps):
+        turned = np.unwrap(sensors.headings.heading_rad)
+        angle = np.interp(_since(stamps, stamps), _since(sensors.headings.stamp_ns, stamps), turned)
+        found.append(MeasuredHeading("heading", angle))
     return tuple(found)
 
 

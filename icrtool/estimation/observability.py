@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icrtool.kernels.trials import Drive
 from icrtool.kernels.window_errors import NEUTRAL, displace, move
-from icrtool.records.run import DrivenRun, drive_of, half_width_m
-from icrtool.records.tables import Floats
+from icrtool.records.run import ICR_COLUMNS, half_width_m
+from icrtool.records.tables import Floats, States
 
 Excited = Literal["shown", "weak", "not shown"]
 
-ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 WINDOW_M = 2.0
@@ -75,12 +75,14 @@ class Excitation:
         }
 
 
-def judge_excitation(run: DrivenRun) -> Excitation:
-    """Judge which ICRs a drive could show.
+def find_excitation(table: States, drive: Drive, track_width_m: float | None) -> Excitation:
+    """Return which ICRs a drive could show.
 
     Parameters
     ----------
-    run : a finished run, or one read back
+    table : the recorded states
+    drive : the same for the kernels
+    track_width_m : b, None where not known
 
     Returns
     -------
@@ -92,10 +94,8 @@ def judge_excitation(run: DrivenRun) -> Excitation:
     own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are marginalised. It
     says what a drive could tell at best, not what the filter made of it.
     """
-    table = run.table
-    drive = drive_of(run)
     dt = np.where(drive.gap, 0.0, drive.dt_s)
-    p = _nominal(run)
+    p = _nominal(table, track_width_m)
     width = float(p[0] - p[1])
     way = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
     rows = np.unique(np.searchsorted(way, np.arange(0.0, float(way[-1]), WINDOW_M)))
@@ -118,7 +118,7 @@ def judge_excitation(run: DrivenRun) -> Excitation:
         float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
         float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),
     )  # fmt: skip
-    stds = dict(zip(ICRS, (float(value) for value in std), strict=True))
+    stds = dict(zip(ICR_COLUMNS, (float(value) for value in std), strict=True))
     verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}
     return Excitation(
         std_m=stds,
@@ -131,11 +131,10 @@ def judge_excitation(run: DrivenRun) -> Excitation:
     )
 
 
-def _nominal(run: DrivenRun) -> Floats:
+def _nominal(table: States, track_width_m: float | None) -> Floats:
     """Return parameters (7,) near which to ask: the run's final ICRs where they can be, else those of the width."""
-    table = run.table
     right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    half = half_width_m(run.track_width_m)
+    half = half_width_m(track_width_m)
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
     return np.array([right, left, x, *NEUTRAL[3:]])

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from icrtool.kernels.open_loop import open_loop_path
-from icrtool.records.run import drive_through, toy_drive
+from icrtool.records.run import Run, make_drive, straight_drive
 from icrtool.records.tables import Bools, Floats, States
-
-if TYPE_CHECKING:
-    from icrtool.estimation.fit import FilterRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,27 +26,36 @@ class OdometryPath:
     end_error_m: float
 
 
-def icr_odometry(run: FilterRun) -> OdometryPath:
-    """Return the path with the ICRs the run ended with."""
-    table = run.table
-    return _path(
-        table,
-        run.in_gap,
-        float(table.y_icr_right_m[-1]),
-        float(table.y_icr_left_m[-1]),
-        float(table.x_icr_m[-1]),
-    )
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Both paths of a run: with the ICRs it ended with, and without slip (None where the track width is not known)."""
+
+    icr: OdometryPath
+    no_slip: OdometryPath | None
 
 
-def no_slip_odometry(run: FilterRun) -> OdometryPath | None:
-    """Return the path of the no-slip model (Eqs. 38-39); None where the track width is not known."""
-    width = run.config.robot.track_width_m
-    return _path(run.table, run.in_gap, width / 2, -width / 2, 0.0) if width is not None else None
+def odometry(run: Run) -> Odometry:
+    """Return the wheels-only paths of a run; run.json holds their end errors as ``odometry``."""
+    return drive_odometry(run.table, run.in_gap, run.track_width_m)
+
+
+def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) -> Odometry:
+    """Return the path with the final ICRs, and that of the no-slip model (Eqs. 38-39).
+
+    Parameters
+    ----------
+    table : the recorded states
+    in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
+    track_width_m : b, None where not known
+    """
+    icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
+    b = track_width_m
+    return Odometry(_path(table, in_gap, *icrs), _path(table, in_gap, b / 2, -b / 2, 0.0) if b is not None else None)
 
 
 def load_kernels() -> None:
     """Have the compiled kernel ready, before there is a run."""
-    open_loop_path(toy_drive(), 1.0, -1.0, 0.0, 0, 1)
+    open_loop_path(straight_drive(), 1.0, -1.0, 0.0, 0, 1)
 
 
 def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:
@@ -61,7 +66,7 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
     Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
-    drive = drive_through(table, in_gap, np.zeros(len(table), np.bool_))
+    drive = make_drive(table, in_gap, np.empty((0, 2), np.int64))
     north, east = np.empty(len(table)), np.empty(len(table))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0

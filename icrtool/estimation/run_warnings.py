@@ -1,24 +1,19 @@
-"""What a user should know before trusting a run, in words."""
+"""What a user should know before trusting a run, as sentences."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_process_position_mps
-from icrtool.estimation.noise_adaptation import AdaptedRun
-from icrtool.estimation.summary import separation_multiplier
 from icrtool.kernels.ekf import GATED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.tables import Floats, RobotLog, States
+from icrtool.records.run import MeasurementOutcome
+from icrtool.records.tables import Floats, States
 
-if TYPE_CHECKING:
-    from icrtool.records.run import MeasurementOutcome
-
-LITTLE_WAY_M, LITTLE_TURN_RAD = 1.0, math.radians(20.0)
+SHORT_DRIVE_M, SMALL_TURN_RAD = 1.0, math.radians(20.0)
 """What drives and turns less has shown nothing of the ICRs."""
 
 SMALLEST_MULTIPLIER = 0.9
@@ -28,34 +23,34 @@ LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not taken for even ones."""
 
 
-def adaptation_notes(name: str, config: Config, adapted: AdaptedRun) -> list[str]:
-    """Say what was done about clocks and wheels that contradict the position reference."""
-    notes = []
-    if config.frames.reference_delay_s == "auto" and adapted.reference_delay_s:
-        side = "late" if adapted.reference_delay_s > 0 else "early"
-        notes.append(
-            f"{name}: the position reference is {abs(adapted.reference_delay_s):.2f} s {side} against the wheels: "
-            "taken out; frames.reference_delay_s sets it"
+def noise_warnings(name: str, config: Config, reference_delay_s: float, process_position_mps: float) -> list[str]:
+    """Return what was done about clocks and wheels that contradict the position reference."""
+    found = []
+    if config.frames.reference_delay_s == "auto" and reference_delay_s:
+        relation = "lags" if reference_delay_s > 0 else "leads"
+        found.append(
+            f"{name}: the position reference {relation} the wheels by {abs(reference_delay_s):.2f} s: "
+            "corrected; frames.reference_delay_s sets it"
         )
-    if adapted.process_position_mps != configured_process_position_mps(config):
-        notes.append(
+    if process_position_mps != configured_process_position_mps(config):
+        found.append(
             f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
-            f"position noise raised to {adapted.process_position_mps:.1f} m/s; filter.process_position_mps sets it"
+            f"position noise raised to {process_position_mps:.1f} m/s; filter.process_position_mps sets it"
         )
-    return notes
+    return found
 
 
-def doubts(name: str, table: States, gnss: MeasurementOutcome, width: float | None = None) -> list[str]:
-    """Return what a user should know before trusting the numbers; `width` is that of the track [m], where known."""
+def run_warnings(name: str, table: States, gnss: MeasurementOutcome, multiplier: float | None) -> list[str]:
+    """Return what a user should know before trusting the numbers; `multiplier` is (y_r - y_l) / b where b is known."""
     found = []
     distance, turns = float(table.distance_m[-1]), _turns(table)
-    if distance < LITTLE_WAY_M and not turns:
+    if distance < SHORT_DRIVE_M and not turns:
         found.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
     elif not turns:
         found.append("the robot hardly turned: the ICRs are not observable on a straight drive")
-    elif width is not None and separation_multiplier(table, width) < SMALLEST_MULTIPLIER:
+    elif multiplier is not None and multiplier < SMALLEST_MULTIPLIER:
         found.append(
-            f"the ICRs are {separation_multiplier(table, width):.2f} of the track width apart; slip makes it "
+            f"the ICRs are {multiplier:.2f} of the track width apart; slip makes it "
             "more than 1: check robot.track_width_m, wheel radius and sides"
         )
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
@@ -69,11 +64,11 @@ def doubts(name: str, table: States, gnss: MeasurementOutcome, width: float | No
             f"{100 * gated / seen:.0f} % of the fixes were rejected: "
             "clocks, antenna place or fix quality do not fit the wheels"
         )
-    return [f"{name}: {doubt}" for doubt in found]
+    return [f"{name}: {warning}" for warning in found]
 
 
-def antenna_doubt(log: RobotLog, config: Config, table: States, covariance: Floats) -> list[str]:
-    """Say that both ICRs lie to one side of a position reference whose place on the robot nobody told.
+def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
+    """Warn where both ICRs lie to one side of a position sensor whose place on the robot is not known.
 
     Parameters
     ----------
@@ -84,7 +79,7 @@ def antenna_doubt(log: RobotLog, config: Config, table: States, covariance: Floa
     The drive cannot tell an antenna off the centre line from sides that slip unequally: only the difference shows
     (`icrtool.calibration.calibrate`). So nothing is moved.
     """
-    if log.antenna_m is not None or config.frames.antenna_right_m != "auto" or not _turns(table):
+    if not _turns(table):
         return []
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
@@ -95,7 +90,7 @@ def antenna_doubt(log: RobotLog, config: Config, table: States, covariance: Floa
     where = f"{abs(middle):.2f} m"
     return [
         (
-            f"{log.name}: both ICRs lie {where} to the {side} of the antenna (the position's sensor): it is {other} of "
+            f"{name}: both ICRs lie {where} to the {side} of the antenna (the position's sensor): it is {other} of "
             f"the centre line, or the sides slip unequally; if it is {where} {other}, set "
             f"frames.antenna_right_m={-middle:.2f} (and antenna_forward_m: x_icr is counted from it too)"
         )
@@ -108,8 +103,8 @@ def _turns(table: States) -> bool:
     A parked robot whose heading drifts has learned nothing, and one that spun on the spot has.
     """
     turned = float(np.ptp(table.heading_rad))
-    if float(table.distance_m[-1]) < LITTLE_WAY_M:
+    if float(table.distance_m[-1]) < SHORT_DRIVE_M:
         width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
         ahead = np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1])
         turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
-    return turned >= LITTLE_TURN_RAD
+    return turned >= SMALL_TURN_RAD

@@ -1,4 +1,4 @@
-"""Smooth: the offline-best trajectory and ICRs of a finished run, every state knowing the whole log."""
+"""Smooth: the best trajectory and ICRs offline, every state knowing the whole log."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from dataclasses import fields
 
 import numpy as np
 
-from icrtool.estimation.filter_setup import set_up_filter
-from icrtool.estimation.fit import STATE_COLUMNS, FilterRun
+from icrtool.config import Config
+from icrtool.estimation.run_filter import Filtered, set_up_again
 from icrtool.kernels.smoother import run_smoother
+from icrtool.records.run import STATE_COLUMNS, Run
 from icrtool.records.tables import Floats, States
 
 
-def smooth(run: FilterRun) -> States:
+def smooth(run: Run | Filtered, config: Config) -> States:
     """Run the RTS smoother over a finished run.
 
     Parameters
     ----------
-    run : what `icrtool.fit` returned
+    run : what `icrtool.fit` returned, or the filter stage within it
+    config : that of the run
 
     Returns
     -------
@@ -29,18 +31,7 @@ def smooth(run: FilterRun) -> States:
     The filter's noises are the smoother's: where the wheels contradict the reference, the smoothed ICRs still follow
     process noise of `filter.process_icr_mps`.
     """
-    check = run.heading_check
-    setup = set_up_filter(
-        run.log,
-        run.config,
-        heading_mirrored=check.applied_mirror,
-        heading_offset_rad=check.applied_offset_rad,
-        heading_std_at_least_rad=check.applied_std_rad,
-        heading_correlation_at_least_s=check.applied_correlation_s,
-        process_position_mps=run.process_position_mps,
-        changes_s=run.changes_s,
-        warm_start=run.warm_start,
-    )
+    setup = set_up_again(run, config)
     smoothed = run_smoother(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     std = np.sqrt(np.maximum(smoothed.variance, 0.0))
     columns: dict[str, Floats] = {}
@@ -51,7 +42,7 @@ def smooth(run: FilterRun) -> States:
     return States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
 
 
-def _distance(run: FilterRun, x: Floats) -> Floats:
+def _distance(run: Run | Filtered, x: Floats) -> Floats:
     """Return the path length (n,) [m] with the smoothed ICRs, as Eqs. 8-12 have it; gaps add nothing."""
     table = run.table
     right, left, ahead = x[:, 3], x[:, 4], x[:, 5]

@@ -4,76 +4,131 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool import __version__
+from icrtool.alignment.gnss_quality import CLASSES
+from icrtool.config import Config
+from icrtool.estimation.observability import find_excitation
+from icrtool.estimation.odometry import Odometry, drive_odometry
+from icrtool.estimation.run_filter import Filtered
+from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings
 from icrtool.kernels.ekf import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.run import RUN_SCHEMA
-from icrtool.records.tables import Floats, Ints, RobotLog, States
-
-if TYPE_CHECKING:
-    from icrtool.alignment.stream_delays import StreamDelays
-    from icrtool.alignment.wheel_alignment import WheelCheck
-    from icrtool.estimation.filter_setup import WarmStart
-    from icrtool.estimation.fit import FilterRun
-    from icrtool.estimation.observability import Excitation
-    from icrtool.records.run import MeasurementOutcome
-
-
-ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+from icrtool.records.measurements import Fixes, FixStatistics, Measurements
+from icrtool.records.plain_data import plain
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
+from icrtool.records.tables import Bools, Floats, Ints, RobotLog, States
 
 SETTLED_S = 2.0
-"""An estimate has arrived when it stays within 10 % of its way for this long: an overshoot passes through."""
+"""An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
 
 SMALLEST_CHANGE_M = 0.03
-"""An ICR whose estimate moved less than this from its start has no rise to time."""
+"""An ICR whose estimate moved less than this from its start has no convergence to time."""
+
+MOST_LISTED = 50
+"""Jumps of the position that run.json lists."""
 
 
-def run_summary(
-    run: FilterRun, wheels: WheelCheck, delays: StreamDelays, excitation: Excitation, *, reference_delay_s: float
-) -> dict[str, Any]:
-    """Return all of a run as plain data for run.json; `reference_delay_s` is how far the fixes' stamps were moved."""
-    log, config, table, fixes = run.log, run.config, run.table, run.fix_quality
-    return {
-        "schema": RUN_SCHEMA,
-        "tool_version": __version__,
-        "log": log.name,
-        "inputs": [asdict(file) for file in log.inputs],
-        "config": config.effective(),
-        "streams": [asdict(stream) for stream in log.streams],
-        "warnings": list(run.warnings),
-        "drive": drive_summary(table),
-        "icr": icr_summary(table, run.convergence) | {"final_covariance_m2": run.covariance[3:, 3:].tolist()},
-        "terrain": run.terrain.summary(),
-        "segments": segment_summary(table, run.changes_s),
-        "gnss": gnss_summary(log, run.gnss, fixes.down_weighted)
-        | delays.gnss_summary()
-        | fixes.summary(*used_and_rejected(run.gnss)),
-        "heading": run.heading_check.summary() | delays.heading_summary(),
-        "wheels": wheels.summary(),
-        "outages_ns": run.outages_ns.tolist(),
-        "rtk_losses_ns": fixes.losses_ns.tolist(),
-        "wheel_gaps_ns": [[int(table.stamp_ns[k]), int(table.stamp_ns[k + 1])] for k in np.flatnonzero(run.in_gap)],
-        "filter": {
-            "preset": config.filter.preset,
-            "process_position_mps": run.process_position_mps,
-            "reference_delay_s": reference_delay_s,
-            "states": len(table),
-            "warm_start": _began_with(run.warm_start),
-            **nis_summary(run.gnss, run.heading),
-        },
-        "excitation": excitation.summary(),
-    }
+def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, config: Config) -> dict[str, Any]:
+    """Return all numbers and warnings of a run as plain data, equal to what run.json gives back.
+
+    Parameters
+    ----------
+    log : as it was read
+    measurements : what the alignment made of it
+    filtered : what the filter made of that
+    config : the effective configuration
+    """
+    table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
+    terrain, beyond = filtered.terrain.within(float(table.t_s[-1]))
+    convergence = converge(table, min(terrain.times_s, default=None))
+    excitation = find_excitation(table, make_drive(table, filtered.in_gap, filtered.outages_ns), width)
+    multiplier = separation_multiplier(table, width) if width is not None else None
+    warnings = [
+        *measurements.warnings,
+        *run_warnings(log.name, table, filtered.gnss, multiplier),
+        *([] if measurements.antenna_is_known else antenna_warning(log.name, table, filtered.covariance)),
+        *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
+        *noise_warnings(log.name, config, filtered.reference_delay_s, filtered.process_position_mps),
+        *(f"{log.name}: {sentence}" for sentence in excitation.sentences),
+    ]
+    document: dict[str, Any] = plain(
+        {
+            "schema": RUN_SCHEMA,
+            "tool_version": __version__,
+            "log": log.name,
+            "inputs": [asdict(file) for file in log.inputs],
+            "config": config.effective(),
+            "streams": [asdict(stream) for stream in log.streams],
+            "warnings": warnings,
+            "alignment": {name: asdict(finding) for name, finding in measurements.findings.items()},
+            "drive": drive_summary(table),
+            "icr": icr_summary(table, convergence)
+            | {"separation_multiplier": multiplier, "final_covariance_m2": filtered.covariance[3:, 3:]},
+            "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
+            "terrain": terrain.summary(),
+            "segments": segment_summary(table, terrain.times_s),
+            "gnss": gnss_summary(log, filtered.gnss, sensors.fixes.down_weighted)
+            | measurements.sections["gnss"]
+            | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss, filtered.reference_delay_s),
+            "heading": measurements.sections["heading"],
+            "wheels": measurements.sections["wheels"],
+            "outages_ns": filtered.outages_ns,
+            "rtk_losses_ns": sensors.losses_ns,
+            "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
+            "filter": {
+                "preset": config.filter.preset,
+                "process_position_mps": filtered.process_position_mps,
+                "reference_delay_s": measurements.position_delay_s + filtered.reference_delay_s,
+                "heading_correlation_s": sensors.heading_correlation_s,
+                "heading_from_position": sensors.heading_from_position,
+                "antenna_m": sensors.antenna_m,
+                "states": len(table),
+                "warm_start": warm_start_summary(filtered.began_with),
+                "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
+            }
+            | nis_summary(filtered.gnss, filtered.heading),
+            "excitation": excitation.summary(),
+        }
+    )
+    return document
 
 
-def _began_with(warm_start: WarmStart | None) -> dict[str, Any] | None:
+def odometry_summary(found: Odometry) -> dict[str, Any]:
+    """Return how far from the filter's last position the wheels-only paths end."""
+    paths = {"icr": found.icr, "no_slip": found.no_slip}
+    return {name: {"end_error_m": path.end_error_m} if path is not None else None for name, path in paths.items()}
+
+
+def warm_start_summary(warm_start: WarmStart | None) -> dict[str, Any] | None:
+    """Return what a run was warm-started with, None where it was not."""
     if warm_start is None:
         return None
-    return {"icrs_m": warm_start.icrs_m.tolist(), "covariance_m2": warm_start.covariance_m2.tolist()}
+    return {"icrs_m": warm_start.icrs_m, "covariance_m2": warm_start.covariance_m2}
+
+
+def class_summary(
+    fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome, reference_delay_s: float
+) -> dict[str, Any]:
+    """Return how many fixes of each class there were and what became of them, and the jumps of the position."""
+    classes, (used, rejected) = {}, used_and_rejected(outcome)
+    for code, name in CLASSES.items():
+        rows = fixes.fix_class == code
+        if rows.any():
+            counted = {"fixes": rows, "used": rows & used, "rejected": rows & rejected}
+            counted |= {"down_weighted": rows & fixes.down_weighted, "sold_as_fixed": rows & fixes.misreported}
+            counts = {key: int(np.count_nonzero(marked)) for key, marked in counted.items()}
+            classes[name] = counts | {"std_m": statistics.std_m[name], "step_std_m": statistics.step_std_m[name]}
+    stamps = statistics.jump_stamp_ns - round(reference_delay_s * 1e9)
+    jumps = list(zip(stamps, statistics.jump_m, strict=True))
+    return {
+        "classes": classes,
+        "jumps": len(jumps),
+        "jump_list": [{"stamp_ns": stamp, "size_m": size} for stamp, size in jumps[:MOST_LISTED]],
+    }
 
 
 def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:
@@ -82,7 +137,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     Returns
     -------
     dict
-        By column: seconds at which the estimate has gone 10 % and 90 % of the way from its start to its settled
+        By column: seconds at which the estimate has gone 10 % and 90 % of the change from its start to its settled
         value (median over the second half of the run), or None where it hardly moved or never settled.
 
     Notes
@@ -107,7 +162,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     return rises
 
 
-def _first_stay(until: Ints, inside: NDArray[np.bool_]) -> int | None:
+def _first_stay(until: Ints, inside: Bools) -> int | None:
     """Return the first row from which `inside` holds up to row `until` of it, which must be one; None if none does."""
     outside = np.concatenate([[0], np.cumsum(~inside)])
     stays = inside & (outside[until] == outside[:-1]) & (until < len(inside))
@@ -132,10 +187,8 @@ def drive_summary(table: States) -> dict[str, float]:
     return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
 
 
-def icr_summary(
-    table: States, convergence: dict[str, tuple[float, float] | None]
-) -> dict[str, dict[str, float | None]]:
-    """Return the ICRs: final, mean and standard deviation over the states after convergence, and rise times."""
+def icr_summary(table: States, convergence: dict[str, tuple[float, float] | None]) -> dict[str, Any]:
+    """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did."""
     settled = max((rise[1] for rise in convergence.values() if rise is not None), default=0.0)
     after = table.t_s >= settled
     columns: dict[str, Floats] = {column: getattr(table, column) for column in ICR_COLUMNS}
@@ -147,6 +200,7 @@ def icr_summary(
         "convergence_s": {
             column: rise[1] - rise[0] if rise is not None else None for column, rise in convergence.items()
         },
+        "convergence_span_s": dict(convergence),
     }
 
 
@@ -176,13 +230,13 @@ def separation_multiplier(table: States, track_width_m: float) -> float:
     return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
 
 
-def used_and_rejected(outcome: MeasurementOutcome) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def used_and_rejected(outcome: MeasurementOutcome) -> tuple[Bools, Bools]:
     """Return which measurements (m,) moved the filter, and which its gate refused."""
     rejected = outcome.code == GATED
     return (outcome.code > UNSEEN) & ~rejected, rejected
 
 
-def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: NDArray[np.bool_]) -> dict[str, Any]:
+def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: Bools) -> dict[str, Any]:
     """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
     used, _ = used_and_rejected(gnss)
     difference = gnss.difference[used & ~down_weighted]

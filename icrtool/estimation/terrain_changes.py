@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.estimation.step_detection import Step, find_steps
-from icrtool.estimation.summary import ICR_COLUMNS
+from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.tables import Bools, Complexes, Floats, Ints, States
 
 FALSE_ALARMS_PER_HOUR = 0.1

@@ -103,7 +103,7 @@ def smooth_headings(events: HeadingEvents, passes: HeadingPasses) -> tuple[Float
     k = events.h.shape[1]
     F = np.tile(np.eye(k), (len(events.z) - 1, 1, 1))
     F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.dG[1:]
-    solved: Floats = np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1])
+    solved = np.asarray(np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]), np.float64)
     gains = np.ascontiguousarray(solved.transpose(0, 2, 1))
     x, P = passes.x.copy(), passes.P.copy()
     _backward(gains, passes.x_predicted, passes.P_predicted, x, P)

@@ -25,8 +25,8 @@ LOSS_SIGMAS = 2.0
 SMALLEST_SCALE = 1e-9
 """Residuals of an exact fit have no spread; this keeps their weights finite."""
 
-SETTLED = 0.01
-"""A Gauss-Newton step below this share of the standard deviation is the last one."""
+SETTLED = 0.03
+"""A Gauss-Newton step shorter than this in standard deviations, all parameters together, is the last one."""
 
 MOST_HALVINGS = 6
 
@@ -139,7 +139,7 @@ def robust_least_squares(
         information = information + np.diag(pull)
         gradient = gradient + pull * (x - prior_mean)
         step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
-        if np.all(np.abs(step) * np.sqrt(np.diag(information)) < SETTLED):
+        if -float(gradient @ step) < SETTLED**2:
             # too short to evaluate for: residuals follow it to first order
             x, residuals, converged = x + step, residuals + jacobian @ step, True
             break

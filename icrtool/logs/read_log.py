@@ -99,6 +99,7 @@ def read_log(path: str | Path, config: Config | None = None, progress: Progress 
     ----------
     path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``
     config : topics, robot and frames; default: all found by type and content
+    progress : called with the share of the bytes that are read
 
     Raises
     ------

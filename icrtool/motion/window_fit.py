@@ -17,7 +17,7 @@ from icrtool.errors import DataError
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.window_errors import move, window_misses
 from icrtool.motion.window_models import CONSTANT, WindowModel, base_parameters, basis_of, usual_terms
-from icrtool.records.run import DrivenRun, drive_of, half_width_m
+from icrtool.records.run import Run, drive_of, half_width_m
 from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
@@ -120,12 +120,12 @@ class WindowFit:
         return right, left, x
 
 
-def window_spacing_m(run: DrivenRun) -> float:
+def window_spacing_m(run: Run) -> float:
     """Return how far apart windows start where a run is fitted many times [m]."""
     return max(EVERY_M, float(run.table.distance_m[-1]) / MOST_STARTS)
 
 
-def cut_windows(run: DrivenRun, lengths_m: Iterable[float] = WINDOWS_M, every_m: float = EVERY_M) -> Windows:
+def cut_windows(run: Run, lengths_m: Iterable[float] = WINDOWS_M, every_m: float = EVERY_M) -> Windows:
     """Cut a run into overlapping windows of way; those across a gap or ending in an outage are left out.
 
     Raises

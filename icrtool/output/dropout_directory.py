@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,23 +14,29 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.output.atomic_directory import whole_directory
-from icrtool.output.dropout_content import DropoutContent
+from icrtool.output.figures.drawing_process import Drawer, DrawingHere
+from icrtool.output.figures.dropout_figures import ReportFigures
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.tables.model_comparison import LADDER_COLUMNS, ladder_document, ladder_rows
-from icrtool.records.dropout import BlindDrive, DropoutReport, ModelResult
+from icrtool.output.trials_file import trials_file
+from icrtool.records.dropout import ExampleTrial, ModelResult
+from icrtool.records.tables import Ints
 
 REPORT_FILE = "report.json"
+TRIALS_FILE = "trials.parquet"
 DROPOUT_DIRECTORY = "dropout"
+"""Where a report stands in its run directory."""
 DROPOUT_SCHEMA = "icrtool/dropout/1"
 SCHEMA_FAMILY = "icrtool/dropout/"
 
 KNOWS = {
-    "icr": "the way up to each start",
+    "icr": "the distance up to each start",
     "no_slip": "the track width",
-    "icr_final": "all of the way (in sample)",
+    "icr_final": "all of the drive (in sample)",
 }
 """What the ICRs of a model were learned from."""
 
@@ -39,20 +45,61 @@ ERROR_COLUMNS = ("icr", "no_slip")
 Cell = str | int | float | None
 
 
-def dropout_directory(run_directory: Path) -> AbstractContextManager[Path]:
-    """Give a hidden directory to write a report into; it becomes ``RUN/dropout`` when the block ends well.
+@contextmanager
+def report_writer(directory: Path, drawer: Drawer, stamp_ns: Ints | None = None) -> Iterator[ReportWriter]:
+    """Give a writer of one report; its files appear as `directory` when the block ends well, or not at all.
+
+    Parameters
+    ----------
+    directory : where the report shall appear; an old report there is replaced
+    drawer : what draws the figures
+    stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
 
     Raises
     ------
     OutputError
         Something that is not a dropout report stands in its place, or the disk does not take it.
     """
-    place = run_directory / DROPOUT_DIRECTORY
-    return whole_directory(place, is_dropout_directory, kind="dropout report")
+    with (
+        whole_directory(directory, is_dropout_directory, kind="dropout report") as partial,
+        drawer.into(partial / "plots") as draw,
+        trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink,
+    ):
+        yield ReportWriter(partial, ReportFigures(draw), sink)
+
+
+class ReportWriter:
+    """Writes one report as it grows; `report_writer` gives one.
+
+    Attributes
+    ----------
+    sink : takes every single trial, None where they are not written
+    """
+
+    def __init__(self, directory: Path, figures: ReportFigures, sink: ErrorSink | None) -> None:
+        self._directory = directory
+        self._figures = figures
+        self.sink = sink
+
+    def watch(self, report: DropoutReport) -> None:
+        """Have those figures drawn whose numbers the growing report holds."""
+        self._figures.draw_ready(report)
+
+    def finish(self, report: DropoutReport) -> None:
+        """Have the last figures drawn, and write the tables."""
+        self._figures.draw_rest(report)
+        write_tables(report, self._directory)
+
+
+def write_report(report: DropoutReport, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
+    """Write a finished report, whole or not at all; see `DropoutReport.write`."""
+    with report_writer(directory, DrawingHere(plots)) as writer:
+        writer.watch(report)
+        writer.finish(report)
 
 
 def is_dropout_directory(directory: Path) -> bool:
-    """Say whether a directory is a dropout report of ours, of whatever version."""
+    """Return whether a directory is a dropout report of ours, of whatever version."""
     try:
         schema = json.loads((directory / REPORT_FILE).read_bytes())["schema"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -60,7 +107,7 @@ def is_dropout_directory(directory: Path) -> bool:
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
 
 
-def write_content(content: DropoutContent, directory: Path) -> None:
+def write_tables(report: DropoutReport, directory: Path) -> None:
     """Write summary.csv, histogram.csv, worst.csv and report.json into a directory, and ladder.csv where there is one.
 
     Raises
@@ -68,23 +115,23 @@ def write_content(content: DropoutContent, directory: Path) -> None:
     OSError
         A file cannot be written.
     """
-    summary = content.report.summary_columns()
+    summary = report.summary_columns()
     (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
-    (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(content.report)))
-    (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(content.worst)))
-    if content.ladder is not None:
-        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(content.ladder)))
-    (directory / REPORT_FILE).write_bytes(json_bytes(report_document(content)))
+    (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(report)))
+    (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(report.worst)))
+    if report.comparison is not None:
+        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(report.comparison)))
+    (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
-def report_document(content: DropoutContent) -> dict[str, Any]:
+def report_document(report: DropoutReport) -> dict[str, Any]:
     """Return what report.json holds."""
-    report, run = content.report, content.run_summary
+    run = report.run_summary
     return {
         "schema": DROPOUT_SCHEMA,
         "tool_version": __version__,
         "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
-        "reference": f"the {'smoother' if content.smoothed else 'filter'}'s estimate at the end of the blind way",
+        "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
         "starts": report.states,
         "starts_standing": report.standing,
         "tolerance_m": TOLERANCE_M,
@@ -97,9 +144,11 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
         },
         "models": [_model_document(result, report) for result in report.results],
         "trials": _count_documents(report),
-        "budgets": [one._asdict() for one in content.budgets],
-        "by_turning": [one._asdict() for one in content.by_turning],
-        "ladder": ladder_document(content.ladder) if content.ladder is not None else {"left_out": content.no_ladder},
+        "budgets": [one._asdict() for one in report.budgets],
+        "by_turning": [one._asdict() for one in report.by_turning],
+        "ladder": ladder_document(report.comparison)
+        if report.comparison is not None
+        else {"left_out": report.no_comparison},
         "gates": [
             {
                 **asdict(verdict.gate),
@@ -108,9 +157,9 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
                 "passed": verdict.passed,
                 "verdict": verdict.line(),
             }
-            for verdict in content.verdicts
+            for verdict in report.verdicts
         ],
-        "passed": content.passed,
+        "passed": report.passed,
         "outages": [
             {
                 "kind": one.kind,
@@ -120,10 +169,10 @@ def report_document(content: DropoutContent) -> dict[str, Any]:
                 "end_error_m": one.end_error_m,
                 "max_error_m": one.max_error_m,
             }
-            for one in content.outages
+            for one in report.outages
         ],
-        "worst": [_drive_document(drive) for drive in content.worst],
-        "examples": [_drive_document(drive) for drive in content.examples],
+        "worst": [_drive_document(drive) for drive in report.worst],
+        "examples": [_drive_document(drive) for drive in report.examples],
     }
 
 
@@ -168,7 +217,7 @@ def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
     ]
 
 
-def _drive_document(drive: BlindDrive) -> dict[str, Any]:
+def _drive_document(drive: ExampleTrial) -> dict[str, Any]:
     return {
         "stamp_ns": drive.stamp_ns,
         "t_s": drive.t_s,
@@ -188,7 +237,7 @@ def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
                 yield result.name, float(horizon), left, right, percent
 
 
-def _worst_rows(worst: Sequence[BlindDrive]) -> Iterator[Sequence[Cell]]:
+def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[Sequence[Cell]]:
     for rank, drive in enumerate(worst, start=1):
         document = {"rank": rank, **_drive_document(drive)}
         errors = document.pop("errors_m")

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from icrtool.estimation.fit import FilterRun
+from collections.abc import Mapping
+from typing import Any
 
 TABLE_WIDTH = 100
 """Letters in a line of a printed table."""
 
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
-"""What the numbers of a ladder's model were fitted to, by `icrtool.calibration.model_comparison.Rung.fitted`."""
+"""What the numbers of a compared model were fitted to, by `icrtool.calibration.model_comparison.Rung.fitted`."""
 
 
-def run_title(run: FilterRun) -> str:
-    """Return the log's name, and the robot's where it has one."""
-    robot = run.config.robot.name
-    return f"{run.log.name}  ({robot})" if robot else run.log.name
+def run_title(summary: Mapping[str, Any]) -> str:
+    """Return the log's name, and the robot's where it has one; `summary` is that of a run."""
+    log, robot = summary["log"], summary["config"]["robot"]["name"]
+    return f"{log}  ({robot})" if robot else str(log)
 
 
-def position_word(run: FilterRun) -> str:
+def position_word(summary: Mapping[str, Any]) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
-    return "GNSS fixes" if run.log.datum is not None else "position reference"
+    return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
 
 
 def signed(metres: float) -> str:
@@ -37,8 +35,8 @@ def length_text(metres: float) -> str:
     return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
-def way_text(metres: float) -> str:
-    """Return a length of way as ``398.5 m`` or ``36.00 km``."""
+def distance_text(metres: float) -> str:
+    """Return a distance as ``398.5 m`` or ``36.00 km``."""
     return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
 
 

@@ -17,7 +17,7 @@ ROWS_A_GROUP = 1 << 18
 
 @contextmanager
 def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
-    """Give a sink that appends trials to a new Parquet file; starts that are none are left out.
+    """Give a sink that appends trials to a new Parquet file; starts without a trial are left out.
 
     Parameters
     ----------

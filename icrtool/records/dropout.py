@@ -1,21 +1,16 @@
-"""What a dropout analysis finds: the records that tables, files and pictures show.
+"""Parts of a dropout report: what tables, files and pictures show.
 
 No kernel is here: a process that only draws them need not load numba.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import numpy as np
-
-from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary, TrialCounts
-from icrtool.records.tables import Floats, Ints
-
-if TYPE_CHECKING:
-    import pandas as pd
+from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
+from icrtool.records.tables import Floats
 
 OutageKind = Literal["forced", "real"]
 
@@ -23,11 +18,11 @@ DEFAULT_SEED = 20140311
 """Seed of the bootstrap: any number, but the same for every run and every model."""
 
 CHOICE_HORIZON_M = 10.0
-"""Where extended models are chosen, and where the ladder of models is pictured."""
+"""Where extended models are chosen, and which horizon the picture of the model comparison shows."""
 
 
 class ModelResult(NamedTuple):
-    """What one model's trials say, by horizon."""
+    """The errors of one model's trials, by horizon."""
 
     name: str
     label: str
@@ -37,70 +32,8 @@ class ModelResult(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class DropoutReport:
-    """Open-loop errors by model and horizon.
-
-    Attributes
-    ----------
-    horizons_m : (h,) ascending
-    results : one per model
-    counts : trials, and starts that were none, by horizon; the same for every model
-    states : recorded states, each a start
-    standing : of them, those at which the robot stood: their trials are near copies of one another
-    seed : of the bootstrap
-    """
-
-    name: str
-    horizons_m: Floats
-    results: tuple[ModelResult, ...]
-    counts: TrialCounts
-    states: int
-    standing: int
-    seed: int
-
-    def result(self, model: str) -> ModelResult | None:
-        """Return the result of a model, None when it was not computed."""
-        return next((result for result in self.results if result.name == model), None)
-
-    @property
-    def summary(self) -> pd.DataFrame:
-        """The rows of summary.csv as a DataFrame."""
-        import pandas as pd
-
-        return pd.DataFrame(self.summary_columns())
-
-    def summary_columns(self) -> dict[str, list[str] | Floats | Ints]:
-        """Return the columns of summary.csv: a row per model and horizon."""
-        h = self.horizons_m
-        names = [result.name for result in self.results for _ in h]
-        horizon = np.tile(h, len(self.results))
-
-        def stacked(values: Sequence[Floats]) -> Floats:
-            return np.concatenate(values) if values else np.empty(0)
-
-        summaries = [result.summary for result in self.results]
-        intervals = [result.intervals for result in self.results]
-        expected, p95 = stacked([s.expected for s in summaries]), stacked([s.p95 for s in summaries])
-        return {
-            "model": names,
-            "horizon_m": horizon,
-            "trials": np.concatenate([s.trials for s in summaries]) if summaries else np.empty(0, np.int64),
-            "expected_error_m": expected,
-            "p50_m": stacked([s.p50 for s in summaries]),
-            "p95_m": p95,
-            "max_m": stacked([s.largest for s in summaries]),
-            "expected_pct": 100.0 * expected / horizon,
-            "p95_pct": 100.0 * p95 / horizon,
-            "expected_low_m": stacked([i.expected_low for i in intervals]),
-            "expected_high_m": stacked([i.expected_high for i in intervals]),
-            "p95_low_m": stacked([i.p95_low for i in intervals]),
-            "p95_high_m": stacked([i.p95_high for i in intervals]),
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class BlindDrive:
-    """One trial: from state `start` to state `end`, the reference's path and each model's.
+class ExampleTrial:
+    """One open-loop trial: from state `start` to state `end`, the reference's path and each model's.
 
     Attributes
     ----------
@@ -133,7 +66,7 @@ class Outage:
     begin_s, end_s : seconds since the first recorded state
     distance_m : path driven through it
     end_error_m, max_error_m : forced: against the undisturbed estimate; real: miss at re-acquisition (both the same)
-    north_m, east_m : (m,) the blind path, for a picture
+    north_m, east_m : (m,) the path without GNSS, for a picture
     """
 
     kind: OutageKind
@@ -161,3 +94,80 @@ class Rung:
     fitted: str
     measured_heading: bool
     summary: Summary
+
+
+class BudgetDistance(NamedTuple):
+    """How far a model's 95th percentile stays within a budget.
+
+    Attributes
+    ----------
+    distance_m : interpolated between horizons, from 0 m at 0 m
+    beyond : the budget still held at `distance_m`, the last horizon with trials
+    between_m : horizons interpolated between
+    """
+
+    model: str
+    label: str
+    budget_m: float
+    distance_m: float
+    beyond: bool
+    between_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """One acceptance limit: ``icr.p95@10m <= 3.8``."""
+
+    text: str
+    model: str
+    metric: str
+    horizon_m: float
+    relation: str
+    bound_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether an acceptance limit was kept.
+
+    Attributes
+    ----------
+    value_m : NaN where the log has no trial of that length
+    margin_m : negative when the bound was missed
+    """
+
+    gate: Gate
+    value_m: float
+    margin_m: float
+    passed: bool
+
+    def line(self) -> str:
+        """Return the verdict in one line."""
+        word = "pass" if self.passed else "FAIL"
+        if math.isnan(self.value_m):
+            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log"
+        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m"
+
+
+class TurningSplit(NamedTuple):
+    """Expected error [m] by model over the trials that are straight, or over those that turn."""
+
+    straight: bool
+    horizon_m: float
+    trials: int
+    expected_m: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredHeading:
+    """Where the robot pointed by a sensor of its own, at the states of a run.
+
+    Attributes
+    ----------
+    kind : ``heading``: an attitude, its direction is taken as measured; ``gyro``: an integrated turn rate, which starts
+        from the reference heading and is given scale and bias by the distance outside the block
+    angle_rad : (n,), clockwise, unwrapped
+    """
+
+    kind: Literal["heading", "gyro"]
+    angle_rad: Floats

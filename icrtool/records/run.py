@@ -1,17 +1,30 @@
-"""What every analysis needs of a filter run, whether it was just made or read back."""
+"""A run: what the filter made of a log. The same record whether it was just made or read back from its directory."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from icrtool.config import Config
 from icrtool.kernels.trials import Drive
+from icrtool.records.late_output import call_output
+from icrtool.records.measurements import SensorData
 from icrtool.records.tables import Bools, Bytes, Floats, Ints, States
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
+
+ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+
+STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
+"""The state's entries, in the kernel's order."""
 
 DEFAULT_HALF_WIDTH_M = 0.3
 """Half of a small field robot, where the width is not known."""
@@ -36,38 +49,135 @@ class MeasurementOutcome:
     difference: Floats
 
 
-class DrivenRun(Protocol):
-    """A filter run, just made or read back: what the analysis needs of it."""
+@dataclass(frozen=True, slots=True)
+class WarmStart:
+    """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] to start from (Pentzer 2014, Fig. 18).
+
+    `track_width_m` is b of the robot they were learned on, None where it was not given.
+    """
+
+    icrs_m: Floats
+    covariance_m2: Floats
+    track_width_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class Run:
+    """One finished run; `icrtool.fit` makes it, `icrtool.open_run` reads it back equal.
+
+    Attributes
+    ----------
+    name : of the log
+    config : the configuration it was made with
+    table : the recorded states; `states` is the same as a DataFrame
+    in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
+    outages_ns : half-open spans without usable GNSS, (k, 2)
+    sensors : the streams as the filter used them
+    gnss, heading : what became of the fixes and headings
+    smoothed : states of the RTS smoother at the same stamps, None where they were not asked for
+    summary : equal to run.json
+    directory : where it was read from, None for one just made
+    """
+
+    name: str
+    config: Config
+    table: States
+    in_gap: Bools
+    outages_ns: Ints
+    sensors: SensorData
+    gnss: MeasurementOutcome
+    heading: MeasurementOutcome
+    smoothed: States | None
+    summary: dict[str, Any] = field(repr=False)
+    directory: Path | None = None
 
     @property
-    def name(self) -> str:
-        """Name of the log."""
-        ...
+    def states(self) -> pd.DataFrame:
+        """The recorded states, equal to states.csv."""
+        return self.table.frame()
 
     @property
-    def table(self) -> States:
-        """The recorded states."""
-        ...
-
-    @property
-    def in_gap(self) -> Bools:
-        """Whether the interval after a state is a gap in the wheel data (n,)."""
-        ...
-
-    @property
-    def outages_ns(self) -> Ints:
-        """Half-open spans without usable GNSS (k, 2)."""
-        ...
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences for the user, in the order they were found."""
+        return tuple(self.summary["warnings"])
 
     @property
     def track_width_m(self) -> float | None:
         """Distance b between the track centre lines, None where not given."""
-        ...
+        return self.config.robot.track_width_m
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """What run.json holds, the effective configuration among it."""
-        ...
+    def changes_s(self) -> tuple[float, ...]:
+        """Terrain changes, seconds since the first recorded state."""
+        return tuple(change["t_s"] for change in self.summary["terrain"]["changes"])
+
+    @property
+    def convergence_s(self) -> dict[str, tuple[float, float] | None]:
+        """By ICR column, first and last second of the 10-90 % convergence, or None."""
+        spans = self.summary["icr"]["convergence_span_s"]
+        return {name: (span[0], span[1]) if span is not None else None for name, span in spans.items()}
+
+    @property
+    def settled_s(self) -> float:
+        """When the last ICR had converged, seconds since the first recorded state; 0 where none did."""
+        return max((span[1] for span in self.convergence_s.values() if span is not None), default=0.0)
+
+    @property
+    def process_position_mps(self) -> float:
+        """Position process noise the run ended with."""
+        return float(self.summary["filter"]["process_position_mps"])
+
+    @property
+    def began_with(self) -> WarmStart | None:
+        """What the run was warm-started with, None where it was not."""
+        stored = self.summary["filter"]["warm_start"]
+        return WarmStart(np.array(stored["icrs_m"]), np.array(stored["covariance_m2"])) if stored else None
+
+    @property
+    def ended_with(self) -> WarmStart:
+        """The final ICRs and their covariance, to start another run from."""
+        icr = self.summary["icr"]
+        icrs = np.array([icr["final"][column] for column in ICR_COLUMNS], np.float64)
+        return WarmStart(icrs, np.array(icr["final_covariance_m2"], np.float64), self.track_width_m)
+
+    def write(
+        self,
+        path: str | Path,
+        *,
+        states: Literal["csv", "parquet"] = "csv",
+        plots: tuple[str, ...] = ("png",),
+    ) -> None:
+        """Write the run directory, whole or not at all; an older run at `path` is replaced.
+
+        Parameters
+        ----------
+        path : the directory
+        states : format of the states
+        plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+
+        Raises
+        ------
+        OutputError
+            A file or a foreign directory is in the way, or the disk does not take it.
+        """
+        call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots)
+
+    def __repr__(self) -> str:
+        drive, icr = self.summary["drive"], self.summary["icr"]
+        icrs = ", ".join(
+            f"{column} {icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}" for column in ICR_COLUMNS
+        )
+        return (
+            f"<Run {self.name!r}: {drive['distance_m']:.1f} m in {drive['duration_s']:.1f} s, "
+            f"{len(self.table):,} states, {icrs}, {len(self.warnings)} warnings>"
+        )
+
+    def _repr_html_(self) -> str:
+        warnings = "".join(f"<li>{escape(warning)}</li>" for warning in self.warnings)
+        text = escape(call_output("tables.run", "format_run", self))
+        return f"<pre>{text}</pre>" + (
+            f"<details><summary>Warnings</summary><ul>{warnings}</ul></details>" if warnings else ""
+        )
 
 
 def half_width_m(track_width_m: float | None) -> float:
@@ -75,25 +185,17 @@ def half_width_m(track_width_m: float | None) -> float:
     return track_width_m / 2 if track_width_m is not None else DEFAULT_HALF_WIDTH_M
 
 
-def drive_of(run: DrivenRun) -> Drive:
+def drive_of(run: Run) -> Drive:
     """Return the run's states as the kernels want them."""
-    table = run.table
+    return make_drive(run.table, run.in_gap, run.outages_ns)
+
+
+def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
+    """Return states as the kernels want them."""
     in_outage = np.zeros(len(table), np.bool_)
-    for begin, end in run.outages_ns:
+    for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
         in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
-    return drive_through(table, run.in_gap, in_outage)
-
-
-def toy_drive() -> Drive:
-    """Return a drive of twenty states straight on, to load compiled kernels with."""
-    way = np.arange(20.0)
-    no = np.zeros(len(way), np.bool_)
-    return Drive(np.ones_like(way), np.ones_like(way), np.ones_like(way), way, 0 * way, 0 * way, way, no, no.copy())
-
-
-def drive_through(table: States, in_gap: Bools, in_outage: Bools) -> Drive:
-    """Return states as the kernels want them."""
     return Drive(
         dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
         v_left=table.v_left_mps,
@@ -104,4 +206,13 @@ def drive_through(table: States, in_gap: Bools, in_outage: Bools) -> Drive:
         distance=table.distance_m,
         gap=in_gap,
         in_outage=in_outage,
+    )
+
+
+def straight_drive() -> Drive:
+    """Return twenty states straight on, to load compiled kernels with."""
+    path = np.arange(20.0)
+    no = np.zeros(len(path), np.bool_)
+    return Drive(
+        np.ones_like(path), np.ones_like(path), np.ones_like(path), path, 0 * path, 0 * path, path, no, no.copy()
     )

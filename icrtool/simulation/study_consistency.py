@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from icrtool.alignment.align import sensors_as_sent
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.batch_filter import model_states, run_batch
 from icrtool.records.tables import Bools, Floats
@@ -203,7 +204,7 @@ def _run_model(
     wheel_t = sample_times(sensors.wheel_rate_hz, plan.duration_s)
     v_left, v_right = track_speeds(*plan_body(cast(PathPlan, plan.path), wheel_t, plan.icrs_m), plan.icrs_m)
     blank = _readings(np.zeros((len(wheel_t), 6)), wheel_t, v_left, v_right, sensors, np.random.default_rng(0))
-    setup = set_up_filter(readings_log(blank, sensors), scenario.config)
+    setup = set_up_filter(sensors_as_sent(readings_log(blank, sensors), scenario.config), scenario.config)
 
     def work(runs: range) -> dict[str, Floats]:
         return _model_chunk(runs, request, setup, sensors, (wheel_t, v_left, v_right), stops_s)

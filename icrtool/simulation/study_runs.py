@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.batch_filter import TOOL, Batch, BatchOutput, run_batch
@@ -149,7 +150,11 @@ def joined(parts: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
 def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float, ...]) -> Chunk:
     truths, readings = zip(*(_simulate(scenario, run, seed) for run in runs), strict=True)
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
-    setup = set_up_filter(readings_log(readings[0], scenario.sensors), scenario.config, changes_s=changes)
+    setup = set_up_filter(
+        sensors_as_sent(readings_log(readings[0], scenario.sensors), scenario.config),
+        scenario.config,
+        changes_s=changes,
+    )
     data = setup.data
     stops = np.unique(np.append(np.searchsorted(data.wheel_t, stops_s, side="right") - 1, len(data.wheel_t) - 1))
     batch = stack(readings, setup, stops[data.wheel_t[stops] >= setup.t0])

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import whole_file
-from icrtool.output.dropout_content import DropoutContent, shown_horizons
-from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text
+from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
+from icrtool.output.text_format import run_title
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-Outcome = DropoutContent | IcrToolError
+Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
 
 
@@ -63,10 +64,10 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
         partial.write_bytes("\n".join(parts).encode("utf-8", errors="backslashreplace"))
 
 
-def format_markdown(content: DropoutContent) -> str:
+def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown."""
-    report, shown = content.report, shown_horizons(content.report)
-    head = ["way driven blind", *(f"{report.horizons_m[h]:g} m" for h in shown)]
+    shown = shown_horizons(report)
+    head = ["distance without GNSS", *(f"{report.horizons_m[h]:g} m" for h in shown)]
     rows = [head, ["---", *("---:" for _ in shown)]]
     for result in report.results:
         for label, column in (("95 %", result.summary.p95), ("expected", result.summary.expected)):
@@ -79,32 +80,32 @@ def format_markdown(content: DropoutContent) -> str:
     if icr is not None and no_slip is not None:
         ratios = [ratio_text(float(no_slip.summary.p95[h]), float(icr.summary.p95[h])) for h in shown]
         rows.append(["no slip : ICR, 95 %", *ratios])
-    lines = [f"## {_escaped(content.title)}", ""]
-    if content.verdicts:
-        word = "All gates passed." if content.passed else "**A gate failed.**"
-        lines += [word, "", *(f"- {_escaped(verdict.line())}" for verdict in content.verdicts), ""]
+    lines = [f"## {_escaped(run_title(report.run_summary))}", ""]
+    if report.verdicts:
+        word = "All gates passed." if report.passed else "**A gate failed.**"
+        lines += [word, "", *(f"- {_escaped(verdict.line())}" for verdict in report.verdicts), ""]
     lines += [f"Open loop from each of {report.states:,} states. In words:", ""]
-    lines += [f"- {_escaped(line)}" for line in budget_lines(content.budgets)]
+    lines += [f"- {_escaped(line)}" for line in budget_lines(report.budgets)]
     lines += ["", *("| " + " | ".join(row) + " |" for row in rows)]
-    if content.outages:
+    if report.outages:
         lines += [
             "",
-            "| outage | from | length | way | end error | max error |",
+            "| outage | from | length | distance | end error | max error |",
             "| --- | ---: | ---: | ---: | ---: | ---: |",
         ]
         lines += [
             f"| {one.kind} | {one.begin_s:.1f} s | {one.end_s - one.begin_s:.1f} s | {one.distance_m:.1f} m "
             f"| {metres_text(one.end_error_m)} | {metres_text(one.max_error_m)} |"
-            for one in content.outages
+            for one in report.outages
         ]
     return "\n".join(lines) + "\n"
 
 
-def _gate_suite(content: DropoutContent) -> ET.Element:
-    name = _xml_text(content.title)
-    failures = sum(not verdict.passed for verdict in content.verdicts)
-    suite = _suite(name, tests=len(content.verdicts), failures=failures, errors=0)
-    for verdict in content.verdicts:
+def _gate_suite(report: DropoutReport) -> ET.Element:
+    name = _xml_text(run_title(report.run_summary))
+    failures = sum(not verdict.passed for verdict in report.verdicts)
+    suite = _suite(name, tests=len(report.verdicts), failures=failures, errors=0)
+    for verdict in report.verdicts:
         case = ET.SubElement(suite, "testcase", classname=name, name=_xml_text(verdict.gate.text))
         if not verdict.passed:
             failure = ET.SubElement(case, "failure", type="gate", message=_xml_text(verdict.line()))

@@ -1,17 +1,17 @@
-"""How far off after how much blind way: summary over the horizons, histograms (Pentzer 2014, Figs. 28-32, 37)."""
+"""Error over distance without GNSS: summary over the horizons, histograms (Pentzer 2014, Figs. 28-32, 37)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.figures.style import ICR, MEAN, NO_SLIP, Pen, fill_bins, inches, new_figure
 from icrtool.output.text_format import length_text
-from icrtool.records.dropout import DropoutReport, ModelResult, Outage
+from icrtool.records.dropout import ModelResult, Outage
 from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
@@ -33,12 +33,12 @@ HISTOGRAM_IN_P95 = 2.0
 """A histogram is shown up to this many times p95; what lies beyond is said in words."""
 
 
-def draw_summary(title: str, report: DropoutReport, outages: Sequence[Outage] = ()) -> Figure:
+def draw_summary(title: str, report: DropoutReport) -> Figure:
     """Draw 95 % and expected error over the horizon, with their intervals, and real outages where there were some.
 
     Where no slip is so far off that the ICR curves would lie on the axis, a second panel has them alone.
     """
-    subtitle = f"Open-loop error after blind way, from each of {report.states:,} states"
+    subtitle = f"Open-loop error over distance without GNSS, from each of {report.states:,} states"
     apart = _flattened(report)
     figure = new_figure(
         title,
@@ -55,14 +55,14 @@ def draw_summary(title: str, report: DropoutReport, outages: Sequence[Outage] = 
         for name in shown:
             if (result := report.result(name)) is not None:
                 _draw_model(axes, result, report.horizons_m)
-        for one in _shown_outages(report, outages):
+        for one in _shown_outages(report):
             axes.plot([one.distance_m], [one.end_error_m], **_real_mark())
         axes.set_xlim(0, report.horizons_m[-1] * 1.02)
         axes.set_ylim(bottom=0)
         axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
-        axes.set_xlabel("Way driven blind [m]")
+        axes.set_xlabel("Distance without GNSS [m]")
         axes.set_ylabel("Error [m]")
-    keys = _summary_keys(report, real=bool(_shown_outages(report, outages)))
+    keys = _summary_keys(report, real=bool(_shown_outages(report)))
     figure.legend(handles=keys, loc="lower center", ncols=4, columnspacing=1.6, handlelength=2.4)
     return figure
 
@@ -97,8 +97,8 @@ def _flattened(report: DropoutReport) -> bool:
     return bool(np.nanmax(no_slip.summary.p95) > FLATTENING * np.nanmax(icr.summary.p95))
 
 
-def _shown_outages(report: DropoutReport, outages: Sequence[Outage]) -> list[Outage]:
-    return [one for one in outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
+def _shown_outages(report: DropoutReport) -> list[Outage]:
+    return [one for one in report.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
 
 
 def _draw_model(axes: Axes, result: ModelResult, horizons: Floats) -> None:

@@ -1,70 +1,77 @@
-"""The pictures of a dropout report, in the order in which their numbers are there."""
+"""The figures of a dropout report, and when each can be drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from icrtool.output.figures.drawing_process import Draw
+from icrtool.output.text_format import run_title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from icrtool.calibration.model_comparison import Ladder
-    from icrtool.records.dropout import BlindDrive, DropoutReport, Outage
-    from icrtool.records.tables import States
+    from icrtool.dropout_analysis.report import DropoutReport
 
 HISTOGRAM_MODELS = ("icr", "no_slip")
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
-def draw_examples(draw: Draw, title: str, examples: Sequence[BlindDrive]) -> None:
-    """Have the typical drives drawn, where there are some."""
-    if examples:
-        draw(write_figure, f"examples_{examples[0].horizon_m:02.0f}m", title, examples)
+class ReportFigures:
+    """Has the figures of one report drawn, each as soon as the growing report holds its numbers.
+
+    Parameters
+    ----------
+    draw : of a `icrtool.output.figures.drawing_process.Drawer`
+    """
+
+    def __init__(self, draw: Draw) -> None:
+        self._draw = draw
+        self._single_drawn = False
+        self._histograms_drawn = False
+
+    def draw_ready(self, report: DropoutReport) -> None:
+        """Have single trials and outages drawn at the first call, histograms once all models they show are there."""
+        title = run_title(report.run_summary)
+        if not self._single_drawn:
+            self._single_drawn = True
+            if report.examples:
+                name = f"examples_{report.examples[0].horizon_m:02.0f}m"
+                self._draw(write_figure, name, title, report.examples)
+            if report.worst:
+                self._draw(write_figure, "worst", title, report.worst)
+            if report.outages:
+                path = report.reference_north_m, report.reference_east_m
+                self._draw(write_figure, "outages", title, *path, report.outages)
+        width_known = report.run_summary["config"]["robot"]["track_width_m"] is not None
+        wanted = HISTOGRAM_MODELS if width_known else HISTOGRAM_MODELS[:1]
+        if not self._histograms_drawn and all(report.result(model) is not None for model in wanted):
+            self._histograms_drawn = True
+            trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
+            for horizon in HISTOGRAM_HORIZONS_M:
+                if trials.get(horizon):
+                    self._draw(write_figure, f"histogram_{horizon:02.0f}m", title, numbers_of(report), horizon)
+
+    def draw_rest(self, report: DropoutReport) -> None:
+        """Have the summary over all horizons and the model comparison drawn, where there are trials."""
+        title = run_title(report.run_summary)
+        if report.counts.trials.any():
+            self._draw(write_figure, "summary", title, numbers_of(report))
+        if (table := report.comparison) is not None:
+            self._draw(write_figure, "ladder", title, table.rungs, table.horizons_m, table.blocks)
 
 
-def draw_worst(draw: Draw, title: str, worst: Sequence[BlindDrive]) -> None:
-    """Have the worst drives drawn, where there are some."""
-    if worst:
-        draw(write_figure, "worst", title, worst)
-
-
-def draw_outages(draw: Draw, title: str, table: States, outages: Sequence[Outage]) -> None:
-    """Have the outages drawn, where there were some."""
-    if outages:
-        draw(write_figure, "outages", title, table.north_m, table.east_m, outages)
-
-
-def draw_histograms(draw: Draw, title: str, report: DropoutReport) -> None:
-    """Have the histograms drawn, where there are trials; `report` needs the models of `HISTOGRAM_MODELS` only."""
-    trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
-    for horizon in HISTOGRAM_HORIZONS_M:
-        if trials.get(horizon):
-            draw(write_figure, f"histogram_{horizon:02.0f}m", title, report, horizon)
-
-
-def watch_for_histograms(draw: Draw, title: str, models: Sequence[str]) -> Callable[[DropoutReport], None]:
-    """Return what has the histograms drawn when it is told that a report of these models holds those they show."""
-    last = [name for name in models if name in HISTOGRAM_MODELS][-1]
-
-    def told(report: DropoutReport) -> None:
-        if report.results[-1].name == last:
-            draw_histograms(draw, title, report)
-
-    return told
-
-
-def draw_summary(draw: Draw, title: str, report: DropoutReport, outages: Sequence[Outage]) -> None:
-    """Have the summary over all horizons drawn, where there are trials."""
-    if report.counts.trials.any():
-        draw(write_figure, "summary", title, report, outages)
-
-
-def draw_ladder(draw: Draw, title: str, ladder: Ladder) -> None:
-    """Have the ladder of models drawn."""
-    draw(write_figure, "ladder", title, ladder.rungs, ladder.horizons_m, ladder.blocks)
+def numbers_of(report: DropoutReport) -> DropoutReport:
+    """Return a report without the columns of the run, for another process to draw."""
+    none = np.empty(0)
+    return replace(
+        report, reference_north_m=none, reference_east_m=none, worst=(), examples=(), by_turning=(), comparison=None,
+        run_summary={},
+    )  # fmt: skip
 
 
 def write_figure(directory: Path, formats: tuple[str, ...], name: str, *content: object) -> None:

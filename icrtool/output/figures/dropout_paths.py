@@ -1,4 +1,4 @@
-"""Blind drives on the ground: typical ones, the worst, and outages (Pentzer 2014, Figs. 27, 33, 34)."""
+"""Open-loop trials on the ground: typical ones, the worst, and outages (Pentzer 2014, Figs. 27, 33, 34)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
 from icrtool.output.text_format import duration_text, length_text
-from icrtool.records.dropout import BlindDrive, Outage
+from icrtool.records.dropout import ExampleTrial, Outage
 from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PENS: dict[str, Pen] = {"icr": ICR, "no_slip": NO_SLIP}
 LABELS = {"icr": "ICR", "no_slip": "no slip"}
 FORCED = Pen(BAD_FIX_COLOR, width=1.8)
 REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
-WAY = Pen(FIX_COLOR, width=1.4)
+PATH = Pen(FIX_COLOR, width=1.4)
 
 Box = tuple[float, float, float, float]
 """Left, bottom, right, top [points]."""
@@ -43,12 +43,12 @@ SMALLEST_VIEW_M = 0.5
 CELLS = 1500.0
 
 
-def draw_examples(title: str, examples: Sequence[BlindDrive]) -> Figure:
-    """Draw a cornering and a straight blind drive side by side: reference, ICR, no slip."""
+def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
+    """Draw a cornering and a straight trial side by side: reference, ICR, no slip."""
     horizon = examples[0].horizon_m
     figure = new_figure(
         title,
-        f"Typical blind drives over {horizon:g} m: cornering (left), among the straightest (right)",
+        f"Typical trials without GNSS over {horizon:g} m: cornering (left), among the straightest (right)",
         width_in=WIDTH_IN,
         height_in=EXAMPLES_HEIGHT_IN,
     )
@@ -65,12 +65,12 @@ def draw_examples(title: str, examples: Sequence[BlindDrive]) -> Figure:
     return figure
 
 
-def draw_worst(title: str, worst: Sequence[BlindDrive]) -> Figure:
-    """Draw the worst blind drives, each in a cell of its own with its scale."""
+def draw_worst(title: str, worst: Sequence[ExampleTrial]) -> Figure:
+    """Draw the worst trials, each in a cell of its own with its scale."""
     rows = -(-len(worst) // WORST_COLUMNS)
     figure = new_figure(
         title,
-        f"The {len(worst)} worst blind drives over {worst[0].horizon_m:g} m with momentary ICRs, none overlapping",
+        f"The {len(worst)} worst trials without GNSS over {worst[0].horizon_m:g} m, momentary ICRs, none overlapping",
         width_in=9.6,
         height_in=1.1 + rows * (WORST_CELL_IN + 0.62),
     )
@@ -95,7 +95,7 @@ def draw_worst(title: str, worst: Sequence[BlindDrive]) -> Figure:
 
 
 def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[Outage]) -> Figure:
-    """Draw the way with the blind paths of forced and real outages."""
+    """Draw the path with those of forced and real outages."""
     paths = [(one.north_m, one.east_m) for one in outages]
     norths = np.concatenate([north_m, *(north for north, _ in paths)])
     easts = np.concatenate([east_m, *(east for _, east in paths)])
@@ -105,7 +105,7 @@ def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[
     figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
     cell = (east - west) / CELLS
     shown = places(north_m, east_m, cell)
-    axes.plot(east_m[shown], north_m[shown], zorder=2, **WAY.keywords())
+    axes.plot(east_m[shown], north_m[shown], zorder=2, **PATH.keywords())
     for one in outages:
         pen = FORCED if one.kind == "forced" else REAL
         shown = places(one.north_m, one.east_m, cell)
@@ -118,17 +118,17 @@ def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[
     _write_errors(axes, outages, (south, west), 72.0 * box_in / (north - south))
     axes.set_xlabel("East [m]")
     axes.set_ylabel("North [m]")
-    keys = [Line2D([], [], label="filter", **WAY.keywords())]
+    keys = [Line2D([], [], label="filter", **PATH.keywords())]
     for kind, pen in (("forced", FORCED), ("real", REAL)):
         if any(one.kind == kind for one in outages):
-            keys.append(Line2D([], [], label=f"blind, {kind} outage", **pen.keywords()))
+            keys.append(Line2D([], [], label=f"{kind} outage", **pen.keywords()))
     keys += [Line2D([], [], label="its begin", **_mark("white")), Line2D([], [], label="its end", **_mark("black"))]
     figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.8)
     return figure
 
 
-def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float], ticks: int = 5) -> None:
-    """Draw one blind drive about its start; the view has the shape of `box` (width, height), metres are square."""
+def _draw_drive(axes: Axes, drive: ExampleTrial, box: tuple[float, float], ticks: int = 5) -> None:
+    """Draw one trial about its start; the view has the shape of `box` (width, height), metres are square."""
     north0, east0 = drive.north_m, drive.east_m
     lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, 2.0)]
     lines += [(path.north, path.east, PENS[name], 3.0) for name, path in drive.paths.items()]
@@ -147,14 +147,14 @@ def _draw_drive(axes: Axes, drive: BlindDrive, box: tuple[float, float], ticks: 
     axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
 
 
-def _add_keys(figure: Figure, drives: Sequence[BlindDrive]) -> None:
+def _add_keys(figure: Figure, drives: Sequence[ExampleTrial]) -> None:
     keys = [Line2D([], [], label="start", **_mark("white")), Line2D([], [], label="filter", **FILTER.keywords())]
     keys += [Line2D([], [], label=LABELS[name], **PENS[name].keywords()) for name in drives[0].paths]
     keys.append(Line2D([], [], label="where each ends", **_end(Pen("0.45"))))
     figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=2.4)
 
 
-def _turn_text(drive: BlindDrive) -> str:
+def _turn_text(drive: ExampleTrial) -> str:
     return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
 
 
@@ -176,7 +176,7 @@ def _view(norths: Floats, easts: Floats, shape: float) -> tuple[tuple[float, flo
 
 
 def _fit_to_box(norths: Floats, easts: Floats) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Return the view of a whole way, and the height [in] its axes take."""
+    """Return the view of a whole path, and the height [in] its axes take."""
     width_in = WIDTH_IN - 0.95
     north, east = max(float(np.ptp(norths)), SMALLEST_VIEW_M), max(float(np.ptp(easts)), SMALLEST_VIEW_M)
     box_in = float(np.clip(width_in * north / east, *OUTAGES_BOX_IN))
@@ -212,11 +212,11 @@ def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, fl
         return (east - lowest[1]) * points_per_metre, (north - lowest[0]) * points_per_metre
 
     ends = [point(one, row) for one in outages for row in (0, -1)]
-    ways = [
+    crossings = [
         point(one, int(row)) for one in outages for row in places(one.north_m, one.east_m, LINE_PT / points_per_metre)
     ]
     taken = [_box_about(place) for place in ends]
-    crossed = [_box_about(place) for place in ways]
+    crossed = [_box_about(place) for place in crossings]
     upper = (axes.get_xlim()[1] - lowest[1]) * points_per_metre, (axes.get_ylim()[1] - lowest[0]) * points_per_metre
     for number, one in enumerate(outages, start=1):
         text = f"{number}: {length_text(one.end_error_m)}"

@@ -10,13 +10,12 @@ from icrtool.kernels.ekf import GATED, UNSEEN
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import BAD_FIX_COLOR, BAR_COLOR, FLOAT_COLOR, MEAN, inches, new_figure, shade_spans
 from icrtool.output.text_format import length_text, position_word, run_title
+from icrtool.records.run import Run
 from icrtool.records.tables import Bools, Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from icrtool.estimation.fit import FilterRun
 
 WIDTH_IN, HEIGHT_IN = 7.2, 3.9
 
@@ -31,11 +30,11 @@ MARKS = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
-def draw_gnss_difference(run: FilterRun) -> Figure:
+def draw_gnss_difference(run: Run) -> Figure:
     """Draw the distance between filter and fixes over percent of the mission, rejected fixes apart."""
     facts = run.summary["gnss"]
-    subtitle = f"Distance between filter and {position_word(run)}"
-    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
+    subtitle = f"Distance between filter and {position_word(run.summary)}"
+    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
     axes = figure.subplots()
     figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
     duration = float(run.table.t_s[-1])
@@ -43,7 +42,7 @@ def draw_gnss_difference(run: FilterRun) -> Figure:
     used, gated = (code > UNSEEN) & (code != GATED), code == GATED
     top = _top(difference[used])
     if used.any():
-        trusted = used & ~run.fix_quality.down_weighted
+        trusted = used & ~run.sensors.fixes.down_weighted
         x, y = _with_breaks(percent[trusted], difference[trusted])
         shown = extremes(y)
         mean, most = (length_text(facts[name]) for name in ("mean_difference_m", "max_difference_m"))
@@ -51,8 +50,8 @@ def draw_gnss_difference(run: FilterRun) -> Figure:
         axes.axhline(facts["mean_difference_m"], label=f"mean {mean}", **MEAN.keywords())
     if gated.any():
         _draw_rejected(axes, percent[gated], difference[gated], top)
-    _mark_down_weighted(axes, percent, difference, run.fix_quality.down_weighted & used, top)
-    lost = len(run.fix_quality.losses_ns) > 0
+    _mark_down_weighted(axes, percent, difference, run.sensors.fixes.down_weighted & used, top)
+    lost = len(run.sensors.losses_ns) > 0
     shade_spans(
         axes,
         100 * (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / duration,
@@ -63,7 +62,7 @@ def draw_gnss_difference(run: FilterRun) -> Figure:
     axes.set_xlabel("Mission time [%]")
     axes.set_ylabel("Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
-    ncols = 3 if lost or run.fix_quality.down_weighted.any() else 5
+    ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
     figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from icrtool.estimation.summary import ICR_COLUMNS
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAND_COLOR,
@@ -24,13 +23,12 @@ from icrtool.output.figures.style import (
     shade_spans,
 )
 from icrtool.output.text_format import run_title, signed
+from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from icrtool.estimation.fit import FilterRun
 
 WIDTH_IN = 7.2
 
@@ -58,14 +56,14 @@ LEAST_MARGIN_S = 10.0
 BINS = 30
 
 
-def draw_icr_estimates(run: FilterRun) -> Figure:
+def draw_icr_estimates(run: Run) -> Figure:
     """Draw the three ICR estimates over time with ±2σ, their 10-90 % rise, b/2 where known, and GNSS outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
     subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
-    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=5.8)
+    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=5.8)
     panels = figure.subplots(
         3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
     )
@@ -84,12 +82,12 @@ def draw_icr_estimates(run: FilterRun) -> Figure:
     return figure
 
 
-def draw_icr_clusters(run: FilterRun) -> Figure:
+def draw_icr_clusters(run: Run) -> Figure:
     """Draw how much of the time each ICR estimate had which value, after convergence."""
-    settled = max((rise[1] for rise in run.convergence.values() if rise is not None), default=0.0)
+    settled = run.settled_s
     after = run.table.t_s >= settled
     subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
-    figure = new_figure(run_title(run), subtitle, width_in=WIDTH_IN, height_in=3.9)
+    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=3.9)
     panels = figure.subplots(1, 3, sharey=True)
     figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
@@ -104,23 +102,23 @@ def draw_icr_clusters(run: FilterRun) -> Figure:
         Patch(color=BAR_COLOR, linewidth=0, label=f"estimates, bins of {_bin_width(span):g} m"),
         Line2D([], [], label="mean", **MEAN.keywords()),
     ]
-    if run.config.robot.track_width_m is not None:
+    if run.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
     return figure
 
 
-def _spans_s(run: FilterRun) -> list[tuple[float, float]]:
+def _spans_s(run: Run) -> list[tuple[float, float]]:
     """Return begin and end [s] of the panels: the rise of all three estimates and what follows, or all in one."""
     duration = float(run.table.t_s[-1])
-    rises = [rise for rise in run.convergence.values() if rise is not None]
+    rises = [rise for rise in run.convergence_s.values() if rise is not None]
     first, last = min((rise[0] for rise in rises), default=0.0), max((rise[1] for rise in rises), default=0.0)
     margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
     begin, end = max(first - margin, 0.0), last + margin
     return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
 
 
-def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float, float], *, first: bool) -> None:
+def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float], *, first: bool) -> None:
     """Draw one estimate over a span; the `first` panel also has b/2 and the rise."""
     table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
@@ -146,13 +144,13 @@ def _draw_estimate(axes: Axes, run: FilterRun, column: str, span_s: tuple[float,
     axes.locator_params(axis="y", nbins=5)
 
 
-def _draw_rise(axes: Axes, run: FilterRun, column: str, unit_s: float) -> list[float]:
+def _draw_rise(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
     """Draw b/2 and the begin and end of the rise; return where they are [m]."""
     heights: list[float] = []
-    if (width := run.config.robot.track_width_m) is not None:
+    if (width := run.track_width_m) is not None:
         heights.append(SIDES[column] * width / 2)
         axes.axhline(heights[0], **HALF_WIDTH.keywords())
-    if (rise := run.convergence[column]) is not None:
+    if (rise := run.convergence_s[column]) is not None:
         for second, face in zip(rise, ("white", "black"), strict=True):
             height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
             axes.plot([second / unit_s], [height], markerfacecolor=face, **_mark())
@@ -164,25 +162,25 @@ def _mark() -> dict[str, Any]:
     return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
-def _rise_text(run: FilterRun, column: str) -> str:
-    rise = run.convergence[column]
+def _rise_text(run: Run, column: str) -> str:
+    rise = run.convergence_s[column]
     return f"10–90 % in {rise[1] - rise[0]:.1f} s" if rise is not None else "hardly moved from its start"
 
 
-def _final_text(run: FilterRun, column: str) -> str:
+def _final_text(run: Run, column: str) -> str:
     icr = run.summary["icr"]
     return f"final {signed(icr['final'][column])} ± {icr['final_std'][column]:.3f} m"
 
 
-def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
+def _estimate_keys(run: Run) -> list[Line2D | Patch]:
     keys: list[Line2D | Patch] = [
         Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
         Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
     ]
-    if any(rise is not None for rise in run.convergence.values()):
+    if any(rise is not None for rise in run.convergence_s.values()):
         keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
         keys.append(Line2D([], [], label="90 % of the way", **_mark()))
-    if run.config.robot.track_width_m is not None:
+    if run.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     if run.changes_s:
         keys.append(Line2D([], [], label="terrain change", **CHANGE.keywords()))
@@ -191,7 +189,7 @@ def _estimate_keys(run: FilterRun) -> list[Line2D | Patch]:
     return keys
 
 
-def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weight: Floats, span_m: float) -> None:
+def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Floats, span_m: float) -> None:
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
@@ -203,7 +201,7 @@ def _draw_histogram(axes: Axes, run: FilterRun, column: str, value: Floats, weig
     mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
     axes.axvline(mean, **MEAN.keywords())
     title = f"{signed(mean)} ± {std:.3f} m"
-    if (track := run.config.robot.track_width_m) is not None:
+    if (track := run.track_width_m) is not None:
         axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
         title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"
     axes.set_title(title, pad=4.0)

@@ -6,30 +6,30 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from icrtool.estimation.odometry import odometry
 from icrtool.output.figures.gnss_difference import draw_gnss_difference
 from icrtool.output.figures.icrs import draw_icr_clusters, draw_icr_estimates
 from icrtool.output.figures.style import save, style
 from icrtool.output.figures.trajectory import draw_trajectory
+from icrtool.records.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from icrtool.estimation.fit import FilterRun
-
-FIGURES: dict[str, Callable[[FilterRun], Figure]] = {
-    "trajectory": draw_trajectory,
+FIGURES: dict[str, Callable[[Run], Figure]] = {
+    "trajectory": lambda run: draw_trajectory(run, odometry(run)),
     "icr_estimates": draw_icr_estimates,
     "icr_clusters": draw_icr_clusters,
     "gnss_difference": draw_gnss_difference,
 }
 
 
-def draw_figures(run: FilterRun, directory: Path, formats: tuple[str, ...]) -> None:
+def draw_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:
     """Write every figure of a run into a directory.
 
     Parameters
     ----------
-    run : what `fit` returned
+    run : just made or read back
     directory : an existing directory
     formats : of ``png``, ``svg`` and ``pdf``
 

@@ -1,4 +1,4 @@
-"""The way: fixes, filter, and where the wheels alone would have led (Pentzer 2014, Fig. 14)."""
+"""The trajectory: fixes, filter, and where the wheels alone would have led (Pentzer 2014, Fig. 14)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, icr_odometry, no_slip_odometry
 from icrtool.kernels.ekf import GATED, UNSEEN
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import (
@@ -22,15 +21,17 @@ from icrtool.output.figures.style import (
     inches,
     new_figure,
 )
-from icrtool.output.text_format import duration_text, position_word, run_title, way_text
-from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats, PositionFixes
+from icrtool.output.text_format import distance_text, duration_text, position_word, run_title
+from icrtool.records.measurements import Fixes
+from icrtool.records.run import Run
+from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from icrtool.estimation.fit import FilterRun
+    from icrtool.estimation.odometry import Odometry, OdometryPath
 
 WIDTH_IN = 7.2
 MARGINS_IN = {"left": 0.75, "right": 0.2, "top": 0.6, "bottom": 1.3}
@@ -56,17 +57,21 @@ REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_
 """Markers by class: shape and luminance tell them apart."""
 
 
-def draw_trajectory(run: FilterRun) -> Figure:
-    """Draw fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north."""
+def draw_trajectory(run: Run, odometry: Odometry) -> Figure:
+    """Draw fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north.
+
+    Parameters
+    ----------
+    odometry : of the run, by `icrtool.estimation.odometry.odometry`
+    """
     table, drive = run.table, run.summary["drive"]
-    icr, no_slip = icr_odometry(run), no_slip_odometry(run)
+    icr, no_slip = odometry.icr, odometry.no_slip
     lowest, highest = _view(run, icr, no_slip)
     lowest, highest, box_in = _fit_to_box(lowest, highest)
-    facts = (
-        f"Trajectory, {way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}; ICR odometry: final ICRs"
-    )
+    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    facts = f"Trajectory, {driven}; ICR odometry: final ICRs"
     height_in = box_in + MARGINS_IN["top"] + MARGINS_IN["bottom"]
-    figure = new_figure(run_title(run), facts, width_in=WIDTH_IN, height_in=height_in)
+    figure = new_figure(run_title(run.summary), facts, width_in=WIDTH_IN, height_in=height_in)
     axes = figure.subplots()
     figure.subplots_adjust(**inches(figure, **MARGINS_IN))
 
@@ -78,7 +83,7 @@ def draw_trajectory(run: FilterRun) -> Figure:
         (no_slip, NO_SLIP, "no-slip odometry", 2),
     ):
         if path is not None:
-            label = f"{name}, ends {way_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
+            label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
             _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
     ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
     axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
@@ -93,7 +98,7 @@ def draw_trajectory(run: FilterRun) -> Figure:
     return figure
 
 
-def _view(run: FilterRun, *odometry: OdometryPath | None) -> tuple[Floats, Floats]:
+def _view(run: Run, *odometry: OdometryPath | None) -> tuple[Floats, Floats]:
     """Return the least and the greatest (north, east) to show [m], margin included."""
     table = run.table
     lowest = np.array([table.north_m.min(), table.east_m.min()])
@@ -137,9 +142,9 @@ def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
     return " (out of view)" if low or high else ""
 
 
-def _draw_fixes(axes: Axes, run: FilterRun, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    fixes, code, kind = run.log.gnss, run.gnss.code, run.fix_quality.fix_class
-    word, used = position_word(run), (code > UNSEEN) & (code != GATED)
+def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
+    fixes, code, kind = run.sensors.fixes, run.gnss.code, run.sensors.fixes.fix_class
+    word, used = position_word(run.summary), (code > UNSEEN) & (code != GATED)
     several = len(np.unique(kind)) > 1
     for value, look in FIX_LOOKS.items():
         label = f"{word}, {CLASSES[value]}" if several else word
@@ -148,7 +153,7 @@ def _draw_fixes(axes: Axes, run: FilterRun, cell_m: float, lowest: Floats, highe
 
 
 def _draw_places(
-    axes: Axes, fixes: PositionFixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
+    axes: Axes, fixes: Fixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
 ) -> None:
     if not chosen.any():
         return

@@ -1,17 +1,10 @@
-"""A calibration as text, and as a file that appears whole or not at all."""
+"""The alignment findings of one log as text."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 
-from icrtool.calibration.findings import CALIBRATION_SCHEMA, Calibration, Finding
-from icrtool.errors import OutputError
-from icrtool.output.atomic_file import whole_file
-from icrtool.output.run_directory import json_bytes
-
-FILE_NAME = "calibration.json"
+from icrtool.calibration.findings import Calibration, Finding
 
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
@@ -63,45 +56,3 @@ def _setting_lines(calibration: Calibration) -> list[str]:
     for section, keys in sections.items():
         lines += [f"  [{section}]", *keys]
     return lines
-
-
-def write_calibration(calibration: Calibration, place: Path) -> Path:
-    """Write calibration.json: into `place` where that is a folder, else as `place`.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    OutputError
-        Something that is not a calibration is there, or it cannot be written.
-    """
-    file = calibration_file(place)
-    with whole_file(file) as partial:
-        partial.write_bytes(json_bytes(calibration.summary()))
-    return file
-
-
-def calibration_file(place: Path) -> Path:
-    """Return where a calibration asked for at `place` goes.
-
-    Raises
-    ------
-    OutputError
-        Its folder does not exist, or something that is not a calibration is there.
-    """
-    file = place / FILE_NAME if place.is_dir() else place
-    if not file.parent.is_dir():
-        raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    if file.exists() and not _is_ours(file):
-        raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
-    return file
-
-
-def _is_ours(file: Path) -> bool:
-    try:
-        return bool(json.loads(file.read_bytes())["schema"] == CALIBRATION_SCHEMA)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False

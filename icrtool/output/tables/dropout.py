@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from textwrap import wrap
 
-from icrtool.dropout_analysis.acceptance_limits import BudgetDistance
-from icrtool.dropout_analysis.straight_and_turning import TurningSplit
-from icrtool.output.dropout_content import DropoutContent, p95_at, shown_horizons
+import numpy as np
+
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.tables.model_comparison import format_ladder
-from icrtool.output.text_format import TABLE_WIDTH, duration_text, way_text
-from icrtool.records.dropout import DropoutReport, ModelResult, Outage
+from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title
+from icrtool.records.dropout import BudgetDistance, ModelResult, Outage, TurningSplit
 
 LABEL = 26
 MODEL = 15
@@ -26,38 +26,57 @@ NEAR_HORIZONS_M = 1.5
 """Between horizons that are further apart an interpolated distance is said to be one."""
 
 
-def format_dropout(content: DropoutContent) -> str:
+def format_dropout(report: DropoutReport) -> str:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
-    report, drive = content.report, content.run_summary["drive"]
-    reference = "; held against the smoothed trajectory" if content.smoothed else ""
-    way = f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    drive = report.run_summary["drive"]
+    reference = "; compared with the smoothed trajectory" if report.smoothed else ""
+    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     lines = [
-        content.title,
-        f"blind with wheel speeds only, from each of {report.states:,} states; {way}{reference}",
+        run_title(report.run_summary),
+        f"without GNSS, wheel speeds only, from each of {report.states:,} states; {driven}{reference}",
         "",
     ]
     lines += _error_lines(report)
     lines += ["", *_count_lines(report)]
-    lines += [_turning_line(one) for one in content.by_turning]
+    lines += [_turning_line(one) for one in report.by_turning]
     lines += [
         "",
-        *(part for line in budget_lines(content.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
+        *(part for line in budget_lines(report.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
     ]
-    if content.ladder is not None:
-        lines += ["", *format_ladder(content.ladder).splitlines()]
-    elif content.no_ladder:
-        lines += ["", f"models on way they were not fitted to: left out: {content.no_ladder}"]
-    if content.outages:
-        lines += ["", *_outage_lines(content.outages, report)]
-    if content.verdicts:
-        lines += ["", *(verdict.line() for verdict in content.verdicts)]
+    if report.comparison is not None:
+        lines += ["", *format_ladder(report.comparison).splitlines()]
+    elif report.no_comparison:
+        lines += ["", f"models on distance they were not fitted to: left out: {report.no_comparison}"]
+    if report.outages:
+        lines += ["", *_outage_lines(report.outages, report)]
+    if report.verdicts:
+        lines += ["", *(verdict.line() for verdict in report.verdicts)]
     return "\n".join(line.rstrip() for line in lines)
+
+
+SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+
+
+def shown_horizons(report: DropoutReport) -> list[int]:
+    """Return the places of the horizons nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
+    if len(report.horizons_m) <= len(SHOWN_HORIZONS_M):
+        return list(range(len(report.horizons_m)))
+    nearest = (int(np.argmin(np.abs(report.horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
+    return sorted(set(nearest))
+
+
+def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> float | None:
+    """Return a model's p95 [m] at the horizon nearest to a distance; None beyond the last one, or without trials."""
+    if distance_m > report.horizons_m[-1]:
+        return None
+    value = float(result.summary.p95[int(np.argmin(np.abs(report.horizons_m - distance_m)))])
+    return value if np.isfinite(value) else None
 
 
 def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     """Return a sentence a budget: how far each model stays within it."""
     if not budgets:
-        return ["no blind drive is as long as the shortest horizon: nothing can be said of budgets"]
+        return ["no trial is as long as the shortest horizon: nothing can be said of budgets"]
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
@@ -74,7 +93,7 @@ def metres_text(metres: float) -> str:
 
 
 def percent_text(percent: float) -> str:
-    """Return an error in percent of the way."""
+    """Return an error in percent of the distance."""
     return f"{percent:.1f} %" if math.isfinite(percent) else "-"
 
 
@@ -87,14 +106,14 @@ def _reach_text(one: BudgetDistance) -> str:
     if one.beyond:
         return f"more than {one.distance_m:g} m"
     low, high = one.between_m
-    # The error grows faster than the way: on a straight line between far horizons the distance comes out too long.
+    # The error grows faster than the distance: on a straight line between far horizons the distance comes out too long.
     far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
     return f"{one.distance_m:.1f} m{far}"
 
 
 def _error_lines(report: DropoutReport) -> list[str]:
     shown = shown_horizons(report)
-    lines = [_row("way driven blind", [f"{report.horizons_m[h]:g} m" for h in shown])]
+    lines = [_row("distance without GNSS", [f"{report.horizons_m[h]:g} m" for h in shown])]
     for result in report.results:
         summary, intervals = result.summary, result.intervals
         lines.append(
@@ -133,9 +152,9 @@ def _count_lines(report: DropoutReport) -> list[str]:
     shown, counts = shown_horizons(report), report.counts
     lines = [_row("trials", [f"{int(counts.trials[h]):,}" for h in shown])]
     for label, column in (
-        ("no trial: too little way", counts.short),
-        ("across a wheel gap", counts.gap),
-        ("ends in GNSS outage", counts.outage),
+        ("not counted: log ends", counts.short),
+        ("  across a wheel gap", counts.gap),
+        ("  ends in GNSS outage", counts.outage),
     ):
         if column[shown].any():
             lines.append(_row(label, [f"{int(column[h]):,}" for h in shown]))
@@ -146,11 +165,11 @@ def _count_lines(report: DropoutReport) -> list[str]:
 
 
 def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]:
-    """Return a line an outage, beside it p95 of the momentary ICRs over as much way."""
+    """Return a line an outage, beside it p95 of the momentary ICRs over as much distance."""
     icr = report.result("icr")
-    lines = [
-        f"{'outage':<10}{'from':>10}{'length':>10}{'way':>10}{'end error':>12}{'max error':>12}{'95 % of trials':>18}"
-    ]
+    heads = ("from", "length", "distance", "end error", "max error", "95 % of trials")
+    widths = (10, 10, 10, 12, 12, 18)
+    lines = [f"{'outage':<10}" + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))]
     for number, one in enumerate(outages, start=1):
         usual = p95_at(icr, report, one.distance_m) if icr is not None else None
         label = f"{number} {one.kind}"
@@ -168,7 +187,7 @@ def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
 
 def _span_text(low_m: float, high_m: float) -> str:
     if not math.isfinite(low_m):
-        return "too little way"
+        return "too short"
     return f"{metres_text(low_m).removesuffix(' m')}-{metres_text(high_m)}"
 
 

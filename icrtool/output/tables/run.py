@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_process_position_mps
-from icrtool.estimation.fit import FilterRun
-from icrtool.estimation.summary import ICR_COLUMNS, separation_multiplier
-from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR, TerrainChange
-from icrtool.output.text_format import TABLE_WIDTH, duration_text, length_text, position_word, run_title, way_text
+from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR
+from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, length_text, position_word, run_title
+from icrtool.records.run import ICR_COLUMNS, Run
 
 LABEL = 12
 """Columns of the left margin: what a line is about."""
@@ -24,18 +22,18 @@ WORTH_TELLING_S = 0.05
 ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
-"""What is said of an ICR by the verdict of `judge_excitation`."""
+"""What is said of an ICR by the verdict of `find_excitation`."""
 
 Row = tuple[str, ...]
 
 
-def format_run(run: FilterRun) -> str:
+def format_run(run: Run) -> str:
     """Return the table of a run: streams, drive, ICRs, position, heading; at most 100 columns wide, no line end.
 
     Warnings are not in it: they belong to stderr.
     """
     lines = [
-        run_title(run),
+        run_title(run.summary),
         "",
         *_stream_lines(run),
         "",
@@ -53,7 +51,7 @@ def format_run(run: FilterRun) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def excitation_lines(run: FilterRun) -> list[str]:
+def excitation_lines(run: Run) -> list[str]:
     """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
     found = run.summary["excitation"]
     verdicts = found["verdict"]
@@ -67,11 +65,12 @@ def excitation_lines(run: FilterRun) -> list[str]:
     return [_line("excitation", f"{said}; {turned}")]
 
 
-def _stream_lines(run: FilterRun) -> list[str]:
+def _stream_lines(run: Run) -> list[str]:
     rows: list[Row] = [("stream", "topic", "type", "rate", "samples", "clock")]
-    for stream in run.log.streams:
-        kind = stream.message_type.replace("/msg/", "/")
-        rows.append((stream.role, stream.topic, kind, f"{stream.rate_hz:.1f} Hz", f"{stream.count:,}", stream.clock))
+    for stream in run.summary["streams"]:
+        kind = stream["message_type"].replace("/msg/", "/")
+        rate, count = f"{stream['rate_hz']:.1f} Hz", f"{stream['count']:,}"
+        rows.append((stream["role"], stream["topic"], kind, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
     widths[0] = LABEL - 2
     # Long names give way: the topic keeps its end, the type its begin.
@@ -85,15 +84,18 @@ def _stream_lines(run: FilterRun) -> list[str]:
     ]
 
 
-def _drive_lines(run: FilterRun) -> list[str]:
+def _drive_lines(run: Run) -> list[str]:
     drive = run.summary["drive"]
     speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s"
     return [
-        _line("drive", f"{way_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed} (mean ± std)")
+        _line(
+            "drive",
+            f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed} (mean ± std)",
+        )
     ]
 
 
-def _icr_lines(run: FilterRun) -> list[str]:
+def _icr_lines(run: Run) -> list[str]:
     icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
     rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise", "")]
     for column in ICR_COLUMNS:
@@ -110,27 +112,27 @@ def _icr_lines(run: FilterRun) -> list[str]:
     return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]:<24}{row[4]}" for row in rows]
 
 
-def _multiplier_lines(run: FilterRun) -> list[str]:
-    width = run.config.robot.track_width_m
-    if width is None:
+def _multiplier_lines(run: Run) -> list[str]:
+    width, multiplier = run.track_width_m, run.summary["icr"]["separation_multiplier"]
+    if multiplier is None:
         return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
-    multiplier = separation_multiplier(run.table, width)
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     doubt = "" if shown else ": not shown well enough to be used"
     return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m{doubt}")]
 
 
-def _terrain_lines(run: FilterRun) -> list[str]:
+def _terrain_lines(run: Run) -> list[str]:
     """Return the terrain changes, given and found, and the ICRs between them."""
-    terrain = run.terrain
-    if not (terrain.changes or terrain.searched):
+    terrain = run.summary["terrain"]
+    changes, threshold = terrain["changes"], terrain["threshold"]
+    if not (changes or terrain["searched"]):
         return []
     lines = [""]
-    if terrain.searched:
-        found = sum(change.source == "detected" for change in terrain.changes)
-        driven = duration_text(3600 * terrain.driven_h)
-        if math.isfinite(terrain.threshold):
+    if terrain["searched"]:
+        found = sum(change["source"] == "detected" for change in changes)
+        driven = duration_text(3600 * terrain["driven_h"])
+        if threshold is not None:
             said = (
                 f"{found} {'change' if found == 1 else 'changes'} of the ICRs found in {driven} of driving; "
                 f"by chance: {FALSE_ALARMS_PER_HOUR:g} an hour at most"
@@ -138,10 +140,10 @@ def _terrain_lines(run: FilterRun) -> list[str]:
         else:
             said = "too few turns, or too rough a position, to look for changes of the ICRs"
         lines.append(_line("terrain", said))
-    if not terrain.changes:
+    if not changes:
         return lines
     rows: list[Row] = [("segment", "begins", "", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
-    begun = ["", *(_found_text(change, terrain.threshold) for change in terrain.changes)]
+    begun = ["", *(_found_text(change, threshold) for change in changes)]
     for number, (segment, why) in enumerate(zip(run.summary["segments"], begun, strict=True), start=1):
         mean, std = segment["mean"], segment["std"]
         icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
@@ -149,15 +151,15 @@ def _terrain_lines(run: FilterRun) -> list[str]:
     return lines + [f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<22}{row[3]:<20}{row[4]:<20}{row[5]}" for row in rows]
 
 
-def _found_text(change: TerrainChange, threshold: float) -> str:
-    if change.statistic is None:
+def _found_text(change: dict[str, Any], threshold: float | None) -> str:
+    if change["statistic"] is None or threshold is None:
         return "given"
-    return f"found, {change.statistic:.1f} σ > {threshold:.1f} σ"
+    return f"found, {change['statistic']:.1f} σ > {threshold:.1f} σ"
 
 
-def _position_lines(run: FilterRun) -> list[str]:
+def _position_lines(run: Run) -> list[str]:
     gnss = run.summary["gnss"]
-    word = position_word(run)
+    word = position_word(run.summary)
     lines = []
     if gnss["mean_difference_m"] is not None:
         mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
@@ -175,7 +177,7 @@ def _position_lines(run: FilterRun) -> list[str]:
     lines += _class_lines(gnss["classes"], gnss["jumps"])
     if gnss["recoveries"]:
         times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
-        lines.append(_line("", f"believed again after rejection: {times}"))
+        lines.append(_line("", f"re-acquired after rejection: {times}"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
         lost = len(run.summary["rtk_losses_ns"])
@@ -185,33 +187,32 @@ def _position_lines(run: FilterRun) -> list[str]:
 
 
 def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
-    """Say what classes the fixes were of, where they were not all of one, and what was done to them."""
+    """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
     lines = []
     for name, one in classes.items() if len(classes) > 1 else ():
         done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
         done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
-        done += [f"{one['sold_as_fixed']:,} sold as fixed"] if one["sold_as_fixed"] else []
+        done += [f"{one['sold_as_fixed']:,} wrongly reported as fixed"] if one["sold_as_fixed"] else []
         lines.append(_line("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
     if jumps:
         lines.append(_line("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
     return lines
 
 
-def _heading_lines(run: FilterRun) -> list[str]:
-    check = run.heading_check
-    if not math.isfinite(check.offset_rad):
+def _heading_lines(run: Run) -> list[str]:
+    heading = run.summary["heading"]
+    if heading["offset_deg"] is None:
         return [_line("heading", "could not be compared with the course: too little straight driving")]
     # Adding zero takes the sign off a rounded -0.0.
-    found = round(math.degrees(check.offset_rad), 1) + 0.0
-    offset = f"{found:+.1f} ± {math.degrees(check.offset_std_rad):.1f} deg off the course"
-    if check.name.text:
-        offset += f" ({check.name.text})"
-    applied = math.degrees(check.applied_offset_rad)
+    offset = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg off the course"
+    if heading["offset_name"]:
+        offset += f" ({heading['offset_name']})"
+    applied = heading["applied_offset_deg"]
     return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
 
 
-def _delay_lines(run: FilterRun) -> list[str]:
-    """Say what seems to be late, or early, against the wheels."""
+def _delay_lines(run: Run) -> list[str]:
+    """Return which streams seem to lag or lead the wheels."""
     told: list[str] = []
     if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
         return told

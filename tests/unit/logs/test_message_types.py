@@ -5,6 +5,7 @@ One log a container holds every type, its numbers and texts drawn; rosbags and m
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -70,7 +71,9 @@ def camel(text: str) -> str:
     return re.sub(r"(?<=[a-z])_([a-z])", lambda m: m[1].upper(), text).replace("invalidLlh", "invalid_llh")
 
 
+@functools.cache
 def make_store(*, ros1: bool) -> Typestore:
+    """Return the types of a ROS version; kept, since the other library compiles code for each type."""
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     for package in resources.files("icrtool.logs.messages").joinpath("definitions").iterdir():
         for file in package.iterdir() if package.is_dir() else ():
@@ -238,7 +241,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Written]:
     """Write a log of every type in a container, once; read it with icrtool and with the other library."""
     folder, done = tmp_path_factory.mktemp("types"), {}
 
-    def topics_for(store: Typestore) -> dict[str, tuple[str, list[Any]]]:
+    @functools.cache
+    def topics_for(*, ros1: bool) -> dict[str, tuple[str, list[Any]]]:
+        store = make_store(ros1=ros1)
         rng = np.random.default_rng(20261121)
         topics = {}
         for message_type in TYPES:
@@ -250,7 +255,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Written]:
 
     def write(container: str) -> Written:
         store = make_store(ros1=container in ROS1)
-        topics, path = topics_for(store), folder / container.replace(" ", "_")
+        topics, path = topics_for(ros1=container in ROS1), folder / container.replace(" ", "_")
         match container:
             case "bag":
                 path = write_bag(path, topics, store)
@@ -347,7 +352,7 @@ def test_every_wanted_column_is_what_another_library_decodes(
     written = logs(container)
     (table,) = (table for table in written.survey.tables if table.topic == topic_of(message_type))
     messages = written.decoded[table.topic]
-    store = make_store_once(ros1=container in ROS1)
+    store = make_store(ros1=container in ROS1)
     assert table.unreadable == 0
     assert table.log_time_ns.tolist() == [START_NS + i * STEP_NS for i in range(MESSAGES)]
     for path in paths_of(message_type):
@@ -359,18 +364,9 @@ def test_every_wanted_column_is_what_another_library_decodes(
             assert path not in table.columns
 
 
-_STORES: dict[bool, Typestore] = {}
-
-
-def make_store_once(*, ros1: bool) -> Typestore:
-    if ros1 not in _STORES:
-        _STORES[ros1] = make_store(ros1=ros1)
-    return _STORES[ros1]
-
-
 @pytest.mark.parametrize("message_type", TYPES)
 def test_the_fields_a_reader_asks_for_exist_in_one_spelling_or_the_other(message_type: str) -> None:
-    spellings = [make_store_once(ros1=ros1) for ros1 in (False, True)]
+    spellings = [make_store(ros1=ros1) for ros1 in (False, True)]
     optional = {"lateral_velocity", "invalidLlh"} | ({"flags"} if "HPPOSLLH" in message_type else set())
     if message_type == DYNAMIC_JOINT_STATE:
         optional |= {"name[*]", "position[*]", "velocity[*]"}
@@ -419,7 +415,7 @@ def top_fields(message_type: str) -> Iterable[str]:
 
 
 def test_a_type_that_lacks_a_field_is_read_without_it_or_refused_in_words(tmp_path: Path) -> None:
-    store, rng = make_store_once(ros1=False), np.random.default_rng(5)
+    store, rng = make_store(ros1=False), np.random.default_rng(5)
     path = tmp_path / "lacking.mcap"
     dropped: dict[str, str] = {}
     with path.open("wb") as stream:
@@ -480,7 +476,7 @@ def test_a_first_version_of_the_lynx_feedback_without_travel_tells_speeds(tmp_pa
 
 
 def test_a_damaged_message_is_left_out_and_counted(tmp_path: Path) -> None:
-    store, rng = make_store_once(ros1=False), np.random.default_rng(9)
+    store, rng = make_store(ros1=False), np.random.default_rng(9)
     path = tmp_path / "damaged.mcap"
     with path.open("wb") as stream:
         writer = McapWriter(stream)

@@ -1,0 +1,156 @@
+"""Align the sensors of a log: from what was sent to what the filter can use."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from icrtool.alignment.corrections import align_streams, start_icrs
+from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
+from icrtool.alignment.heading_alignment import HeadingCheck
+from icrtool.alignment.sensor_noise import heading_variance, position_variance
+from icrtool.alignment.stream_checks import check_streams
+from icrtool.alignment.stream_delays import StreamDelays
+from icrtool.alignment.wheel_alignment import WheelCheck
+from icrtool.config import Config
+from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
+from icrtool.records.tables import PositionFixes, RobotLog
+
+
+def align(log: RobotLog, config: Config) -> Measurements:
+    """Find what the streams of a log get wrong, and correct what is certain.
+
+    Parameters
+    ----------
+    log : as `icrtool.read_log` returns it
+    config : preset ``paper`` corrects nothing
+
+    Returns
+    -------
+    Measurements
+        The streams with every correction applied, and what was found.
+
+    Raises
+    ------
+    DataError
+        Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
+    """
+    found = align_streams(log, config)
+    wheels, heading, delays = found.wheels, found.heading, found.delays
+    quality = judge_fixes(found.log, config, heading)
+    aligned = sensors_as_sent(quality.log, config)
+    return Measurements(
+        sensors=replace(
+            aligned,
+            fixes=replace(
+                aligned.fixes,
+                fix_class=quality.fix_class,
+                misreported=quality.sold,
+                down_weighted=quality.down_weighted,
+            ),
+            headings=replace(
+                aligned.headings,
+                heading_rad=(-1.0 if heading.applied_mirror else 1.0) * aligned.headings.heading_rad
+                - heading.applied_offset_rad,
+                var_rad2=heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
+            ),
+            heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
+            losses_ns=quality.losses_ns,
+            icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
+        ),
+        findings=_findings(wheels, heading, delays) | found.robot_findings(),
+        sections={
+            "wheels": wheels.summary(),
+            "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
+            "gnss": delays.gnss_summary(),
+        },
+        fix_statistics=_fix_statistics(quality),
+        position_delay_s=delays.applied_gnss_s,
+        antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
+        warnings=tuple(
+            warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings
+        ),
+    )
+
+
+def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
+    """Return the streams of a log without any correction, each sample with its noise: for logs known to be right.
+
+    Raises
+    ------
+    DataError
+        Streams that cannot be used together.
+    """
+    check_streams(log)
+    topics = {stream.role: stream.topic for stream in log.streams}
+    return SensorData(
+        name=log.name,
+        wheels=log.wheels,
+        fixes=_fixes(log.gnss, config),
+        headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
+        gyro=log.gyro,
+        heading_from_position="heading" in topics and topics["heading"] == topics.get("gnss"),
+        heading_correlation_s=config.filter.heading_correlation_s,
+        antenna_m=_antenna_m(log, config),
+        losses_ns=np.empty((0, 2), np.int64),
+    )
+
+
+def _fixes(gnss: PositionFixes, config: Config) -> Fixes:
+    variance = position_variance(gnss, config.filter)
+    none = np.zeros(len(gnss.stamp_ns), np.bool_)
+    return Fixes(
+        stamp_ns=gnss.stamp_ns,
+        north_m=gnss.north_m,
+        east_m=gnss.east_m,
+        var_north_m2=np.ascontiguousarray(variance[:, 0]),
+        var_east_m2=np.ascontiguousarray(variance[:, 1]),
+        fix_class=np.zeros(len(gnss.stamp_ns), np.uint8),
+        misreported=none,
+        down_weighted=none,
+    )
+
+
+def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
+    """Return the antenna's place in the body frame, forward and right [m]: configured, else the log's own, else 0."""
+    forward, right = log.antenna_m if log.antenna_m is not None else (0.0, 0.0)
+    given = config.frames
+    return (
+        forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
+        right if given.antenna_right_m == "auto" else given.antenna_right_m,
+    )
+
+
+def _findings(wheels: WheelCheck, heading: HeadingCheck, delays: StreamDelays) -> dict[str, Finding]:
+    degrees = math.degrees
+    return {
+        "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
+        "heading_offset_deg": _finding(
+            degrees(heading.offset_rad), degrees(heading.offset_std_rad), degrees(heading.applied_offset_rad)
+        ),
+        "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
+        "position_delay_s": _finding(*delays.gnss, delays.applied_gnss_s),
+    }
+
+
+def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:
+    """Return one estimate; `nothing` is the correction that changes nothing."""
+    known = math.isfinite(value) and math.isfinite(std)
+    if applied != nothing:
+        why = "corrected"
+    elif known:
+        why = "not corrected: too small, too uncertain, or not told apart from wheel slip"
+    else:
+        why = "not corrected: this drive does not show it"
+    return Finding(value if known else None, std if known else None, applied, why)
+
+
+def _fix_statistics(quality: FixQuality) -> FixStatistics:
+    gnss, std_m = quality.log.gnss, {}
+    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    for code, name in CLASSES.items():
+        given = std[(quality.fix_class == code) & np.isfinite(std)]
+        std_m[name] = float(np.median(given)) if len(given) else math.nan
+    return FixStatistics(std_m, quality.step_std_m, quality.jump_stamp_ns, quality.jump_m)

@@ -1,0 +1,327 @@
+"""Every motion model on recordings, or blocks of one, that it was not fitted to; and which model to recommend.
+
+Each fold, a recording or a block of distance, is left out in turn (Stone 1974). What is recommended for a fold is also
+*chosen* without it, so the reported score of the recommended model is honest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.errors import DataError
+from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.trials import Summary
+from icrtool.motion.fit import Pool, PooledFit
+from icrtool.motion.models import MODELS, MotionModel
+from icrtool.motion.recording import Recording, Windows, cut_windows
+from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.tables import Bools, Floats
+
+HORIZONS_M = (5.0, 10.0, 20.0)
+
+SHORTEST_BLOCK_M, MOST_BLOCKS = 25.0, 5
+
+FEWEST_RESIDUALS = 20
+
+FEWEST_TO_CHOOSE = 3
+"""With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
+
+BASELINE = "multiplier"
+"""What is worse than this one is never recommended."""
+
+MOST_GIVEN_UP = 0.05
+"""A simpler model may cost this share of the best one's error, no more: few folds show their own noise badly."""
+
+AT_ONCE = 2
+
+
+class Fold(NamedTuple):
+    """What is left out together: a recording, or a block of one between two path lengths [m]."""
+
+    name: str
+    recording: int
+    begin_m: float
+    end_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModelScores:
+    """One model on what it was not fitted to.
+
+    Attributes
+    ----------
+    name : of the model, or ``recommended``
+    folds : errors of each fold, by horizon; together : of all folds
+    """
+
+    name: str
+    label: str
+    folds: tuple[Summary, ...]
+    together: Summary
+
+    def median(self, column: str, h: int) -> float:
+        """Return the median over folds of ``p95`` or ``expected`` at a horizon; NaN without trials."""
+        return _over(np.nanmedian, self.folds, column, h)
+
+    def worst(self, column: str, h: int) -> float:
+        """Return the largest over folds."""
+        return _over(np.nanmax, self.folds, column, h)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """The leave-one-out table of one set of models.
+
+    Attributes
+    ----------
+    scores : by model, in the order of the family, then what was recommended without each fold
+    fits : of everything, by model name
+    recommended : name of the model chosen with all folds
+    chosen : by fold, the model chosen without it
+    why : the reason, one sentence
+    """
+
+    horizons_m: tuple[float, ...]
+    folds: tuple[Fold, ...]
+    scores: tuple[ModelScores, ...]
+    fits: dict[str, PooledFit]
+    recommended: str
+    chosen: tuple[str, ...]
+    why: str
+
+    def score(self, name: str) -> ModelScores:
+        """Return the row of a model."""
+        return next(score for score in self.scores if score.name == name)
+
+
+def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
+    """Return what is left out in turn: each recording, or of a single one contiguous blocks of distance.
+
+    Raises
+    ------
+    DataError
+        A single drive is too short to hold anything out.
+    """
+    if len(recordings) > 1:
+        return tuple(Fold(one.name, i, -np.inf, np.inf) for i, one in enumerate(recordings))
+    total = float(recordings[0].drive.distance[-1])
+    if total < 2.0 * CHOICE_HORIZON_M:
+        why = f"{total:.1f} m of driven distance"
+        raise DataError(recordings[0].name, why, "too short to fit on one part and test on another")
+    edges = np.linspace(0.0, total, count_blocks(total) + 1)
+    edges[0], edges[-1] = -np.inf, np.inf
+    return tuple(Fold(f"block {i + 1}", 0, float(a), float(b)) for i, (a, b) in enumerate(pairwise(edges)))
+
+
+def count_blocks(distance_m: float) -> int:
+    """Return into how many blocks a drive of this length is cut."""
+    return int(np.clip(distance_m // SHORTEST_BLOCK_M, 2, MOST_BLOCKS))
+
+
+def hold_out(
+    recordings: Sequence[Recording], models: Sequence[MotionModel] | None = None,
+    horizons_m: Sequence[float] = HORIZONS_M,
+) -> tuple[HeldOut, HeldOut | None]:  # fmt: skip
+    """Fit and test every model, each fold left out in turn.
+
+    Parameters
+    ----------
+    recordings : at least one
+    models : the candidates; default the family
+
+    Returns
+    -------
+    The tables of wheels alone, and of wheels and gyro where every recording has one.
+
+    Raises
+    ------
+    DataError
+        Too short a drive, or too little left beside a fold.
+    """
+    folds = plan_folds(recordings)
+    tester = _Tester(recordings, folds, horizons_m)
+    gyro = all(one.gyro_radps is not None for one in recordings)
+
+    def job(model: MotionModel) -> list[_Tested]:
+        alone = tester.test(model)
+        return [alone, tester.test(model.with_gyro(), alone)] if gyro else [alone]
+
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        tested = list(threads.map(job, tuple(MODELS.values()) if models is None else models))
+    wheels = _table(folds, horizons_m, [one[0] for one in tested], _nested_choice([one[0] for one in tested], folds))
+    if not gyro:
+        return wheels, None
+    # the same models: a choice of its own for the gyro would only add noise
+    names = _Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
+    return wheels, _table(folds, horizons_m, [one[1] for one in tested], names)
+
+
+class _Tested(NamedTuple):
+    """A model's fits, to everything and without each fold; its trial errors by fold; window errors (folds, folds).
+
+    ``inner[f, g]``: expected error of fold g, fitted without f and g; ``inner[f, f]`` without f alone.
+    """
+
+    model: MotionModel
+    whole: PooledFit
+    fits: list[PooledFit]
+    errors: list[Floats]
+    inner: Floats
+
+
+class _Tester:
+    """What all models are fitted to and tested by."""
+
+    def __init__(self, recordings: Sequence[Recording], folds: Sequence[Fold], horizons_m: Sequence[float]) -> None:
+        self._recordings, self._folds = recordings, folds
+        self._windows = [cut_windows(one) for one in recordings]
+        self._widths = [one.width_m for one in recordings]
+        self._clear, self._inside = _masks(self._windows, folds)
+        for fold, kept in zip(folds, self._clear, strict=True):
+            if np.count_nonzero(kept) < FEWEST_RESIDUALS:
+                why = "too short to fit on one part and test on another"
+                raise DataError(fold.name, "too few windows beside it", why)
+        trials = [cut_trials(one, horizons_m) for one in recordings]
+        self._trials = [
+            trials[fold.recording].within(recordings[fold.recording].drive.distance, fold.begin_m, fold.end_m)
+            for fold in folds
+        ]
+
+    def test(self, model: MotionModel, wheels: _Tested | None = None) -> _Tested:
+        """Fit and test a model; one with a gyro weighs the turn rates of the same fits for wheels alone."""
+        pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.whole.turning)
+        whole, count = pool.fit(), len(self._folds)
+        fits, errors, inner = [], [], np.full((count, count), np.nan)
+        for f in range(count):
+            if wheels is not None:
+                pool = Pool(self._windows, self._widths, model, wheels.fits[f].turning)
+            fit = pool.fit(self._clear[f], pool.without(whole, ~self._clear[f]))
+            fits.append(fit)
+            errors.append(self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f]))
+            inner[f, f] = _window_error(fit.residuals[self._inside[f]])
+            for g in range(count):
+                if g != f and count >= FEWEST_TO_CHOOSE:
+                    x, rows = pool.without(fit, ~self._clear[g]), self._inside[g]
+                    inner[f, g] = _window_error(fit.residuals[rows] + fit.jacobian[rows] @ (x - fit.solution.x))
+        return _Tested(model, whole, fits, errors, inner)
+
+    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> Floats:
+        """Return the errors of a fold's trials.
+
+        Notes
+        -----
+        Delay and gyro bias are constants of a recording: from what is left of it, or, where all of it is left out,
+        from itself with the parameters of the others.
+        """
+        i = self._folds[f].recording
+        whole_recording = self._folds[f].begin_m == -np.inf and self._folds[f].end_m == np.inf
+        own = pool.own_constants(i, fit.parameters) if whole_recording else fit.constants[i]
+        turn = None if wheels is None else wheels.turning
+        rates = twist_rates(self._recordings[i], fit.model, fit.parameters, turn, float(own[2]))
+        return trial_errors(self._recordings[i], self._trials[f], rates, float(own[1]))
+
+
+class _Choice(NamedTuple):
+    """The model recommended and why, and the one chosen without each fold."""
+
+    recommended: str
+    why: str
+    chosen: tuple[str, ...]
+
+
+def _nested_choice(tested: Sequence[_Tested], folds: Sequence[Fold]) -> _Choice:
+    """Choose with all folds, and without each of them."""
+    by_name = {one.model.name: one for one in tested}
+    sizes = {name: len(one.model.terms) for name, one in by_name.items()}
+    baseline = BASELINE if BASELINE in by_name else next(iter(by_name))
+    recommended, why = choose({name: np.diag(one.inner) for name, one in by_name.items()}, sizes, baseline)
+    chosen = [baseline] * len(folds)
+    if len(folds) >= FEWEST_TO_CHOOSE:
+        for f in range(len(folds)):
+            others = [g for g in range(len(folds)) if g != f]
+            chosen[f], _ = choose({name: one.inner[f, others] for name, one in by_name.items()}, sizes, baseline)
+    return _Choice(recommended, why, tuple(chosen))
+
+
+def _table(
+    folds: tuple[Fold, ...], horizons_m: Sequence[float], tested: Sequence[_Tested], choice: _Choice
+) -> HeldOut:  # fmt: skip
+    """Return the table of models that were tested on the same folds."""
+    by_name = {one.model.name: one for one in tested}
+    rows = [_scores(name, one.model.label, one.errors) for name, one in by_name.items()]
+    rows.append(
+        _scores("recommended", "recommended", [by_name[name].errors[f] for f, name in enumerate(choice.chosen)])
+    )
+    fits = {name: one.whole for name, one in by_name.items()}
+    return HeldOut(tuple(horizons_m), folds, tuple(rows), fits, choice.recommended, choice.chosen, choice.why)
+
+
+def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> tuple[str, str]:
+    """Return the model to recommend and why: the simplest whose held-out error is within noise of the best.
+
+    Parameters
+    ----------
+    errors : by model, expected error of each fold (folds,) [m], NaN where it has no window
+    sizes : by model, how many parameters it has
+    baseline : what is worse than this one is not recommended
+
+    Notes
+    -----
+    The rule of one standard error (Breiman et al. 1984), of the logarithms' differences over the same folds, since some
+    folds are harder than others for every model.
+    """
+    logs = {name: np.log(np.maximum(values[np.isfinite(values)], 1e-9)) for name, values in errors.items()}
+    logs = {name: values for name, values in logs.items() if len(values) and values.mean() <= logs[baseline].mean()}
+    if not logs:
+        return baseline, "the drive is too short to compare models"
+    best = min(logs, key=lambda name: float(logs[name].mean()))
+    for name in sorted(logs, key=lambda one: sizes[one]):
+        apart = logs[name] - logs[best]
+        noise = float(apart.std(ddof=1)) / np.sqrt(len(apart)) if len(apart) > 1 else np.inf
+        if name == best or float(apart.mean()) <= min(noise, MOST_GIVEN_UP):
+            break
+    if name == best:
+        return name, f"least expected error after {CHOICE_HORIZON_M:g} m on what it was not fitted to"
+    share = 100.0 * float(np.expm1((logs[name] - logs[best]).mean()))
+    return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
+
+
+def _masks(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
+    """Return, by fold, the residuals that share no distance with it, and those of 10 m that lie within it."""
+    clear, inside = [], []
+    for fold in folds:
+        apart, within = [], []
+        for i, w in enumerate(windows):
+            mine = np.full(len(w.start), i == fold.recording)
+            here = mine & (w.start_m >= fold.begin_m) & (w.end_m <= fold.end_m) & (w.length_m == CHOICE_HORIZON_M)
+            apart.append(np.tile(~mine | (w.end_m <= fold.begin_m) | (w.start_m >= fold.end_m), 2))
+            within.append(np.tile(here, 2))
+        clear.append(np.concatenate(apart))
+        inside.append(np.concatenate(within))
+    return clear, inside
+
+
+def _window_error(residuals: Floats) -> float:
+    """Return the expected error [m] of windows of `CHOICE_HORIZON_M` from their residuals, forward then right."""
+    half = len(residuals) // 2
+    if not half:
+        return float("nan")
+    return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
+
+
+def _scores(name: str, label: str, errors: Sequence[Floats]) -> ModelScores:
+    folds = tuple(summarise(one) for one in errors)
+    return ModelScores(name, label, folds, summarise(np.concatenate(errors)))
+
+
+def _over(function: Callable[[Floats], Any], folds: Sequence[Summary], column: str, h: int) -> float:
+    values = np.array([getattr(fold, column)[h] for fold in folds])
+    values = values[np.isfinite(values)]
+    return float(function(values)) if len(values) else float("nan")

@@ -1,0 +1,181 @@
+"""Calibrate from one run or many: every motion model fitted to all, tested on what it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from icrtool import __version__
+from icrtool.calibration.held_out import HeldOut, hold_out
+from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
+from icrtool.errors import ConfigError
+from icrtool.estimation.measured_heading import measured_headings
+from icrtool.motion.fit import Pool, PooledFit
+from icrtool.motion.models import GYRO_TERMS, typical_drive, wheel_motion
+from icrtool.motion.recording import Recording, Windows, cut_windows
+from icrtool.motion.trials import Trials, trial_errors, twist_rates
+from icrtool.records.run import Run, drive_of
+from icrtool.records.tables import Floats
+
+GYRO_SCALE_RANGE = 0.2
+"""A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResult:
+    """A calibration with the tables it was chosen by; `gyro` is None where a log has no gyro."""
+
+    calibration: Calibration
+    wheels: HeldOut
+    gyro: HeldOut | None
+    notes: tuple[str, ...]
+
+
+def recording_of(run: Run) -> Recording:
+    """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
+
+    A gyro is used where it turns as the reference does.
+
+    Raises
+    ------
+    ConfigError
+        The robot's track width is not known.
+    """
+    if run.track_width_m is None:
+        raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
+    drive, inputs = drive_of(run), run.summary.get("inputs", [])
+    scale = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
+    gyro = next((one.angle_rad for one in measured_headings(run) if one.kind == "gyro"), None)
+    return Recording(
+        name=run.name,
+        t_s=run.table.t_s,
+        drive=drive._replace(v_left=drive.v_left / scale, v_right=drive.v_right / scale),
+        gyro_radps=None if gyro is None else _turn_rate(gyro, drive.dt_s, drive.heading, run.table.t_s),
+        width_m=run.track_width_m,
+        path=inputs[0]["path"] if inputs else "",
+        sha256=inputs[0]["sha256"] if inputs else "",
+    )
+
+
+def _turn_rate(angle: Floats, dt: Floats, heading: Floats, t: Floats) -> Floats | None:
+    """Return the rate [rad/s] of an integrated gyro over each interval, clockwise; None where it measures another axis.
+
+    Its sign is that with which it turns as the reference does.
+    """
+    if not np.isfinite(angle).all():
+        return None
+    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], 1.0)))
+    turned, told, took = np.diff(heading[every]), np.diff(angle[every]), np.diff(t[every])
+    if len(every) < 10:
+        return None
+    slope = float(np.linalg.lstsq(np.column_stack([told, took]), turned, rcond=None)[0][0])
+    if abs(abs(slope) - 1.0) > GYRO_SCALE_RANGE:
+        return None
+    step = np.append(np.diff(angle), 0.0)
+    rate: Floats = np.sign(slope) * np.divide(step, dt, out=np.zeros(len(dt)), where=dt > 0.0)
+    return rate
+
+
+def calibrate(
+    recordings: Sequence[Recording], robot: str | None = None, wheel_radius_m: float | None = None
+) -> CalibrationResult:
+    """Fit every model to all recordings, test each without a recording or block in turn, recommend one.
+
+    Parameters
+    ----------
+    recordings : one or many, of one robot
+    robot, wheel_radius_m : its name and configured wheel radius, for the file
+
+    Raises
+    ------
+    ConfigError
+        Recordings of robots of different width, or one recording twice.
+    DataError
+        Too short a drive.
+    """
+    widths = {one.width_m for one in recordings}
+    if len(widths) > 1:
+        found = ", ".join(f"{width:g} m" for width in sorted(widths))
+        raise ConfigError("robot.track_width_m", f"{found} in the logs given", "calibrate one robot at a time")
+    known = [one for one in recordings if one.sha256]
+    if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
+        raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
+    wheels, gyro = hold_out(recordings)
+    best = wheels.fits[wheels.recommended]
+    logs = tuple(
+        CalibrationLog(
+            one.name, one.path, one.sha256, float(one.drive.distance[-1]), float(np.degrees(own[0])), -float(own[1])
+        )
+        for one, own in zip(recordings, best.constants, strict=True)
+    )
+    scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
+    calibration = Calibration(
+        robot={"name": robot, "track_width_m": recordings[0].width_m, "wheel_radius_m": wheel_radius_m},
+        fitted=_fitted(best),
+        others={name: _fitted(fit) for name, fit in wheels.fits.items()},
+        gyro=None if gyro is None else _fitted(gyro.fits[gyro.recommended]),
+        typical=typical_drive(
+            [(wheel_motion(one.drive.v_left, one.drive.v_right, one.width_m), one.held_s) for one in recordings]
+        ),
+        why=wheels.why,
+        logs=logs,
+        held_out=tuple(scores),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        tool_version=__version__,
+    )
+    without = [one.name for one in recordings if one.gyro_radps is None]
+    notes = () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
+    return CalibrationResult(calibration, wheels, gyro, notes)
+
+
+def _fitted(fit: PooledFit) -> FittedModel:
+    return FittedModel(fit.model, fit.parameters, fit.covariance)
+
+
+def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
+    """Yield the rows of ``held_out``; a score without trials is left out."""
+    gyro = "_gyro" if any(fit.model.uses_gyro for fit in table.fits.values()) else ""
+    for row in table.scores:
+        name = f"{row.name}{gyro}" if row.name == "recommended" else row.name
+        for fold, summary in zip(table.folds, row.folds, strict=True):
+            for h, horizon in enumerate(table.horizons_m):
+                if summary.trials[h]:
+                    yield HeldOutScore(name, horizon, float(summary.p95[h]), float(summary.expected[h]), fold.name)
+
+
+def calibrated_errors(
+    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
+) -> Floats:
+    """Return the errors (k, h) [m] of a calibration in the trials of a recording, NaN where there is none.
+
+    Parameters
+    ----------
+    trials : starts and ends, such as those that other models are tested in
+    with_gyro : the turn rate is the weighted mean with the recording's gyro
+
+    Raises
+    ------
+    ConfigError
+        The calibration is of a robot of another width; or with_gyro, and one of the two has no gyro.
+    DataError
+        The drive is too short to find its own constants.
+
+    Notes
+    -----
+    Delay of the wheels and bias of the gyro are the recording's own, found with the parameters held.
+    """
+    if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
+        why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
+        raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
+    if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
+        raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
+    fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
+    windows: list[Windows] = [cut_windows(recording)]
+    wheels = (calibration.fitted.model, calibration.fitted.parameters) if GYRO_TERMS[0] in fitted.model.terms else None
+    pool = Pool(windows, [recording.width_m], fitted.model, wheels)
+    own = pool.own_constants(0, fitted.parameters)
+    rates = twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2]))
+    return trial_errors(recording, trials, rates, float(own[1]))

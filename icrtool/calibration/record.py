@@ -1,0 +1,260 @@
+"""A calibration: the motion model recommended for a robot, its parameters with covariance, and how it was tested.
+
+Frames and signs are those of `icrtool`: x forward, y right, turn rate clockwise. Parameters refer to wheel speeds at
+the configured wheel radius.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.motion.models import (
+    MotionModel,
+    TrackGeometry,
+    TypicalDrive,
+    find_model,
+    track_geometry,
+    twist,
+    wheel_motion,
+)
+from icrtool.records.tables import Floats, Ints, RobotLog
+
+CALIBRATION_SCHEMA = "icrtool/calibration/1"
+
+NOT_SHOWN = 0.7
+"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
+
+STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class FittedModel:
+    """A model of the family with its parameters.
+
+    Attributes
+    ----------
+    parameters : (k,), in the order of the model's terms; covariance : (k, k)
+    """
+
+    model: MotionModel
+    parameters: Floats
+    covariance: Floats
+
+    @property
+    def std(self) -> Floats:
+        """One standard deviation of each parameter (k,)."""
+        deviations: Floats = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+    @property
+    def not_shown(self) -> tuple[str, ...]:
+        """Names of the terms that the data did not show: they rest on the prior."""
+        share = self.std / self.model.prior_std
+        return tuple(name for name, left in zip(self.model.terms, share, strict=True) if left > NOT_SHOWN)
+
+    def geometry(self, width_m: float, typical: TypicalDrive) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs, multipliers and radius factors, and their covariance (7, 7)."""
+        at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
+        slopes = np.zeros((len(at), len(self.parameters)))
+        for k in range(len(self.parameters)):
+            moved = self.parameters.copy()
+            moved[k] += STEP
+            slopes[:, k] = (np.array(track_geometry(self.model, moved, width_m, typical)) - at) / STEP
+        covariance: Floats = slopes @ self.covariance @ slopes.T
+        return TrackGeometry(*at.tolist()), covariance
+
+
+class HeldOutScore(NamedTuple):
+    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
+
+    model: str
+    horizon_m: float
+    p95_m: float
+    expected_m: float
+    log: str
+
+
+class CalibrationLog(NamedTuple):
+    """A log that a calibration was fitted to, and its own constants.
+
+    Attributes
+    ----------
+    heading_offset_deg : what its reference's heading is off; wheels_delay_s : its wheels against its poses, positive
+        for later
+    """
+
+    name: str
+    path: str
+    sha256: str
+    distance_m: float
+    heading_offset_deg: float
+    wheels_delay_s: float
+
+
+class Odometry(NamedTuple):
+    """A path from wheel speeds alone, from the origin with heading zero; (n,) each."""
+
+    stamp_ns: Ints
+    forward_m: Floats
+    right_m: Floats
+    heading_rad: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What goes into the robot, and what error it gives.
+
+    Attributes
+    ----------
+    robot : name (or None), track_width_m, wheel_radius_m (or None)
+    fitted : the recommended model; others : every model, by name
+    gyro : the recommended model with a gyro, None where a log has none
+    typical : curvature and speed at which ICRs and multiplier are stated
+    why : reason for the recommendation
+    logs : what it was fitted to
+    held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
+    created : date and time, UTC, ISO 8601
+    """
+
+    robot: Mapping[str, Any]
+    fitted: FittedModel
+    others: Mapping[str, FittedModel]
+    gyro: FittedModel | None
+    typical: TypicalDrive
+    why: str
+    logs: tuple[CalibrationLog, ...]
+    held_out: tuple[HeldOutScore, ...]
+    created: str
+    tool_version: str
+
+    @property
+    def recommended(self) -> str:
+        """Name of the recommended model."""
+        return self.fitted.model.name
+
+    @property
+    def width_m(self) -> float:
+        """Track width b."""
+        return float(self.robot["track_width_m"])
+
+    def geometry(self) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs, multipliers and radius factors of the recommended model, and their covariance (7, 7)."""
+        return self.fitted.geometry(self.width_m, self.typical)
+
+    def twist(self, v_left: Floats | float, v_right: Floats | float) -> Floats:
+        """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n).
+
+        Parameters
+        ----------
+        v_left, v_right : speeds of the sides at the configured wheel radius, forward positive
+
+        Notes
+        -----
+        x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
+        """
+        left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
+        found = twist(self.fitted.model, self.fitted.parameters, wheel_motion(left, right, self.width_m))
+        return found[:, 0] if np.ndim(v_left) == 0 else found
+
+    def odometry(self, log: RobotLog) -> Odometry:
+        """Return the path that the wheels of a log make, from the origin with heading zero.
+
+        Notes
+        -----
+        A speed holds until the next sample; Euler steps, as in the dropout analysis.
+        """
+        wheels = log.wheels
+        v_x, v_y, omega = self.twist(wheels.v_left_mps, wheels.v_right_mps)
+        held = np.diff(wheels.stamp_ns) / 1e9
+        heading = np.concatenate([[0.0], np.cumsum(held * omega[:-1])])
+        moved = held * (v_x + 1j * v_y)[:-1] * np.exp(1j * heading[:-1])
+        place = np.concatenate([[0.0], np.cumsum(moved)])
+        return Odometry(wheels.stamp_ns, place.real, place.imag, heading)
+
+    def warm_start(self) -> tuple[Floats, Floats]:
+        """Return y_icr_right, y_icr_left, x_icr [m] (3,) and their covariance (3, 3), for a filter to begin with."""
+        geometry, covariance = self.geometry()
+        return np.array(geometry[:3]), covariance[:3, :3]
+
+    def fitted_to(self, sha256: str) -> bool:
+        """Return whether a log was among those the calibration was fitted to."""
+        return bool(sha256) and any(log.sha256 == sha256 for log in self.logs)
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain data for the calibration file."""
+        geometry, covariance = self.geometry()
+        return {
+            "schema": CALIBRATION_SCHEMA,
+            "tool_version": self.tool_version,
+            "created": self.created,
+            "robot": dict(self.robot),
+            "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
+            "model": self.fitted.model.name,
+            "recommended": self.recommended,
+            "why": self.why,
+            **_plain(self.fitted),
+            "not_shown": list(self.fitted.not_shown),
+            "geometry": geometry._asdict(),
+            "typical": self.typical._asdict(),
+            "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+            "gyro": None if self.gyro is None else {"model": self.gyro.model.name, **_plain(self.gyro)},
+            "models": {name: _plain(one) for name, one in self.others.items()},
+            "logs": [log._asdict() for log in self.logs],
+            "held_out": [score._asdict() for score in self.held_out],
+        }
+
+
+def _plain(one: FittedModel) -> dict[str, Any]:
+    rows = zip(one.model.terms, one.parameters.tolist(), one.std.tolist(), strict=True)
+    unseen = one.not_shown
+    return {
+        "terms": list(one.model.terms),
+        "parameters": {
+            name: {"value": value, "std": std, "verdict": "not shown" if name in unseen else "shown"}
+            for name, value, std in rows
+        },
+        "covariance": one.covariance.tolist(),
+    }
+
+
+def calibration_of(document: Mapping[str, Any]) -> Calibration:
+    """Return the calibration that a file's plain data hold.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        They are not what `Calibration.summary` gives.
+    """
+    if document["schema"] != CALIBRATION_SCHEMA:
+        raise ValueError(f"schema {document['schema']!r}")
+    gyro = document["gyro"]
+    if not float(document["robot"]["track_width_m"]) > 0.0:
+        raise ValueError("track width")
+    return Calibration(
+        robot=dict(document["robot"]),
+        fitted=_fitted(document["model"], document),
+        others={name: _fitted(name, one) for name, one in document["models"].items()},
+        gyro=None if gyro is None else _fitted(gyro["model"], gyro),
+        typical=TypicalDrive(**document["typical"]),
+        why=str(document["why"]),
+        logs=tuple(CalibrationLog(**log) for log in document["logs"]),
+        held_out=tuple(HeldOutScore(**score) for score in document["held_out"]),
+        created=str(document["created"]),
+        tool_version=str(document["tool_version"]),
+    )
+
+
+def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:
+    model = find_model(name)
+    k = len(model.terms)
+    if tuple(document["terms"]) != model.terms:
+        raise ValueError(f"terms of {name}")
+    parameters = np.array([document["parameters"][term]["value"] for term in model.terms], np.float64)
+    covariance = np.array(document["covariance"], np.float64).reshape(k, k)
+    if not (np.isfinite(parameters).all() and np.isfinite(covariance).all()):
+        raise ValueError(f"parameters of {name}")
+    return FittedModel(model, parameters, covariance)

@@ -1,0 +1,119 @@
+"""The whole dropout report of a run: all that ``icrtool dropout-report`` gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+from icrtool.calibration.model_comparison import Ladder, judge_ladder
+from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
+from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
+from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.straight_and_turning import split_by_turning
+from icrtool.dropout_analysis.trials import ErrorSink, ReportWatch, configured_horizons_m, dropout
+from icrtool.errors import ConfigError, DataError
+from icrtool.estimation.measured_heading import measured_headings
+from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage
+from icrtool.records.run import Run
+
+
+def dropout_report(
+    run: Run,
+    *,
+    horizons_m: Sequence[float] | None = None,
+    budgets_m: Sequence[float] = (0.5,),
+    gates: Sequence[str | Gate] = (),
+    outage_s: Sequence[float] | None = None,
+    outage_at_s: Sequence[float] = (),
+    comparison: bool = True,
+    reference: Literal["filter", "smoothed"] = "filter",
+    seed: int = DEFAULT_SEED,
+    sink: ErrorSink | None = None,
+    watch: ReportWatch | None = None,
+) -> DropoutReport:
+    """Return how far a robot can go without GNSS, with all that ``icrtool dropout-report`` gives.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    horizons_m : distances without GNSS; default those of the run's configuration. Horizons of `gates` are added
+    budgets_m : for each, the distance over which 95 % of the trials stay within it
+    gates : acceptance limits, for example ``"icr.p95@10m <= 3.8"``
+    outage_s : lengths of outages to force on the filter; default those of the run's configuration
+    outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
+    comparison : also compare all models on distance they were not fitted to
+    reference : what trials are compared with: the filter's states or the smoother's
+    seed : of the bootstrap
+    sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
+    watch : called with the report as it grows: with outages and single trials before the first model, after each model
+
+    Raises
+    ------
+    ConfigError
+        A gate, horizon, budget or outage that cannot be met.
+    DataError
+        The run has fewer than two states.
+    RunError
+        `reference` is ``smoothed`` and the run has no smoothed states.
+    """
+    limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
+    forced = _force(run, outage_s, outage_at_s)
+    compared = with_smoothed_reference(run) if reference == "smoothed" else run
+    # Single trials come first: whoever watches can draw them while the many are driven.
+    examples, worst = example_trials(compared), worst_trials(compared)
+    outages = (*forced, *real_outages(compared))
+
+    def with_single(report: DropoutReport) -> DropoutReport:
+        smoothed = reference == "smoothed"
+        return replace(report, smoothed=smoothed, examples=examples, worst=worst, outages=outages)
+
+    def grown(report: DropoutReport) -> None:
+        if watch is not None:
+            watch(with_single(report))
+
+    horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
+    report = with_single(dropout(compared, horizons, seed=seed, sink=sink, watch=grown))
+    table, why = _compare(compared, run) if comparison else (None, "")
+    return replace(
+        report,
+        budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
+        verdicts=tuple(check_gate(gate, report) for gate in limits),
+        by_turning=split_by_turning(compared),
+        comparison=table,
+        no_comparison=why,
+    )
+
+
+def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> tuple[float, ...]:
+    """Return the lengths of outages to force: those given, else those of the run's configuration."""
+    return tuple(outage_s if outage_s is not None else run.config.dropout.forced_outage_s)
+
+
+def _force(run: Run, outage_s: Sequence[float] | None, outage_at_s: Sequence[float]) -> list[Outage]:
+    lengths = forced_lengths_s(run, outage_s)
+    if outage_at_s and not lengths:
+        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
+    plans = [plan_outages(run, length, outage_at_s) for length in lengths]
+    return [outage for plan in plans for outage in force_outages(run, plan)]
+
+
+def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]:
+    """Return the horizons asked for, and those that acceptance limits name."""
+    horizons = list(horizons_m)
+    for gate in gates:
+        if not any(math.isclose(gate.horizon_m, horizon, rel_tol=1e-9) for horizon in horizons):
+            horizons.append(gate.horizon_m)
+    return horizons
+
+
+def _compare(compared: Run, run: Run) -> tuple[Ladder | None, str]:
+    """Compare the models of a run; where that cannot be, None and why."""
+    try:
+        return judge_ladder(compared, measured_headings(run)), ""
+    except DataError as err:
+        return None, f"{err.why}, {err.advice}"

@@ -1,0 +1,146 @@
+"""The dropout report: the record that `icrtool.dropout` and `icrtool.dropout_report` return.
+
+It stands here and not among the records because it holds a model comparison, which is made of fits. No code that makes
+it is here, and no kernel: a process that only draws it need not load numba.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrtool.kernels.trials import TrialCounts
+from icrtool.records.dropout import BudgetDistance, ExampleTrial, ModelResult, Outage, TurningSplit, Verdict
+from icrtool.records.late_output import call_output
+from icrtool.records.tables import Floats, Ints
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from icrtool.calibration.model_comparison import Ladder
+
+
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class DropoutReport:
+    """Open-loop errors by model and horizon, and what else was asked for.
+
+    `icrtool.dropout` gives the errors alone, `icrtool.dropout_report` all of it.
+
+    Attributes
+    ----------
+    horizons_m : (h,) ascending
+    results : one per model
+    counts : trials, and starts that were none, by horizon; the same for every model
+    states : recorded states, each a start
+    standing : of them, those at which the robot stood: their trials are near copies of one another
+    seed : of the bootstrap
+    run_summary : of the run, equal to its run.json
+    run_directory : where the run was read from, None for one just made
+    reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
+    smoothed : the reference is the smoother's trajectory, not the filter's
+    budgets : by budget and model
+    verdicts : of the acceptance limits
+    worst : trials with the largest error first
+    examples : a cornering and a straight trial; empty where no trial is that long
+    outages : forced ones, then real ones
+    by_turning : straight and turning trials apart
+    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` says why
+    """
+
+    name: str
+    horizons_m: Floats
+    results: tuple[ModelResult, ...]
+    counts: TrialCounts
+    states: int
+    standing: int
+    seed: int
+    run_summary: dict[str, Any]
+    run_directory: Path | None
+    reference_north_m: Floats
+    reference_east_m: Floats
+    smoothed: bool = False
+    budgets: tuple[BudgetDistance, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+    worst: tuple[ExampleTrial, ...] = ()
+    examples: tuple[ExampleTrial, ...] = ()
+    outages: tuple[Outage, ...] = ()
+    by_turning: tuple[TurningSplit, ...] = ()
+    comparison: Ladder | None = None
+    no_comparison: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every acceptance limit was kept."""
+        return all(verdict.passed for verdict in self.verdicts)
+
+    def result(self, model: str) -> ModelResult | None:
+        """Return the result of a model, None when it was not computed."""
+        return next((result for result in self.results if result.name == model), None)
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The rows of summary.csv as a DataFrame."""
+        import pandas as pd
+
+        return pd.DataFrame(self.summary_columns())
+
+    def summary_columns(self) -> dict[str, list[str] | Floats | Ints]:
+        """Return the columns of summary.csv: a row per model and horizon."""
+        h = self.horizons_m
+        names = [result.name for result in self.results for _ in h]
+        horizon = np.tile(h, len(self.results))
+
+        def stacked(values: Sequence[Floats]) -> Floats:
+            return np.concatenate(values) if values else np.empty(0)
+
+        summaries = [result.summary for result in self.results]
+        intervals = [result.intervals for result in self.results]
+        expected, p95 = stacked([s.expected for s in summaries]), stacked([s.p95 for s in summaries])
+        return {
+            "model": names,
+            "horizon_m": horizon,
+            "trials": np.concatenate([s.trials for s in summaries]) if summaries else np.empty(0, np.int64),
+            "expected_error_m": expected,
+            "p50_m": stacked([s.p50 for s in summaries]),
+            "p95_m": p95,
+            "max_m": stacked([s.largest for s in summaries]),
+            "expected_pct": 100.0 * expected / horizon,
+            "p95_pct": 100.0 * p95 / horizon,
+            "expected_low_m": stacked([i.expected_low for i in intervals]),
+            "expected_high_m": stacked([i.expected_high for i in intervals]),
+            "p95_low_m": stacked([i.p95_low for i in intervals]),
+            "p95_high_m": stacked([i.p95_high for i in intervals]),
+        }
+
+    def write(self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",)) -> None:
+        """Write summary.csv, histogram.csv, report.json, the other tables and the figures, whole or not at all.
+
+        Parameters
+        ----------
+        path : directory of the report; default: ``dropout`` in the directory the run was read from
+        plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+
+        Raises
+        ------
+        OutputError
+            Something that is not a dropout report is there, or the disk does not take it.
+        """
+        if path is None:
+            if self.run_directory is None:
+                raise ValueError("path: this run was not read from a directory; name one for its report")
+            path = self.run_directory / "dropout"
+        call_output("dropout_directory", "write_report", self, Path(path), plots=plots)
+
+    def __repr__(self) -> str:
+        icr, last = self.result("icr"), len(self.horizons_m) - 1
+        error = f", ICR 95 % {icr.summary.p95[last]:.3g} m after {self.horizons_m[last]:g} m" if icr is not None else ""
+        limits = f", acceptance limits {'kept' if self.passed else 'MISSED'}" if self.verdicts else ""
+        return f"<DropoutReport {self.name!r}: {len(self.results)} models from {self.states:,} states{error}{limits}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(call_output('tables.dropout', 'format_dropout', self))}</pre>"

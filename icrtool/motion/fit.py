@@ -1,0 +1,253 @@
+"""Robust fit of motion models to windows of driven distance, pooled over recordings.
+
+With z = forward + j right, heading Theta and place S are prefix sums over the wheel samples, and a window from s to e
+displaces the robot, in the body frame of its start, by
+
+    d = e^{-j Theta_s} (S_e - S_s).
+
+omega is linear in the parameters, so d Theta / d theta does not depend on them; the derivatives of S are prefix sums
+too, and all windows of a recording with their derivatives cost a few passes over its samples.
+
+Each recording has constants of its own, which are no part of a calibration: the offset of its reference's heading, the
+delay of its wheels against its poses, the bias of its gyro.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
+from icrtool.motion.models import MotionModel, model_columns, twist, wheel_motion
+from icrtool.motion.recording import STRETCH_M, Windows
+from icrtool.records.tables import Bools, Complexes, Floats, Ints
+
+CONSTANTS = ("heading_offset_rad", "wheels_read_later_s", "gyro_bias_radps")
+"""What each recording has of its own: added to the reference's heading; wheels read later; added to the turn rate."""
+
+CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02])
+"""Prior of `CONSTANTS` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class PooledFit:
+    """A model fitted to windows of several recordings.
+
+    Attributes
+    ----------
+    parameters : (k,) of the model's terms; covariance : (k, k)
+    constants : (recordings, 3), see `CONSTANTS`
+    solution : of all parameters, those of the model first, then three a recording
+    residuals, jacobian : of all windows (m,), (m, k + 3 recordings), at the minimum
+    kept : (m,) the residuals that were fitted
+    """
+
+    model: MotionModel
+    parameters: Floats
+    covariance: Floats
+    constants: Floats
+    solution: RobustFit
+    residuals: Floats
+    jacobian: Floats
+    kept: Bools
+
+    @property
+    def turning(self) -> Turning:
+        """What a model with a gyro weighs."""
+        return self.model, self.parameters
+
+
+Turning = tuple[MotionModel, Floats]
+"""A wheels-only model and its parameters."""
+
+
+class WindowResiduals:
+    """Residuals of all windows of one recording for one model, (d - d_ref) / sqrt(length), and their derivatives.
+
+    Parameters
+    ----------
+    windows : of `icrtool.motion.recording.cut_windows`
+    model, width_m : what predicts, and the track width b [m]
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    """
+
+    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
+        motion = wheel_motion(windows.v_left, windows.v_right, width_m)
+        if wheels is not None:
+            motion = motion._replace(gyro=windows.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
+        fixed, free = model_columns(model, motion)
+        self._w = windows
+        self._fixed_omega = fixed[2]
+        self._fixed_v = fixed[0] + 1j * fixed[1]
+        bias = np.zeros((1, 3, len(windows.t)))
+        bias[0, 2] = float(model.uses_gyro)
+        columns = np.concatenate([free, bias])
+        self._omega = np.ascontiguousarray(columns[:, 2])
+        self._v = columns[:, 0] + 1j * columns[:, 1]
+        self._angle = _prefix(self._omega * windows.held)
+        self._angle_taken = self._angle[:, :-1] + self._omega * windows.into
+        self._root = np.sqrt(windows.length_m)
+        # the end of the last step, or a delayed knot would find no sample
+        self._t = np.append(windows.t, windows.t[-1] + max(float(windows.held[-1]), 1e-9))
+
+    def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
+        """Return residuals (2 w,), forward then right [m per root metre], and derivatives (2 w, k + 3)."""
+        w = self._w
+        offset, delay, bias = constants
+        p = np.append(parameters, bias)
+        omega, v = self._fixed_omega + p @ self._omega, self._fixed_v + p @ self._v
+        theta = _prefix(omega * w.held)
+        direction = _direction(theta[:-1] + omega * w.into)
+        moved = v * direction
+        place = _prefix(moved * w.held)
+        place_by = _prefix((self._v * direction + 1j * self._angle_taken * moved) * w.held)
+        at = w.knot_t + delay
+        row, share = self._locate(at)
+        knot_theta, knot_place = _between(theta, row, share), _between(place, row, share)
+        knot_angle, knot_place_by = _between(self._angle, row, share), _between(place_by, row, share)
+        back = np.conj(_direction(np.real(knot_theta[w.start])))
+        went = knot_place[w.end] - knot_place[w.start]
+        d = back * went
+        expected = w.reference * np.exp(-1j * offset)
+        d_by = back * (knot_place_by[:, w.end] - knot_place_by[:, w.start] - 1j * knot_angle[:, w.start] * went)
+        rate = moved[row]
+        d_late = back * (rate[w.end] - rate[w.start] - 1j * omega[row][w.start] * went)
+        slopes = np.empty((len(parameters) + 3, len(d)), np.complex128)
+        slopes[: len(parameters)] = d_by[:-1]
+        slopes[-3], slopes[-2], slopes[-1] = 1j * expected, d_late, d_by[-1]
+        residual, slopes = (d - expected) / self._root, slopes / self._root
+        return np.concatenate([residual.real, residual.imag]), np.concatenate([slopes.real, slopes.imag], axis=1).T
+
+    def _locate(self, at: Floats) -> tuple[Ints, Floats]:
+        """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
+        row = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, len(self._w.t) - 1)
+        held = self._w.held[row]
+        passed = np.clip(at - self._t[row], 0.0, held)
+        return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
+
+
+class Pool:
+    """Windows of several recordings, and the fits of one model to parts of them.
+
+    Parameters
+    ----------
+    windows, widths_m : by recording
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    """
+
+    def __init__(
+        self, windows: Sequence[Windows], widths_m: Sequence[float], model: MotionModel, wheels: Turning | None = None
+    ) -> None:
+        self.model = model
+        self._parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(windows, widths_m, strict=True)]
+        self._windows = windows
+        groups, offset = [], 0
+        for w in windows:
+            stretch = (w.start_m / STRETCH_M).astype(np.int64)
+            groups.append(np.tile(stretch + offset, 2))
+            offset += int(stretch.max()) + 1
+        self.group = np.concatenate(groups)
+        self.length_m = np.concatenate([np.tile(w.length_m, 2) for w in windows])
+
+    def own_constants(self, recording: int, parameters: Floats) -> Floats:
+        """Return the constants (3,) of one recording for given parameters of the model."""
+        part, free = self._parts[recording], self._constant_std()
+        kept = np.ones(len(self._windows[recording].start) * 2, np.bool_)
+
+        def evaluate(constants: Floats) -> tuple[Floats, Floats]:
+            residuals, slopes = part(parameters, constants)
+            return residuals, slopes[:, -3:]
+
+        return robust_least_squares(evaluate, np.zeros(3), np.zeros(3), free, overlap=len(kept) / 10.0).x
+
+    def _constant_std(self) -> Floats:
+        free = CONSTANT_STD.copy()
+        if not self.model.uses_gyro:
+            free[2] = 1e-9
+        return free
+
+    @property
+    def prior(self) -> tuple[Floats, Floats]:
+        """Mean and standard deviation of all parameters, model first, then the constants of each recording."""
+        count = len(self._parts)
+        mean = np.concatenate([self.model.prior_mean, np.zeros(3 * count)])
+        return mean, np.concatenate([self.model.prior_std, np.tile(self._constant_std(), count)])
+
+    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return residuals (m,) of all windows of all recordings and their derivatives (m, k + 3 recordings)."""
+        k = len(self.model.terms)
+        residuals, jacobians = [], []
+        for i, part in enumerate(self._parts):
+            columns = slice(k + 3 * i, k + 3 * i + 3)
+            residual, slopes = part(x[:k], x[columns])
+            jacobian = np.zeros((len(residual), len(x)))
+            jacobian[:, :k], jacobian[:, columns] = slopes[:, :k], slopes[:, k:]
+            residuals.append(residual)
+            jacobians.append(jacobian)
+        return np.concatenate(residuals), np.concatenate(jacobians)
+
+    def overlap(self, kept: Bools) -> float:
+        """Return how many windows of those marked in `kept` (m,) cover a place on average."""
+        covered_m = STRETCH_M * max(len(np.unique(self.group[kept])), 1)
+        return max(float(self.length_m[kept].sum()) / 2.0 / covered_m, 1.0)
+
+    def fit(self, kept: Bools | None = None, start: Floats | None = None) -> PooledFit:
+        """Fit the model to the residuals marked in `kept` (m,); default all.
+
+        Parameters
+        ----------
+        start : all parameters to start from; default the prior's mean
+        """
+        mean, std = self.prior
+        rows = np.ones(len(self.group), np.bool_) if kept is None else kept
+        last: list[tuple[Floats, Floats, Floats]] = []
+
+        def evaluate(x: Floats) -> tuple[Floats, Floats]:
+            residuals, jacobian = self.evaluate(x)
+            last[:] = [(x, residuals, jacobian)]
+            return residuals[rows], jacobian[rows]
+
+        found = robust_least_squares(
+            evaluate, mean if start is None else start, mean, std, group=self.group[rows], overlap=self.overlap(rows)
+        )
+        k = len(self.model.terms)
+        at, residuals, jacobian = last[0]
+        return PooledFit(
+            self.model, found.x[:k], found.covariance[:k, :k], found.x[k:].reshape(-1, 3), found,
+            residuals + jacobian @ (found.x - at), jacobian, rows,
+        )  # fmt: skip
+
+    def without(self, fit: PooledFit, dropped: Bools) -> Floats:
+        """Return all parameters as they would be without the residuals marked in `dropped` (m,), to first order.
+
+        Notes
+        -----
+        At the minimum the gradients of all residuals and of the prior sum to zero, so what is left without some is
+        minus theirs: one step with the curvature of the rest (a downdate, as for studentised residuals).
+        """
+        out = dropped & fit.kept
+        scale = np.full(int(np.count_nonzero(out)), fit.solution.scale[0])
+        H, g = normal_equations(fit.residuals[out], fit.jacobian[out], scale, self.overlap(fit.kept))
+        changed: Floats = fit.solution.x + np.linalg.solve(fit.solution.information - H, g)
+        return changed
+
+
+def _prefix(steps: Floats | Complexes) -> Floats | Complexes:
+    """Return cumulative sums along the last axis with a zero in front."""
+    total = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), steps.dtype)
+    np.cumsum(steps, axis=-1, out=total[..., 1:])
+    return total
+
+
+def _between(sums: Floats | Complexes, row: Ints, share: Floats) -> Floats | Complexes:
+    low = sums[..., row]
+    return low + share * (sums[..., row + 1] - low)
+
+
+def _direction(angle: Floats) -> Complexes:
+    """Return e^{j angle} in a third of the time of a complex exponential."""
+    direction = np.empty(angle.shape, np.complex128)
+    direction.real, direction.imag = np.cos(angle), np.sin(angle)
+    return direction

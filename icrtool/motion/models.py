@@ -1,0 +1,267 @@
+"""Motion models that are linear in their parameters: body twist (v_x, v_y, omega) = sum theta_k phi_k(V_l, V_r).
+
+A `Term` is one phi with its prior, a `MotionModel` a list of terms. Adding either is one entry below. Body frame: x
+forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds are those at the
+configured wheel radius.
+
+The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is
+v_x = v + (y_r + y_l) / W w b / 2, v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model is the one
+without free terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.records.tables import Floats
+
+Axis = int
+VX, VY, OMEGA = 0, 1, 2
+
+
+class WheelMotion(NamedTuple):
+    """What terms are made of, (n,) each.
+
+    Attributes
+    ----------
+    v, w : mean speed [m/s], (V_l - V_r) / b [rad/s]
+    spin : |V_l - V_r| / (|V_l| + |V_r|): 0 straight ahead, 1 on the spot
+    b : track width [m]
+    gyro : turn rate of a gyro [rad/s], clockwise; turn : that of a wheels-only model; zeros where neither is used
+    """
+
+    v: Floats
+    w: Floats
+    spin: Floats
+    b: float
+    gyro: Floats
+    turn: Floats
+
+
+def wheel_motion(v_left: Floats, v_right: Floats, width_m: float) -> WheelMotion:
+    """Return what the terms are made of, from speeds at the configured wheel radius (n,) [m/s]."""
+    both = np.abs(v_left) + np.abs(v_right)
+    spin = np.divide(np.abs(v_left - v_right), both, out=np.zeros_like(both), where=both > 0.0)
+    none = np.zeros_like(both)
+    return WheelMotion((v_left + v_right) / 2.0, (v_left - v_right) / width_m, spin, width_m, none, none)
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One column of the model.
+
+    Attributes
+    ----------
+    axis : which of v_x, v_y, omega it adds to
+    column : its value per unit parameter, (n,)
+    nominal : the parameter without slip
+    mean, std : prior of the parameter: how real robots differ
+    meaning : for a reader, with source
+    """
+
+    name: str
+    axis: Axis
+    column: Callable[[WheelMotion], Floats]
+    nominal: float
+    mean: float
+    std: float
+    meaning: str
+
+
+TERMS: dict[str, Term] = {
+    term.name: term
+    for term in (
+        Term("vx_v", VX, lambda m: m.v, 1.0, 1.0, 0.04, "common wheel scale, longitudinal slip"),
+        Term("vx_w", VX, lambda m: m.w * m.b / 2, 0.0, 0.0, 0.3, "ICRs off centre (Martinez 2005)"),
+        Term("omega_w", OMEGA, lambda m: m.w, 1.0, 0.6, 0.4, "b / W, one over the multiplier (Mandow 2007)"),
+        Term("omega_v", OMEGA, lambda m: m.v / m.b, 0.0, 0.0, 0.02, "left/right asymmetry: turns while driving ahead"),
+        Term("vy_w", VY, lambda m: m.w * m.b / 2, 0.0, 0.0, 0.3, "-2 x_icr / W (Martinez 2005)"),
+        Term(
+            "vy_vw", VY, lambda m: m.v * m.w, 0.0, 0.0, 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"
+        ),
+        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, 0.0, 0.0, 0.3, "turn gain that depends on curvature"),
+        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, 0.0, 0.0, 0.2, "turn gain that depends on speed"),
+        Term("vy_v", VY, lambda m: m.v, 0.0, 0.0, 0.02, "sideways while driving ahead (Anousaki 2004)"),
+        Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, 0.0, 0.0, 0.1, "drag in turns (Seegmiller 2014)"),
+        Term("gyro_scale", OMEGA, lambda m: m.gyro, 0.0, 0.0, 0.02, "scale error of the gyro"),
+        Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.5, "weight of the wheels in the turn rate"),
+    )
+}
+"""Every term by name."""
+
+GYRO_TERMS = ("gyro_scale", "wheels_weight")
+"""Terms of a model with a gyro: the turn rate is the gyro's where a drive shows nothing of the wheels' turning."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """A list of free terms; every other term keeps its nominal value.
+
+    Attributes
+    ----------
+    label : for tables
+    source : who proposed it
+    """
+
+    name: str
+    label: str
+    terms: tuple[str, ...]
+    source: str
+
+    @property
+    def prior_mean(self) -> Floats:
+        """Prior mean of each term (k,)."""
+        return np.array([TERMS[name].mean for name in self.terms])
+
+    @property
+    def prior_std(self) -> Floats:
+        """Prior standard deviation of each term (k,)."""
+        return np.array([TERMS[name].std for name in self.terms])
+
+    @property
+    def uses_gyro(self) -> bool:
+        """Whether the turn rate is the weighted mean of a gyro's and that of a wheels-only model."""
+        return GYRO_TERMS[0] in self.terms
+
+    def with_gyro(self) -> MotionModel:
+        """Return the same model, its turn rate the weighted mean of its own and a gyro's."""
+        moves = tuple(name for name in self.terms if TERMS[name].axis != OMEGA)
+        return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*moves, *GYRO_TERMS), self.source)
+
+
+_FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
+_EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
+
+MODELS: dict[str, MotionModel] = {
+    model.name: model
+    for model in (
+        MotionModel("no_slip", "no slip", (), "Pentzer 2014, Eqs. 38-39"),
+        MotionModel(
+            "multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier of diff_drive_controller"
+        ),
+        MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
+        MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
+        MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
+        MotionModel("six", "+ side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
+        MotionModel("eight", "+ turn gain", _EIGHT, "with gains that depend on curvature and speed"),
+        MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004"),
+        MotionModel("slip", "slip regression", (*_FIVE, "vx_absw", "vy_vw"), "Seegmiller 2014, Baril 2024"),
+    )
+}
+"""Every model by name, simplest first."""
+
+
+def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Floats]:
+    """Return the twist without the free terms (3, n) and the columns of the free terms (k, 3, n)."""
+    fixed = np.zeros((3, len(motion.v)))
+    free = np.zeros((len(model.terms), 3, len(motion.v)))
+    if model.uses_gyro:
+        fixed[OMEGA] = motion.gyro
+    for term in TERMS.values():
+        if model.uses_gyro and term.axis == OMEGA:
+            continue
+        if term.name not in model.terms and term.nominal:
+            fixed[term.axis] += term.nominal * term.column(motion)
+    for k, name in enumerate(model.terms):
+        term = TERMS[name]
+        free[k, term.axis] = term.column(motion)
+    return fixed, free
+
+
+def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
+    """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
+    fixed, free = model_columns(model, motion)
+    result: Floats = fixed + np.tensordot(parameters, free, axes=1)
+    return result
+
+
+class TrackGeometry(NamedTuple):
+    """What a twist that is linear in V_l and V_r amounts to as track ICRs and controller numbers.
+
+    Attributes
+    ----------
+    y_icr_right_m, y_icr_left_m, x_icr_m : track ICRs
+    multiplier : (y_r - y_l) / b, beside the radius factors
+    multiplier_nominal : W / (a b), for a controller that keeps the configured radii
+    radius_left, radius_right : wheel radius over the configured one
+    """
+
+    y_icr_right_m: float
+    y_icr_left_m: float
+    x_icr_m: float
+    multiplier: float
+    multiplier_nominal: float
+    radius_left: float
+    radius_right: float
+
+
+class TypicalDrive(NamedTuple):
+    """At what curvature and speed the robot turned, weighted with the square of w.
+
+    Attributes
+    ----------
+    spin : of `WheelMotion`; speed_mps, speed_abs_mps : mean of v and of its size
+    """
+
+    spin: float = 0.0
+    speed_mps: float = 0.0
+    speed_abs_mps: float = 0.0
+
+
+def typical_drive(motions: Sequence[tuple[WheelMotion, Floats]]) -> TypicalDrive:
+    """Return where robots turned; `motions` are wheel motions with how long each sample holds [s]."""
+    weight = np.concatenate([held * m.w**2 for m, held in motions])
+    if not weight.sum() > 0.0:
+        return TypicalDrive()
+    spin, v = np.concatenate([m.spin for m, _ in motions]), np.concatenate([m.v for m, _ in motions])
+    return TypicalDrive(*(float(weight @ column / weight.sum()) for column in (spin, v, np.abs(v))))
+
+
+def track_geometry(
+    model: MotionModel, parameters: Floats, width_m: float, typical: TypicalDrive | None = None
+) -> TrackGeometry:
+    """Return ICRs, multiplier and radius factors of a model.
+
+    Parameters
+    ----------
+    typical : terms that are not linear in the speeds enter with the curvature and speed here; default zero
+
+    Notes
+    -----
+    y_r = (d v_x / d V_l) / (d omega / d V_l), y_l = (d v_x / d V_r) / (d omega / d V_r), x from v_y = -x omega of a
+    turn. A radius factor of a side is that by which its speed must be multiplied for one W to give the turn:
+    a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
+    """
+    at = typical if typical is not None else TypicalDrive()
+    value = {name: TERMS[name].nominal for name in TERMS} | dict(zip(model.terms, parameters.tolist(), strict=True))
+    turn_gain = value["omega_w"] + value["omega_sw"] * at.spin + value["omega_vw"] * at.speed_abs_mps
+    vx_left, vx_right = value["vx_v"] / 2 + value["vx_w"] / 2, value["vx_v"] / 2 - value["vx_w"] / 2
+    turn_left = (value["omega_v"] / 2 + turn_gain) / width_m
+    turn_right = (value["omega_v"] / 2 - turn_gain) / width_m
+    y_right, y_left = vx_left / turn_left, vx_right / turn_right
+    separation = y_right - y_left
+    x = -(value["vy_w"] * width_m / 2 + value["vy_vw"] * at.speed_mps) / turn_gain
+    return TrackGeometry(
+        y_right, y_left, x, separation / width_m, 1.0 / turn_gain, separation * turn_left, -separation * turn_right
+    )
+
+
+def find_model(name: str) -> MotionModel:
+    """Return a model by name, ``_gyro`` behind it for the one with a gyro.
+
+    Raises
+    ------
+    KeyError
+        There is none.
+    """
+    base = name.removesuffix("_gyro")
+    return MODELS[base].with_gyro() if base != name else MODELS[base]
+
+
+def wheels_models() -> Sequence[MotionModel]:
+    """Return every model of the family, for wheels alone, simplest first."""
+    return tuple(MODELS.values())

@@ -1,0 +1,161 @@
+"""What motion models are fitted to and judged by: wheel speeds, a reference trajectory, a gyro, and windows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.errors import DataError
+from icrtool.kernels.open_loop import trial_ends
+from icrtool.kernels.trials import Drive
+from icrtool.records.tables import Complexes, Floats, Ints
+
+WINDOWS_M = (5.0, 10.0)
+"""Lengths of the windows. One length alone lets a circle of just that circumference show nothing."""
+
+EVERY_M = 0.5
+"""A window of each length starts every so much distance."""
+
+MOST_STARTS = 1000
+"""Windows of a long drive start further apart: about so many of a length."""
+
+STEP_S = 0.1
+"""Wheel samples are joined to steps of this length."""
+
+MOST_STEPS, LONGEST_STEP_S, LONGEST_STEP_M = 10_000, 0.4, 0.25
+"""Steps are longer where there would be more of them, but not longer than this in time and distance."""
+
+STRETCH_M = 20.0
+"""Distance whose errors depend on one another, for the covariance: twice the longest window."""
+
+FEWEST_WINDOWS = 10
+
+MOVING_MPS = 0.01
+"""Slower than this the robot stands: its starts are copies of one another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One log as motion models see it.
+
+    Attributes
+    ----------
+    t_s : (n,) time of each state [s]
+    drive : wheel speeds at the configured radius and the reference
+    gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
+    width_m : track width b
+    path, sha256 : the log's first file; empty where it is not known
+    """
+
+    name: str
+    t_s: Floats
+    drive: Drive
+    gyro_radps: Floats | None
+    width_m: float
+    path: str = ""
+    sha256: str = ""
+
+    @property
+    def held_s(self) -> Floats:
+        """How long each wheel sample holds (n,) [s]; 0 over gaps and for the last one."""
+        held: Floats = np.where(self.drive.gap, 0.0, self.drive.dt_s)
+        held[-1] = 0.0
+        return held
+
+
+class Windows(NamedTuple):
+    """Overlapping windows of driven distance of one recording, ready to be fitted.
+
+    Attributes
+    ----------
+    t, held, v_left, v_right, gyro : (n,) steps: wheel samples joined, `held` 0 over gaps
+    into : (n,) [s] how far into a step its heading is taken: Euler steps of m samples at a constant turn rate move
+        along the heading (m - 1) / 2 samples into them
+    knot_t : (m,) times at which windows start or end [s], ascending
+    start, end : (w,) rows of `knot_t`
+    start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
+    reference : complex (w,), displacement forward + j right in the body frame of the start [m]
+    """
+
+    t: Floats
+    held: Floats
+    v_left: Floats
+    v_right: Floats
+    gyro: Floats
+    into: Floats
+    knot_t: Floats
+    start: Ints
+    end: Ints
+    start_m: Floats
+    end_m: Floats
+    length_m: Floats
+    reference: Complexes
+
+
+def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M) -> Windows:
+    """Cut a recording into windows of driven distance; those across a gap or with an end in an outage are left out.
+
+    Raises
+    ------
+    DataError
+        There are fewer than `FEWEST_WINDOWS`.
+    """
+    drive = recording.drive
+    total = float(drive.distance[-1])
+    place = drive.north + 1j * drive.east
+    every = max(EVERY_M, total / MOST_STARTS)
+    begins = np.unique(np.searchsorted(drive.distance, np.arange(0.0, total, every)))
+    begins = begins[~drive.in_outage[begins]]
+    ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
+    row, column = np.nonzero(ends.T >= 0)[::-1]
+    if len(row) < FEWEST_WINDOWS:
+        why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"
+        raise DataError(recording.name, why, "a calibration needs a longer drive")
+    start, end = begins[row], ends[row, column]
+    knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
+    return Windows(
+        *_joined_steps(recording),
+        knot_t=recording.t_s[knots],
+        start=rows[: len(start)],
+        end=rows[len(start) :],
+        start_m=drive.distance[start],
+        end_m=drive.distance[end],
+        length_m=np.asarray(lengths_m, np.float64)[column],
+        reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
+    )
+
+
+def samples_a_step(held_s: Floats, v_left: Floats, v_right: Floats) -> int:
+    """Return how many wheel samples make a step of the fits.
+
+    A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
+    metre.
+    """
+    lasting = held_s > 0.0
+    if not lasting.any():
+        return 1
+    total_s = float(held_s.sum())
+    speed_mps = float((held_s * (np.abs(v_left) + np.abs(v_right))).sum()) / 2.0 / total_s
+    step_s = min(total_s / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S)
+    return max(int(max(step_s, STEP_S) / float(np.median(held_s[lasting]))), 1)
+
+
+def _joined_steps(recording: Recording) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Return t, held, v_left, v_right, gyro, into of steps with the mean speeds over their time."""
+    drive, held = recording.drive, recording.held_s
+    joined = samples_a_step(held, drive.v_left, drive.v_right)
+    first = np.arange(0, len(held), joined)
+    lasting = np.add.reduceat(held, first)
+    gyro = recording.gyro_radps if recording.gyro_radps is not None else np.zeros(len(held))
+
+    def mean(column: Floats) -> Floats:
+        total = np.add.reduceat(held * column, first)
+        return np.divide(total, lasting, out=np.zeros(len(first)), where=lasting > 0.0)
+
+    return (
+        recording.t_s[first], lasting, mean(drive.v_left), mean(drive.v_right), mean(gyro),
+        lasting * (joined - 1) / (2.0 * joined),
+    )  # fmt: skip

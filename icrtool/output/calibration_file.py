@@ -1,0 +1,75 @@
+"""The calibration file: written whole or not at all, read back as a `Calibration`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration, calibration_of
+from icrtool.errors import OutputError, RunError
+from icrtool.output.atomic_file import whole_file
+from icrtool.output.run_directory import json_bytes
+
+FILE_NAME = "calibration.json"
+
+
+def open_calibration(file: Path | str) -> Calibration:
+    """Read a calibration file.
+
+    Raises
+    ------
+    RunError
+        It cannot be read, or is not a calibration.
+    """
+    path = Path(file)
+    try:
+        return calibration_of(json.loads(path.read_bytes()))
+    except OSError as err:
+        raise RunError(path, "cannot be read", err.strerror or str(err)) from err
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
+        why = "not a calibration with a motion model"
+        raise RunError(path, why, "make one with icrtool calibrate -o") from err
+
+
+def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
+    """Write plain data of a calibration: into `place` where that is a folder, else as `place`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        Something that is not a calibration is there, or it cannot be written.
+    """
+    file = calibration_file(place)
+    with whole_file(file) as partial:
+        partial.write_bytes(json_bytes(document))
+    return file
+
+
+def calibration_file(place: Path) -> Path:
+    """Return where a calibration asked for at `place` goes.
+
+    Raises
+    ------
+    OutputError
+        Its folder does not exist, or something that is not a calibration is there.
+    """
+    file = place / FILE_NAME if place.is_dir() else place
+    if not file.parent.is_dir():
+        raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
+    if file.exists() and not _is_ours(file):
+        raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
+    return file
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        return bool(json.loads(file.read_bytes())["schema"] == CALIBRATION_SCHEMA)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -1,0 +1,133 @@
+"""``measurements.npz`` of a run: the sensors as the filter used them, and what became of each measurement.
+
+The wheel samples from the first recorded state on are columns of the states; only those before it are here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.records.measurements import Fixes, IcrStart, SensorData
+from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.tables import GyroSamples, HeadingSamples, Ints, States, WheelSamples
+
+MEASUREMENTS_FILE = "measurements.npz"
+
+OUTCOME_COLUMNS = ("nis", "code", "difference")
+
+KINDS = {
+    "stamp_ns": np.int64,
+    "fix_class": np.uint8,
+    "misreported": np.bool_,
+    "down_weighted": np.bool_,
+    "code": np.uint8,
+}
+"""Types of the columns that are not float64."""
+
+
+class FilterInputs(NamedTuple):
+    """What run.json holds of the sensors: numbers that are no column."""
+
+    name: str
+    heading_from_position: bool
+    heading_correlation_s: float
+    antenna_m: tuple[float, float]
+    losses_ns: Ints
+    icr_start: IcrStart | None
+
+
+def write_measurements(run: Run, path: Path) -> None:
+    """Write the measurements of a run as arrays that `numpy.load` reads.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    sensors, before = run.sensors, len(run.sensors.wheels.stamp_ns) - len(run.table)
+    columns: dict[str, NDArray[Any]] = {}
+    for group, record in (("wheels", sensors.wheels), ("fixes", sensors.fixes), ("headings", sensors.headings)):
+        for field in fields(record):
+            column = getattr(record, field.name)
+            columns[f"{group}_{field.name}"] = column[:before] if group == "wheels" else column
+    for group, outcome in (("fixes", run.gnss), ("headings", run.heading)):
+        columns |= {f"{group}_{name}": getattr(outcome, name) for name in OUTCOME_COLUMNS}
+    if sensors.gyro is not None:
+        columns["gyro_topic"] = np.frombuffer(sensors.gyro.topic.encode("utf-8", "surrogatepass"), np.uint8)
+        columns |= {"gyro_stamp_ns": sensors.gyro.stamp_ns, "gyro_rate_radps": sensors.gyro.rate_radps}
+    with path.open("xb") as file:
+        np.savez(file, **columns)  # type: ignore[arg-type]  # numpy's stub takes the columns for its own flag
+
+
+def read_measurements(
+    path: Path, table: States, inputs: FilterInputs
+) -> tuple[SensorData, MeasurementOutcome, MeasurementOutcome]:
+    """Read what `write_measurements` wrote: the sensors, and what became of fixes and headings.
+
+    Raises
+    ------
+    ValueError
+        It is no such file, or its columns do not belong together.
+    OSError
+        The file cannot be read.
+    """
+    try:
+        with np.load(path) as stored:
+            columns = {name: stored[name] for name in stored.files}
+        wheels = [_columns(columns, "wheels", WheelSamples)[field.name] for field in fields(WheelSamples)]
+        later = [getattr(table, field.name) for field in fields(WheelSamples)]
+        joined = [np.concatenate(pair) if len(pair[0]) else pair[1] for pair in zip(wheels, later, strict=True)]
+        fixes = Fixes(**_columns(columns, "fixes", Fixes))
+        headings = HeadingSamples(**_columns(columns, "headings", HeadingSamples))
+        sensors = SensorData(
+            name=inputs.name,
+            wheels=WheelSamples(*joined),
+            fixes=fixes,
+            headings=headings,
+            gyro=_gyro(columns) if "gyro_topic" in columns else None,
+            heading_from_position=inputs.heading_from_position,
+            heading_correlation_s=inputs.heading_correlation_s,
+            antenna_m=inputs.antenna_m,
+            losses_ns=inputs.losses_ns,
+            icr_start=inputs.icr_start,
+        )
+        outcomes = [
+            _outcome(columns, group, stamps, table)
+            for group, stamps in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
+        ]
+    except (BadZipFile, KeyError, EOFError) as err:
+        raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
+    return sensors, outcomes[0], outcomes[1]
+
+
+def _columns(columns: dict[str, NDArray[Any]], group: str, record: type) -> dict[str, NDArray[Any]]:
+    """Return the columns of a record, all of one length and of their types."""
+    found = {field.name: _checked(columns, f"{group}_{field.name}", field.name) for field in fields(record)}
+    if len({len(column) for column in found.values()}) > 1:
+        raise ValueError(f"the columns of the {group} differ in length")
+    return found
+
+
+def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[Any]:
+    column, kind = columns[key], KINDS.get(name, np.float64)
+    if column.ndim != 1 or column.dtype != kind:
+        raise ValueError(f"{key} is no column of {np.dtype(kind)}")
+    return column
+
+
+def _gyro(columns: dict[str, NDArray[Any]]) -> GyroSamples:
+    topic = columns["gyro_topic"].astype(np.uint8).tobytes().decode("utf-8", "surrogatepass")
+    return GyroSamples(topic, *(_checked(columns, f"gyro_{name}", name) for name in ("stamp_ns", "rate_radps")))
+
+
+def _outcome(columns: dict[str, NDArray[Any]], group: str, stamps: Ints, table: States) -> MeasurementOutcome:
+    nis, code, difference = (_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS)
+    if not len(nis) == len(code) == len(difference) == len(stamps):
+        raise ValueError(f"the outcomes of the {group} are not as many as those")
+    return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, nis, code, difference)

@@ -1,0 +1,182 @@
+"""Runs on disk: open one, find the newest one, find the log that one was made from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from icrtool.config import Config, parse_config
+from icrtool.errors import ConfigError, RunError
+from icrtool.output.measurements_file import MEASUREMENTS_FILE, FilterInputs, read_measurements
+from icrtool.output.run_directory import (
+    CHECKSUM_FILE,
+    RUN_FILE,
+    SCHEMA_FAMILY,
+    SMOOTHED_FILES,
+    STATES_FILES,
+    is_run_directory,
+)
+from icrtool.output.run_schema import check_run_document
+from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
+from icrtool.records.measurements import IcrStart
+from icrtool.records.run import RUN_SCHEMA, Run
+from icrtool.records.tables import Ints, States
+
+FIT_AGAIN = "fit the log again"
+
+
+def open_run(path: str | Path) -> Run:
+    """Read a run directory back, equal to the run that was written.
+
+    Parameters
+    ----------
+    path : a directory that `icrtool fit` or `Run.write` made
+
+    Raises
+    ------
+    RunError
+        Not a run directory, one of another version, or one that was edited or cut short since it was written.
+    """
+    import pyarrow as pa
+
+    directory = Path(path)
+    document = _read_document(directory)
+    sums = _read_sums(directory)
+    _check_sum(directory, RUN_FILE, sums)
+    if MEASUREMENTS_FILE not in sums:
+        raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
+    try:
+        check_run_document(document)
+        table = _read_states(directory, STATES_FILES, sums)
+        if table is None:
+            raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
+        losses = _spans(document["rtk_losses_ns"])
+        facts = document["filter"]
+        forward, right = facts["antenna_m"]
+        start = facts["icr_start"]
+        inputs = FilterInputs(
+            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses,
+            None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
+        )  # fmt: skip
+        _check_sum(directory, MEASUREMENTS_FILE, sums)
+        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
+        smoothed = _read_states(directory, SMOOTHED_FILES, sums)
+        if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
+            raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
+        run = Run(
+            name=document["log"],
+            config=_config(document["config"], directory),
+            table=table,
+            in_gap=np.isin(table.stamp_ns, _spans(document["wheel_gaps_ns"])[:, 0]),
+            outages_ns=_spans(document["outages_ns"]),
+            sensors=sensors,
+            gnss=gnss,
+            heading=heading,
+            smoothed=smoothed,
+            summary=document,
+            directory=directory,
+        )
+    except (OSError, StatesFileError, ValueError, OverflowError) as err:
+        raise RunError(directory, f"cannot be read ({err})", FIT_AGAIN) from err
+    # What reading took beyond the columns goes back to the system.
+    pa.default_memory_pool().release_unused()
+    return run
+
+
+def log_of(run: Run) -> Path:
+    """Return the log a run was made from: its file, or the bag directory its files lie in.
+
+    Raises
+    ------
+    RunError
+        It is not where it was when the run was made.
+    """
+    files = [Path(file["path"]) for file in run.summary["inputs"]]
+    gone = [file for file in files if not file.is_file()]
+    if gone or not files:
+        what = gone[0] if gone else "a list of inputs"
+        raise RunError(
+            run.directory or run.name, f"the log it was made from is gone ({what})", "put it back, or name it"
+        )
+    folder = files[0].parent
+    packed = files[0].suffix in {".zstd", ".zst"}
+    return folder if len(files) > 1 or packed or (folder / "metadata.yaml").is_file() else files[0]
+
+
+def newest_run(runs: Path) -> Path:
+    """Return the newest run directory below a folder, by the time of its run.json.
+
+    Raises
+    ------
+    RunError
+        There is none.
+    """
+    found = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
+    if not found:
+        raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
+    return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
+
+
+def _config(document: Mapping[str, Any], directory: Path) -> Config:
+    try:
+        return parse_config(document)
+    except ConfigError as err:
+        raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
+
+
+def _read_document(directory: Path) -> dict[str, Any]:
+    try:
+        raw = (directory / RUN_FILE).read_bytes()
+    except OSError as err:
+        why = "not a run directory" if directory.is_dir() else "no such run directory"
+        raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
+    try:
+        document = json.loads(raw)
+    except (ValueError, RecursionError) as err:
+        raise RunError(directory, f"{RUN_FILE} is not JSON", FIT_AGAIN) from err
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not (isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)):
+        raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
+    if schema != RUN_SCHEMA:
+        raise RunError(directory, f"its schema is {schema}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN)
+    return cast("dict[str, Any]", document)
+
+
+def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mapping[str, str]) -> States | None:
+    """Read the first of the named files that the run has; None where it has none of them."""
+    name = next((name for name in names if name in sums), None)
+    if name is None:
+        return None
+    with ThreadPoolExecutor(1) as pool:
+        # Both read the file from end to end; hashing leaves the interpreter to the other.
+        checked = pool.submit(_check_sum, directory, name, sums)
+        try:
+            return read_states(directory / name, names[name])
+        finally:
+            checked.result()
+
+
+def _read_sums(directory: Path) -> dict[str, str]:
+    try:
+        lines = (directory / CHECKSUM_FILE).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise RunError(directory, f"no readable {CHECKSUM_FILE}", FIT_AGAIN) from err
+    return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
+
+
+def _check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
+    try:
+        found = file_b2sum(directory / name)
+    except OSError as err:
+        raise RunError(directory, f"{name} is missing or unreadable", FIT_AGAIN) from err
+    if found != sums.get(name):
+        raise RunError(directory, f"{name} was edited or cut short since the run", FIT_AGAIN)
+
+
+def _spans(pairs: object) -> Ints:
+    return np.array(pairs, np.int64).reshape(-1, 2)

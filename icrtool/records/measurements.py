@@ -1,0 +1,152 @@
+"""What a log's sensors measured once they are aligned: the streams as the filter uses them, and what was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, WheelSamples
+
+Scalar = str | float | bool | None
+"""A value as JSON has it (an int is a float to Python's types)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One estimate of the alignment, and what was done with it.
+
+    Attributes
+    ----------
+    value, std : the estimate and its standard deviation, None where the drive does not show it; unit in its name
+    applied : the correction that the measurements hold
+    why : why it was applied or not
+    """
+
+    value: float | None
+    std: float | None
+    applied: float
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """Positions of the antenna as the filter uses them.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (m,), non-decreasing, of the wheels' clock
+    north_m, east_m : float64 (m,)
+    var_north_m2, var_east_m2 : float64 (m,), finite
+    fix_class : uint8 (m,), keys of `icrtool.alignment.gnss_quality.CLASSES`
+    misreported : bool (m,), reported as RTK-fixed and no fixed solution
+    down_weighted : bool (m,), given a larger variance for their class
+    """
+
+    stamp_ns: Ints
+    north_m: Floats
+    east_m: Floats
+    var_north_m2: Floats
+    var_east_m2: Floats
+    fix_class: Bytes
+    misreported: Bools
+    down_weighted: Bools
+
+    def cut(self, rows: slice) -> Fixes:
+        """Return the fixes of some rows."""
+        return Fixes(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+class IcrStart(NamedTuple):
+    """ICRs to start the filter from, right, left, x, and their standard deviations (3,) [m]."""
+
+    icrs_m: tuple[float, float, float]
+    std_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorData:
+    """The streams of one log as the filter uses them: all it needs of the log.
+
+    Attributes
+    ----------
+    name : of the log
+    headings : clockwise from north, offset corrected; every variance finite
+    gyro : not used by the filter; None without one
+    heading_from_position : heading and position are fields of the same messages: they are late together
+    heading_correlation_s : headings closer together than this err alike
+    antenna_m : the antenna from the body origin, forward and right
+    losses_ns : half-open spans in which RTK was lost, (k, 2)
+    icr_start : ICRs that the alignment found, or that such robots have; None: the preset's start
+    """
+
+    name: str
+    wheels: WheelSamples
+    fixes: Fixes
+    headings: HeadingSamples
+    gyro: GyroSamples | None
+    heading_from_position: bool
+    heading_correlation_s: float
+    antenna_m: tuple[float, float]
+    losses_ns: Ints
+    icr_start: IcrStart | None = None
+
+    def earlier(self, delay_s: float) -> SensorData:
+        """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""
+        if delay_s == 0.0:
+            return self
+        shift = round(delay_s * 1e9)
+        headings = self.headings
+        if self.heading_from_position:
+            headings = replace(headings, stamp_ns=headings.stamp_ns - shift)
+        fixes = replace(self.fixes, stamp_ns=self.fixes.stamp_ns - shift)
+        return replace(self, fixes=fixes, headings=headings, losses_ns=self.losses_ns - shift)
+
+    def part(self, rows: slice) -> SensorData:
+        """Return the part of some wheel samples, with the fixes and headings of that time."""
+        wheels = WheelSamples(*(getattr(self.wheels, field.name)[rows] for field in fields(self.wheels)))
+        span = wheels.stamp_ns[[0, -1]]
+        fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
+        samples = slice(*np.searchsorted(self.headings.stamp_ns, span))
+        headings = HeadingSamples(*(getattr(self.headings, field.name)[samples] for field in fields(self.headings)))
+        return replace(self, wheels=wheels, fixes=self.fixes.cut(fixes), headings=headings)
+
+
+@dataclass(frozen=True, slots=True)
+class FixStatistics:
+    """What the position fixes of a log show of themselves.
+
+    Attributes
+    ----------
+    std_m : by class name, median standard deviation stated or measured [m], NaN where none is known
+    step_std_m : by class name, white noise from step to step [m]; NaN where too few steps show it
+    jump_stamp_ns : (j,) first fix after a jump, before any reference delay is corrected; jump_m : (j,) its size
+    """
+
+    std_m: dict[str, float]
+    step_std_m: dict[str, float]
+    jump_stamp_ns: Ints
+    jump_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """The aligned sensors of one log, and what the alignment found.
+
+    Attributes
+    ----------
+    findings : by name with unit; run.json has them as ``alignment``
+    sections : more numbers for run.json, by section (``wheels``, ``heading``, ``gnss``)
+    position_delay_s : correction of the position's clock that `sensors` holds
+    antenna_is_known : its place was configured, or in the log
+    warnings : sentences for the user, in the order they were found
+    """
+
+    sensors: SensorData
+    findings: dict[str, Finding]
+    sections: dict[str, dict[str, Scalar]]
+    fix_statistics: FixStatistics
+    position_delay_s: float
+    antenna_is_known: bool
+    warnings: tuple[str, ...]
