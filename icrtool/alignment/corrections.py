@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.conventions import AS_NAMED, Convention, Decision, decide_conventions
-from icrtool.alignment.course_over_ground import EXPLAINED, FEWEST_WINDOWS, Course, measure_course
+from icrtool.alignment.course_over_ground import FEWEST_WINDOWS, Course, measure_course
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
 from icrtool.alignment.heading_alignment import (
@@ -35,13 +35,15 @@ from icrtool.records.run import half_width_m
 from icrtool.records.tables import HeadingSamples, RobotLog, WheelSamples
 
 SIGNIFICANT_SIGMAS = 4.0
-SMALLEST_SCALE_ERROR = 0.01
+SMALLEST_SCALE_ERROR, SCALE_SIGMAS, USUAL_SCALE_STD = 0.01, 2.0, 0.04
+"""A scale is corrected by what remains of it beside a prior: wheels roll at their nominal radius to 4 %."""
+
 LARGEST_SCALE_CORRECTION = 0.15
 FACTOR_TWO_TOLERANCE = 0.04
 """A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
-SMALLEST_DELAY_S, SMALLEST_LEAD_S, LARGEST_DELAY_STD_S = 0.08, 0.2, 0.03
+SMALLEST_DELAY_S, SMALLEST_LEAD_S, LARGEST_DELAY_STD_S = 0.08, 0.2, 0.04
 """A robot answers its wheels late, by 0.1 s on rigid-body simulated robots: a stream that leads by as much needs no
 correction, one that lags does."""
 
@@ -270,8 +272,10 @@ def _scale(fit: AlignmentFit | None, config: Config, *, sound: bool, corrects: b
     scale, std = fit.estimate("scale")
     error = abs(scale - 1.0)
     # a heading that scatters makes the path along it shorter by half its variance
-    if error <= max(SMALLEST_SCALE_ERROR, SIGNIFICANT_SIGMAS * std, fit.across_std**2):
+    if error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
         return 1.0, []
+    if error <= LARGEST_SCALE_CORRECTION:
+        scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
     text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     twice = any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))
@@ -337,7 +341,7 @@ def _heading_check(
         notes.append(f"heading is {text} off the course{cause}: applied; frames.heading_offset_deg sets it")
     elif significant:
         notes.append(f"heading is {text} off the course{cause}, {math.degrees(fixed):+.1f}° is applied")
-    noisy = corrects and scatter > NOISY_SCATTER_RAD and course.agreement >= EXPLAINED
+    noisy = corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
     if noisy:
         notes.append(
             f"the heading scatters by {math.degrees(scatter):.0f}° about the course, over whole windows: "
@@ -345,7 +349,8 @@ def _heading_check(
         )
     return HeadingCheck(
         windows=len(course.angle), offset_rad=offset, offset_std_rad=std, scatter_rad=scatter,
-        agreement=course.agreement, mirrored_agreement=course.mirrored_agreement, applied_mirror=mirrored,
+        agreement=course.agreement if len(course.angle) else math.nan,
+        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan, applied_mirror=mirrored,
         applied_offset_rad=applied, applied_std_rad=scatter if noisy else 0.0,
         applied_correlation_s=course.duration_s if noisy else 0.0, name=name,
         warnings=tuple(f"{log.name}: {note}" for note in notes),

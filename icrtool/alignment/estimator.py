@@ -39,10 +39,13 @@ NAMES = (
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.15, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.1, 0.5])
+PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.15, 0.5])
 """They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
-far to either side (middle: 0.15 W). Delays of position and heading of one
-robot usually agree to 0.1 s."""
+far to either side. Delays of position and heading of one
+robot usually agree to 0.15 s."""
+
+MIDDLE_STD_M = 0.1
+"""The middle of the ICRs lies this near to the antenna, to either side."""
 
 SAME_CLOCK_STD_S = 1e-3
 """Fields of the same messages are late together."""
@@ -88,6 +91,11 @@ class AlignmentFit(NamedTuple):
             return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(float(both.sum()))
         row = NAMES.index(name)
         return float(self.fit.x[row]), float(self.fit.std[row])
+
+    @property
+    def heading_scatter(self) -> float:
+        """Robust scatter of the heading [rad], across windows or within a second, whichever is more."""
+        return max(self.across_std, float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
     def across_std(self) -> float:
@@ -136,9 +144,14 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = PRIOR_STD.copy()
     prior_std[TP] = SAME_CLOCK_STD_S if drive.same_clock else prior_std[TP]
-    fit = robust_least_squares(
-        model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
-    )
+    prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
+    try:
+        fit = robust_least_squares(
+            model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
+        )
+    except np.linalg.LinAlgError:
+        # exact data on one circle: nothing separates the parameters
+        return None
     return AlignmentFit(fit, width_m, windows)
 
 
