@@ -10,7 +10,7 @@ import pytest
 
 import icrtool
 from icrtool.errors import IcrToolError, LogError, MissingStreamError
-from icrtool.estimation.fit import FilterRun
+from icrtool.records.run import Run
 
 RUNS = {
     "simulated/wheeled_lawnmower": ("segway-rmp400", (0.74, -0.73, 0.02)),
@@ -23,7 +23,7 @@ ICR_TOLERANCE_M = 0.1
 """The ICRs of a real robot differ by ground and manoeuvre; half a decimetre either way is what the runs show."""
 
 
-def run_of(shared_logs: Path, name: str, robot: str) -> FilterRun:
+def run_of(shared_logs: Path, name: str, robot: str) -> Run:
     config = icrtool.load_config(robot=robot)
     return icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
 
@@ -57,7 +57,7 @@ def test_recorded_logs_of_poor_quality_run_sanely_and_say_what_is_wrong(
 
 def test_the_troubled_log_runs_finds_the_heading_offset_and_rejects_the_outliers(shared_logs: Path) -> None:
     run = run_of(shared_logs, "simulated/tracked_trouble", "pentzer-tracked")
-    assert np.degrees(run.heading_check.applied_offset_rad) == pytest.approx(12.0, abs=0.5)
+    assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(12.0, abs=0.5)
     assert 40 <= run.summary["gnss"]["rejected_by_gate"] <= 70
     assert len(run.outages_ns) == 1
 

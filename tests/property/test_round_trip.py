@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from icrtool.cli.drive_options import PATHS
 from icrtool.cli.simulate import WHEEL_MESSAGES, command
 from icrtool.config import load_config
-from icrtool.estimation.fit import FilterRun, fit
+from icrtool.estimation.fit import fit
 from icrtool.logs import read_log
+from icrtool.records.run import Run
 
 SIGMAS = 3.0
 ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
@@ -24,7 +25,7 @@ LOGS = ("drive.mcap", "drive.bag", "drive")
 
 def round_trip(
     folder: Path, *options: object, robot: str = "pentzer-tracked", log: str = "drive.mcap", sets: tuple[str, ...] = ()
-) -> tuple[FilterRun, pd.DataFrame]:
+) -> tuple[Run, pd.DataFrame]:
     """Simulate by the command, fit, and return the run with the truth."""
     arguments = ["-o", str(folder / log), "--robot", robot, "-q", *map(str, options)]
     done = CliRunner().invoke(command, arguments, catch_exceptions=False)
@@ -34,13 +35,13 @@ def round_trip(
     return run, pd.read_csv(folder / f"{log}.truth.csv")
 
 
-def off_by(run: FilterRun, truth: pd.DataFrame) -> dict[str, float]:
+def off_by(run: Run, truth: pd.DataFrame) -> dict[str, float]:
     """Return how far each final ICR is from the truth, in its own standard deviations."""
     icr = run.summary["icr"]
     return {name: (icr["final"][name] - truth[name].iloc[-1]) / icr["final_std"][name] for name in ICRS}
 
 
-def assert_found(run: FilterRun, truth: pd.DataFrame) -> None:
+def assert_found(run: Run, truth: pd.DataFrame) -> None:
     off = off_by(run, truth)
     assert max(map(abs, off.values())) < SIGMAS, off
 

@@ -12,8 +12,9 @@ import pytest
 from icrtool.alignment.heading_alignment import check_heading
 from icrtool.config import load_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import FilterRun, fit
+from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf_plain import step_state
+from icrtool.records.run import Run
 from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from support.drives import ICRS, make_log
 
@@ -31,7 +32,7 @@ def told(log: RobotLog, psi: Floats) -> RobotLog:
     return replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * psi))))
 
 
-def icrs(run: FilterRun) -> np.ndarray:
+def icrs(run: Run) -> np.ndarray:
     return np.array([run.summary["icr"]["final"][name] for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")])
 
 
@@ -55,7 +56,7 @@ def test_each_convention_is_found_and_put_right(
     expected = icrs(fit(log, load_config(sets=[WIDTH])))
     run = fit(told(log, spoil(log.heading.heading_rad)), load_config(sets=[WIDTH]))
     assert np.abs(icrs(run) - expected).max() < ICR_TOLERANCE_M
-    applied = math.degrees(run.heading_check.applied_offset_rad)
+    applied = run.summary["heading"]["applied_offset_deg"]
     assert math.remainder(applied - offset_deg, 360.0) == pytest.approx(0.0, abs=OFFSET_TOLERANCE_DEG)
     assert any("applied" in warning and words in warning for warning in run.warnings)
 
@@ -130,7 +131,7 @@ def test_a_heading_that_nothing_explains_is_refused_once_and_clearly(
         fit(spoilt, load_config(sets=[WIDTH]))
     assert why in str(caught.value)
     insisting = fit(spoilt, load_config(sets=[WIDTH, "frames.heading_offset_deg=0.0"]))
-    assert insisting.heading_check.applied_offset_rad == 0.0
+    assert insisting.summary["heading"]["applied_offset_deg"] == 0.0
     fit(spoilt, load_config(sets=[WIDTH, "filter.preset=paper"]))
 
 
@@ -187,14 +188,14 @@ def test_outliers_among_the_fixes_do_not_condemn_the_heading() -> None:
     log, rng = clean(), np.random.default_rng(6)
     far = 5.0 * (rng.random(len(log.gnss.north_m)) < 0.15)
     run = fit(replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + far)), load_config(sets=[WIDTH]))
-    assert run.heading_check.applied_offset_rad == pytest.approx(0.0, abs=math.radians(OFFSET_TOLERANCE_DEG))
+    assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(0.0, abs=OFFSET_TOLERANCE_DEG)
 
 
 def test_fixes_that_are_noisier_than_they_say_do_not_condemn_the_heading() -> None:
     log, rng = clean(), np.random.default_rng(7)
     north, east = (column + rng.normal(0.0, 0.5, len(column)) for column in (log.gnss.north_m, log.gnss.east_m))
     run = fit(replace(log, gnss=replace(log.gnss, north_m=north, east_m=east)), load_config(sets=[WIDTH]))
-    check = run.heading_check
-    assert check.agreement > 0.9
-    assert (check.applied_offset_rad, check.applied_std_rad) == (0.0, 0.0)
-    assert abs(check.offset_rad) < 4 * check.offset_std_rad
+    heading = run.summary["heading"]
+    assert heading["agreement"] > 0.9
+    assert (heading["applied_offset_deg"], heading["applied_std_deg"]) == (0.0, 0.0)
+    assert abs(heading["offset_deg"]) < 4 * heading["offset_std_deg"]

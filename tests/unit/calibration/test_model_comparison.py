@@ -12,11 +12,12 @@ from icrtool.calibration.model_comparison import count_blocks, judge_ladder
 from icrtool.calibration.model_trials import Along, cut_trials, predict
 from icrtool.config import parse_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import FilterRun, fit
+from icrtool.estimation.fit import fit
 from icrtool.estimation.measured_heading import MeasuredHeading, measured_headings
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs
 from icrtool.motion.window_fit import cut_windows
+from icrtool.records.run import Run
 from support.drives import make_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -26,16 +27,16 @@ CHORD_M = 1e-5
 
 
 @pytest.fixture(scope="module")
-def run() -> FilterRun:
+def run() -> Run:
     return fit(make_log(0, 180.0, rate=20.0), CONFIG)
 
 
-def edges_of(run: FilterRun) -> np.ndarray:
+def edges_of(run: Run) -> np.ndarray:
     total = float(run.table.distance_m[-1])
     return np.linspace(0.0, total, count_blocks(total) + 1)[1:-1]
 
 
-def test_predictions_equal_the_direct_integration_of_their_model(run: FilterRun) -> None:
+def test_predictions_equal_the_direct_integration_of_their_model(run: Run) -> None:
     """Scales, bend, speed and delay against Euler steps with what they mean, spelt out."""
     trials = cut_trials(run, edges_of(run), (5.0, 10.0))
     blocks = count_blocks(run.table.distance_m[-1])
@@ -60,7 +61,7 @@ def test_predictions_equal_the_direct_integration_of_their_model(run: FilterRun)
         assert mine[start, 1] == pytest.approx(miss, abs=ROUNDING_M)
 
 
-def test_a_delay_of_whole_samples_moves_the_wheels_by_them(run: FilterRun) -> None:
+def test_a_delay_of_whole_samples_moves_the_wheels_by_them(run: Run) -> None:
     trials = cut_trials(run, edges_of(run), (5.0,))
     blocks = count_blocks(run.table.distance_m[-1])
     interval = float(np.median(np.diff(trials.t)))
@@ -72,14 +73,14 @@ def test_a_delay_of_whole_samples_moves_the_wheels_by_them(run: FilterRun) -> No
     assert np.allclose(late[tried], moved[tried], atol=1e-9)
 
 
-def test_all_trials_stay_within_their_block(run: FilterRun) -> None:
+def test_all_trials_stay_within_their_block(run: Run) -> None:
     trials = cut_trials(run, edges_of(run), (5.0, 10.0))
     start, h = np.nonzero(trials.ends >= 0)
     assert len(start) > 100
     assert np.array_equal(trials.block[start], trials.block[trials.ends[start, h]])
 
 
-def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
+def test_along_a_true_heading_the_way_is_the_models_own(run: Run) -> None:
     """A gyro that turns as the wheels say with the ICRs: the way is that of steps along the middle of each turn."""
     trials = cut_trials(run, edges_of(run), (5.0,))
     blocks = count_blocks(run.table.distance_m[-1])
@@ -102,7 +103,7 @@ def test_along_a_true_heading_the_way_is_the_models_own(run: FilterRun) -> None:
     assert np.max(np.abs(along[start, 0] - expected)) < CHORD_M
 
 
-def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run: FilterRun) -> None:
+def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run: Run) -> None:
     heading = run.table.heading_rad
     gyro = MeasuredHeading("gyro", 0.97 * heading + 0.01 * run.table.t_s)
     exact = judge_ladder(run, [MeasuredHeading("gyro", heading.copy())])
@@ -116,7 +117,7 @@ def test_a_gyro_is_scaled_by_other_blocks_and_refused_where_it_does_not_turn(run
     assert "does not turn with the robot" in other.notes[0]
 
 
-def test_a_gyro_of_the_other_sign_is_turned_and_said(run: FilterRun) -> None:
+def test_a_gyro_of_the_other_sign_is_turned_and_said(run: Run) -> None:
     told = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
     usual, turned = (judge_ladder(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
     assert usual.notes == ()
@@ -126,7 +127,7 @@ def test_a_gyro_of_the_other_sign_is_turned_and_said(run: FilterRun) -> None:
         assert np.allclose(one.summary.p95, other.summary.p95, atol=ROUNDING_M, equal_nan=True)
 
 
-def test_no_window_of_a_fit_touches_the_block_held_out(run: FilterRun) -> None:
+def test_no_window_of_a_fit_touches_the_block_held_out(run: Run) -> None:
     windows, edges = cut_windows(run), edges_of(run)
     borders = np.concatenate([[0.0], edges, [np.inf]])
     for block in range(len(borders) - 1):
@@ -135,7 +136,7 @@ def test_no_window_of_a_fit_touches_the_block_held_out(run: FilterRun) -> None:
         assert not np.any((kept.end_m > borders[block]) & (kept.start_m < borders[block + 1]))
 
 
-def test_shuffled_reference_of_a_block_changes_neither_its_fit_nor_its_choice(run: FilterRun) -> None:
+def test_shuffled_reference_of_a_block_changes_neither_its_fit_nor_its_choice(run: Run) -> None:
     before = judge_ladder(run)
     block = 1
     borders = np.concatenate([[0.0], edges_of(run), [np.inf]])
@@ -153,7 +154,7 @@ def test_shuffled_reference_of_a_block_changes_neither_its_fit_nor_its_choice(ru
     assert after.rung("window").summary.p95[1] > before.rung("window").summary.p95[1]
 
 
-def test_all_rungs_are_judged_on_the_same_trials(run: FilterRun) -> None:
+def test_all_rungs_are_judged_on_the_same_trials(run: Run) -> None:
     ladder = judge_ladder(run, measured_headings(run))
     names = [rung.name for rung in ladder.rungs]
     assert names == [
@@ -165,7 +166,7 @@ def test_all_rungs_are_judged_on_the_same_trials(run: FilterRun) -> None:
         assert rung.measured_heading == rung.name.endswith("_heading")
 
 
-def test_constant_icrs_predict_better_than_no_slip_and_momentary(run: FilterRun) -> None:
+def test_constant_icrs_predict_better_than_no_slip_and_momentary(run: Run) -> None:
     ladder = judge_ladder(run)
     p95 = {rung.name: float(rung.summary.p95[1]) for rung in ladder.rungs}
     assert p95["window"] < p95["icr"] < p95["no_slip"]

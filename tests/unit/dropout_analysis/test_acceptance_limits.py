@@ -7,17 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate, parse_gate
+from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
-from icrtool.estimation.fit import FilterRun
-from icrtool.records.dropout import DropoutReport
+from icrtool.records.run import Run
 
 METRICS = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}
 
 
 @pytest.fixture(scope="module")
-def report(run: FilterRun) -> DropoutReport:
+def report(run: Run) -> DropoutReport:
     return dropout(run, [1.0, 2.5, 10.0])
 
 
@@ -32,7 +32,7 @@ def test_a_gate_holds_its_number_against_its_bound(
     value = float(getattr(result.summary, METRICS[metric])[1])
     above, below = value + 0.25, value - 0.25
     for bound in (above, below):
-        verdict = judge_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report)
+        verdict = check_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report)
         assert verdict.value_m == value
         assert verdict.passed == ((bound == above) == (relation[0] == "<"))
         assert verdict.margin_m == pytest.approx(0.25 if verdict.passed else -0.25)
@@ -43,7 +43,7 @@ def test_a_number_on_its_bound_passes_only_where_equality_is_allowed(
     report: DropoutReport, relation: str, passes: bool
 ) -> None:
     value = float(report.results[0].summary.p95[0])
-    verdict = judge_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report)
+    verdict = check_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report)
     assert verdict.passed is passes
     assert verdict.margin_m == 0.0
 
@@ -83,15 +83,15 @@ def test_text_that_is_no_gate_is_refused_with_an_example(text: str) -> None:
 
 def test_an_unknown_model_or_horizon_is_an_error_that_names_what_there_is(report: DropoutReport) -> None:
     with pytest.raises(ConfigError, match="no model calibrated; this run has icr, no_slip, icr_final"):
-        judge_gate(parse_gate("calibrated.p95@1m <= 1"), report)
+        check_gate(parse_gate("calibrated.p95@1m <= 1"), report)
     with pytest.raises(ConfigError, match="no horizon of 7 m"):
-        judge_gate(parse_gate("icr.p95@7m <= 1"), report)
+        check_gate(parse_gate("icr.p95@7m <= 1"), report)
 
 
-def test_a_gate_without_trials_fails_and_says_so(run: FilterRun) -> None:
+def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
     report = dropout(run, [900.0])
     for relation in ("<=", ">="):
-        verdict = judge_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
+        verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
         assert not verdict.passed
         assert math.isnan(verdict.value_m)
         assert verdict.line() == f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log"
@@ -99,7 +99,7 @@ def test_a_gate_without_trials_fails_and_says_so(run: FilterRun) -> None:
 
 def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
     value = float(report.results[0].summary.p95[0])
-    line = judge_gate(parse_gate("icr.p95@1m <= 3"), report).line()
+    line = check_gate(parse_gate("icr.p95@1m <= 3"), report).line()
     assert line == f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m"
 
 

@@ -8,43 +8,42 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
+from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.trials import models_of
-from icrtool.estimation.fit import FilterRun
 from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.records.run import drive_of
+from icrtool.records.run import Run, drive_of
 
 EQUAL_M = 1e-9
 
 
-def errors_of(run: FilterRun, horizon_m: float, model: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(run: Run, horizon_m: float, model: int = 0) -> tuple[np.ndarray, np.ndarray]:
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     return open_loop_errors_direct(drive, models_of(run)[model].icrs, ends)[:, 0], ends[:, 0]
 
 
-def test_the_worst_drives_are_the_largest_that_do_not_overlap(run: FilterRun) -> None:
+def test_the_worst_trials_are_the_largest_that_do_not_overlap(run: Run) -> None:
     errors, ends = errors_of(run, 3.0)
     expected: list[tuple[int, int]] = []
     for start in np.argsort(-np.nan_to_num(errors, nan=-1.0), kind="stable"):
         span = (int(start), int(ends[start]))
         if not np.isnan(errors[start]) and all(span[1] < begin or end < span[0] for begin, end in expected):
             expected.append(span)
-    worst = worst_drives(run, 3.0, count=6)
+    worst = worst_trials(run, 3.0, count=6)
     assert [(drive.start, drive.end) for drive in worst] == expected[:6]
     assert len(worst) == 6
     assert [drive.errors_m["icr"] for drive in worst] == sorted((d.errors_m["icr"] for d in worst), reverse=True)
 
 
-def test_fewer_drives_fit_than_are_asked_for(run: FilterRun) -> None:
-    worst = worst_drives(run, 10.0)
+def test_fewer_drives_fit_than_are_asked_for(run: Run) -> None:
+    worst = worst_trials(run, 10.0)
     assert 1 <= len(worst) < 10
     spans = sorted((drive.start, drive.end) for drive in worst)
     assert all(earlier[1] < later[0] for earlier, later in pairwise(spans))
 
 
-def test_a_drive_tells_time_place_turn_speed_and_paths(run: FilterRun) -> None:
-    drive, table = worst_drives(run, 3.0)[0], run.table
+def test_a_drive_tells_time_place_turn_speed_and_paths(run: Run) -> None:
+    drive, table = worst_trials(run, 3.0)[0], run.table
     k, j = drive.start, drive.end
     assert (drive.stamp_ns, drive.t_s) == (table.stamp_ns[k], table.t_s[k])
     assert (drive.north_m, drive.east_m) == (table.north_m[k], table.east_m[k])
@@ -58,8 +57,8 @@ def test_a_drive_tells_time_place_turn_speed_and_paths(run: FilterRun) -> None:
         assert drive.errors_m[name] == pytest.approx(errors[k], abs=EQUAL_M)
 
 
-def test_examples_are_a_turning_and_a_straight_drive_with_ordinary_errors(run: FilterRun) -> None:
-    cornering, straight = example_drives(run, 5.0)
+def test_examples_are_a_turning_and_a_straight_drive_with_ordinary_errors(run: Run) -> None:
+    cornering, straight = example_trials(run, 5.0)
     errors, ends = errors_of(run, 5.0)
     turned = np.abs(run.table.heading_rad[np.maximum(ends, 0)] - run.table.heading_rad)[ends >= 0]
     assert abs(cornering.heading_change_rad) >= turned.max() - np.radians(10.5)
@@ -68,7 +67,7 @@ def test_examples_are_a_turning_and_a_straight_drive_with_ordinary_errors(run: F
         assert errors[drive.start] < np.nanmax(errors)
 
 
-def test_no_drive_is_long_enough(make_run: Callable[..., FilterRun]) -> None:
+def test_no_drive_is_long_enough(make_run: Callable[..., Run]) -> None:
     parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False)
-    assert worst_drives(parked) == ()
-    assert example_drives(parked) == ()
+    assert worst_trials(parked) == ()
+    assert example_trials(parked) == ()

@@ -12,22 +12,23 @@ import pytest
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.filter_setup import WarmStart
-from icrtool.estimation.fit import STATE_COLUMNS, FilterRun, fit
+from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf_plain import step_state
+from icrtool.records.run import STATE_COLUMNS, Run, WarmStart
+from support.barn import simulate
 
 
 @pytest.fixture(scope="module")
-def clean(make_run: Callable[..., FilterRun]) -> FilterRun:
+def clean(make_run: Callable[..., Run]) -> Run:
     return make_run(troubles=False)
 
 
-def seconds(run: FilterRun, spans: tuple[tuple[int, int], ...]) -> list[tuple[float, float]]:
+def seconds(run: Run, spans: tuple[tuple[int, int], ...]) -> list[tuple[float, float]]:
     origin = int(run.table.stamp_ns[0])
     return [((begin - origin) / 1e9, (end - origin) / 1e9) for begin, end in spans]
 
 
-def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: FilterRun) -> None:
+def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: Run) -> None:
     last = clean.table.t_s[-1]
     for length in (1.0, 4.0, 10.0):
         spans = seconds(clean, plan_outages(clean, length))
@@ -41,7 +42,7 @@ def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: FilterRun) -> No
         assert pauses == pytest.approx(pauses[:1] * len(pauses), abs=0.03)
 
 
-def test_no_spaced_outage_begins_where_the_robot_stands(clean: FilterRun) -> None:
+def test_no_spaced_outage_begins_where_the_robot_stands(clean: Run) -> None:
     t, way = clean.table.t_s, clean.table.distance_m
     stood = np.interp(np.where(t < 20, t, np.maximum(t - 20, 20)), t, way)
     parked = replace(clean, table=replace(clean.table, distance_m=stood))
@@ -52,7 +53,7 @@ def test_no_spaced_outage_begins_where_the_robot_stands(clean: FilterRun) -> Non
         assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.1
 
 
-def test_no_outage_reaches_into_one_of_the_logs_own(run: FilterRun) -> None:
+def test_no_outage_reaches_into_one_of_the_logs_own(run: Run) -> None:
     origin = int(run.table.stamp_ns[0])
     ((own_begin, own_end),) = [((a - origin) / 1e9, (b - origin) / 1e9) for a, b in run.outages_ns.tolist()]
     spans = seconds(run, plan_outages(run, 2.0))
@@ -62,14 +63,14 @@ def test_no_outage_reaches_into_one_of_the_logs_own(run: FilterRun) -> None:
         plan_outages(run, 2.0, (own_begin - 1.0,))
 
 
-def test_an_outage_that_takes_nothing_away_is_refused(clean: FilterRun) -> None:
+def test_an_outage_that_takes_nothing_away_is_refused(clean: Run) -> None:
     for length, begin in ((5.0, 0.0), (1e-6, 20.0)):
         with pytest.raises(ConfigError, match="fewer than two states"):
             force_outages(clean, plan_outages(clean, length, (begin,)))
 
 
-def test_outages_do_not_change_how_headings_at_odd_times_are_weighed(make_run: Callable[..., FilterRun]) -> None:
-    log = make_run(troubles=False).log
+def test_outages_do_not_change_how_headings_at_odd_times_are_weighed(make_run: Callable[..., Run]) -> None:
+    log = simulate(troubles=False)
     # A little more than half of the headings come at a third of the rate: without some of them the median interval
     # would be that of the others.
     rows = np.arange(len(log.heading.stamp_ns))
@@ -81,7 +82,7 @@ def test_outages_do_not_change_how_headings_at_odd_times_are_weighed(make_run: C
     assert force_outages(run, plan_outages(run, 15.0, (40.0,)))
 
 
-def test_outages_stand_where_they_are_asked_for(clean: FilterRun) -> None:
+def test_outages_stand_where_they_are_asked_for(clean: Run) -> None:
     assert seconds(clean, plan_outages(clean, 5.0, (30.0, 12.0))) == [(12.0, 17.0), (30.0, 35.0)]
 
 
@@ -97,12 +98,12 @@ def test_outages_stand_where_they_are_asked_for(clean: FilterRun) -> None:
         (5.0, (10.0, 15.0), "reach into"),
     ],
 )
-def test_outages_that_do_not_fit_are_refused(clean: FilterRun, length: float, at: tuple[float, ...], why: str) -> None:
+def test_outages_that_do_not_fit_are_refused(clean: Run, length: float, at: tuple[float, ...], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         plan_outages(clean, length, at)
 
 
-def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: FilterRun) -> None:
+def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: Run) -> None:
     (outage,) = force_outages(clean, plan_outages(clean, 8.0, (20.0,)))
     table = clean.table
     first, last = np.searchsorted(table.t_s, [20.0, 28.0])
@@ -123,33 +124,37 @@ def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: F
     assert outage.distance_m == pytest.approx(table.distance_m[last - 1] - table.distance_m[first])
 
 
-def test_the_filter_learns_on_after_a_forced_outage(clean: FilterRun) -> None:
+def test_the_filter_learns_on_after_a_forced_outage(clean: Run) -> None:
     alone = force_outages(clean, plan_outages(clean, 5.0, (40.0,)))[0]
     after_another = force_outages(clean, plan_outages(clean, 5.0, (20.0, 40.0)))[1]
     assert after_another.end_error_m == pytest.approx(alone.end_error_m, abs=0.05)
 
 
-def test_an_outage_is_never_better_than_none_and_none_costs_nothing(clean: FilterRun) -> None:
+def test_an_outage_is_never_better_than_none_and_none_costs_nothing(clean: Run) -> None:
     short, long = (force_outages(clean, plan_outages(clean, length, (20.0,)))[0] for length in (0.1, 15.0))
     assert 0 <= short.max_error_m < 0.03 < long.max_error_m
     for outage in (short, long):
         assert outage.end_error_m <= outage.max_error_m
 
 
-def test_a_warm_started_run_is_made_again_from_its_own_start(clean: FilterRun) -> None:
-    warm = fit(clean.log, clean.config, warm_start=WarmStart(np.array([0.9, -0.4, 0.2]), 1e-4 * np.eye(3)))
+def test_a_warm_started_run_is_made_again_from_its_own_start(clean: Run) -> None:
+    warm = fit(
+        simulate(troubles=False), clean.config, warm_start=WarmStart(np.array([0.9, -0.4, 0.2]), 1e-4 * np.eye(3))
+    )
     (cold_outage,), (outage,) = (force_outages(run, plan_outages(run, 5.0, (2.0,))) for run in (clean, warm))
     assert outage.end_error_m != pytest.approx(cold_outage.end_error_m, rel=0.01)
+    began_cold = {**warm.summary, "filter": {**warm.summary["filter"], "warm_start": None}}
+    cold = replace(warm, summary=began_cold)
     with pytest.raises(DataError, match="cannot be made again"):
-        force_outages(replace(warm, warm_start=None), plan_outages(warm, 5.0, (20.0,)))
+        force_outages(cold, plan_outages(warm, 5.0, (20.0,)))
 
 
-def test_a_run_with_terrain_changes_is_made_again_with_them(clean: FilterRun) -> None:
-    changing = fit(clean.log, clean.config, changes_s=(15.0,))
+def test_a_run_with_terrain_changes_is_made_again_with_them(clean: Run) -> None:
+    changing = fit(simulate(troubles=False), clean.config, changes_s=(15.0,))
     assert len(force_outages(changing, plan_outages(changing, 5.0, (20.0,)))) == 1
 
 
-def test_a_real_outage_is_judged_at_reacquisition(run: FilterRun) -> None:
+def test_a_real_outage_is_judged_at_reacquisition(run: Run) -> None:
     (outage,), table = real_outages(run), run.table
     (begin, end), origin = run.outages_ns[0], table.stamp_ns[0]
     assert (outage.kind, outage.begin_s, outage.end_s) == ("real", (begin - origin) / 1e9, (end - origin) / 1e9)
@@ -161,7 +166,7 @@ def test_a_real_outage_is_judged_at_reacquisition(run: FilterRun) -> None:
     assert len(outage.north_m) == last - first + 1
 
 
-def test_a_real_outage_that_never_ends_or_spans_a_wheel_gap_has_no_miss(run: FilterRun) -> None:
+def test_a_real_outage_that_never_ends_or_spans_a_wheel_gap_has_no_miss(run: Run) -> None:
     (begin, end), last = run.outages_ns[0], int(run.table.stamp_ns[-1])
     endless = replace(run, outages_ns=np.array([[begin, last + 1]]))
     assert real_outages(endless) == ()

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.dropout_analysis.smoothed_reference import held_against
+from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
-from icrtool.estimation.fit import FilterRun, fit
-from icrtool.estimation.smooth import smooth
+from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf_plain import step_state
-from icrtool.records.tables import States
+from icrtool.records.run import Run
 from support.drives import ICRS, make_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -20,14 +19,13 @@ NOISY_M = 0.3
 
 
 @pytest.fixture(scope="module")
-def noisy() -> tuple[FilterRun, States]:
-    run = fit(make_log(3, 120.0, gnss_std=NOISY_M), CONFIG)
-    return run, smooth(run)
+def noisy() -> Run:
+    return fit(make_log(3, 120.0, gnss_std=NOISY_M), CONFIG, smooth=True)
 
 
-def true_places(run: FilterRun) -> np.ndarray:
+def true_places(run: Run) -> np.ndarray:
     """Drive the log's wheel speeds with its true ICRs from its true start, in steps as the log was made."""
-    wheels = run.log.wheels
+    wheels = run.sensors.wheels
     x = np.array([10.0, -5.0, 0.3, *ICRS])
     places = [x[:2]]
     for k, dt in enumerate(np.diff(wheels.stamp_ns) / 1e9):
@@ -37,9 +35,9 @@ def true_places(run: FilterRun) -> np.ndarray:
     return np.array(places[first:])
 
 
-def test_with_poor_fixes_the_smoother_is_nearer_to_the_truth_than_the_filter(noisy: tuple[FilterRun, States]) -> None:
-    run, smoothed = noisy
-    truth, judged = true_places(run), held_against(run, smoothed)
+def test_with_poor_fixes_the_smoother_is_nearer_to_the_truth_than_the_filter(noisy: Run) -> None:
+    run = noisy
+    truth, judged = true_places(run), with_smoothed_reference(run)
     misses = [
         float(np.sqrt(((np.column_stack([table.north_m, table.east_m]) - truth) ** 2).sum(axis=1).mean()))
         for table in (judged.table, run.table)
@@ -48,9 +46,9 @@ def test_with_poor_fixes_the_smoother_is_nearer_to_the_truth_than_the_filter(noi
     assert misses[1] < NOISY_M
 
 
-def test_models_starts_and_trials_stay_the_filters(noisy: tuple[FilterRun, States]) -> None:
-    run, smoothed = noisy
-    judged = held_against(run, smoothed)
+def test_models_starts_and_trials_stay_the_filters(noisy: Run) -> None:
+    run = noisy
+    judged = with_smoothed_reference(run)
     for one, other in zip(models_of(judged), models_of(run), strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(one.icrs, other.icrs, strict=True))
     held, plain = (dropout(one, [5.0]) for one in (judged, run))

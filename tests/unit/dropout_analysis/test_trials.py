@@ -16,10 +16,9 @@ import icrtool
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.trials import Model, configured_horizons_m, dropout, models_of
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.fit import FilterRun
 from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.kernels.trials import FrozenIcrs
-from icrtool.records.run import drive_of
+from icrtool.records.run import Run, drive_of
 
 EQUAL_M = 1e-9
 """What the fast algorithm promises against direct integration."""
@@ -37,7 +36,7 @@ def gathered(run, horizons_m=HORIZONS_M, **options):
     return dropout(run, horizons_m, sink=sink, **options), errors
 
 
-def changed(run: FilterRun, **columns) -> SimpleNamespace:
+def changed(run: Run, **columns) -> SimpleNamespace:
     return SimpleNamespace(
         name=run.name,
         table=replace(run.table, **columns),
@@ -48,7 +47,7 @@ def changed(run: FilterRun, **columns) -> SimpleNamespace:
     )
 
 
-def test_every_single_error_equals_brute_force_for_all_models(run: FilterRun) -> None:
+def test_every_single_error_equals_brute_force_for_all_models(run: Run) -> None:
     _, errors = gathered(run)
     drive, horizons = drive_of(run), np.array(HORIZONS_M)
     ends = trial_ends(drive, horizons)
@@ -59,7 +58,7 @@ def test_every_single_error_equals_brute_force_for_all_models(run: FilterRun) ->
             np.testing.assert_allclose(errors[model.name, horizon], expected[:, h], rtol=0, atol=EQUAL_M)
 
 
-def test_the_summary_is_that_of_the_single_errors(run: FilterRun) -> None:
+def test_the_summary_is_that_of_the_single_errors(run: Run) -> None:
     report, errors = gathered(run)
     frame = report.summary.set_index(["model", "horizon_m"])
     for key, error in errors.items():
@@ -76,7 +75,7 @@ def test_the_summary_is_that_of_the_single_errors(run: FilterRun) -> None:
             assert row[column] == pytest.approx(value, rel=1e-12)
 
 
-def test_the_contracts_columns_come_first(run: FilterRun) -> None:
+def test_the_contracts_columns_come_first(run: Run) -> None:
     assert list(icrtool.dropout(run, [1.0]).summary.columns)[:9] == [
         "model",
         "horizon_m",
@@ -90,7 +89,7 @@ def test_the_contracts_columns_come_first(run: FilterRun) -> None:
     ]
 
 
-def test_starts_that_are_no_trial_are_counted_by_kind(run: FilterRun) -> None:
+def test_starts_that_are_no_trial_are_counted_by_kind(run: Run) -> None:
     report = dropout(run, HORIZONS_M)
     table, counts = run.table, report.counts
     assert report.states == len(table)
@@ -113,13 +112,13 @@ def test_starts_that_are_no_trial_are_counted_by_kind(run: FilterRun) -> None:
         assert sum(kinds.values()) == len(table)
 
 
-def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., FilterRun]) -> None:
+def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., Run]) -> None:
     report = dropout(make_run(track_width_m=None, duration_s=20.0), [1.0])
     assert [result.name for result in report.results] == ["icr", "icr_final"]
     assert report.result("no_slip") is None
 
 
-def test_a_model_is_data(run: FilterRun) -> None:
+def test_a_model_is_data(run: Run) -> None:
     models = [Model("mine", "my own", FrozenIcrs.constant(0.3, -0.3, 0.0))]
     mine, known = dropout(run, [5.0], models=models).result("mine"), dropout(run, [5.0]).result("no_slip")
     assert mine is not None
@@ -128,7 +127,7 @@ def test_a_model_is_data(run: FilterRun) -> None:
     assert dropout(run, [5.0], models=models).counts.trials == known.summary.trials
 
 
-def test_rotating_and_shifting_the_world_changes_no_error(run: FilterRun) -> None:
+def test_rotating_and_shifting_the_world_changes_no_error(run: Run) -> None:
     _, before = gathered(run)
     angle, table = 2.0, run.table
     cos, sin = math.cos(angle), math.sin(angle)
@@ -139,7 +138,7 @@ def test_rotating_and_shifting_the_world_changes_no_error(run: FilterRun) -> Non
         np.testing.assert_allclose(after[key], error, rtol=0, atol=EQUAL_M)
 
 
-def test_neither_order_nor_company_of_horizons_matters(run: FilterRun) -> None:
+def test_neither_order_nor_company_of_horizons_matters(run: Run) -> None:
     report, errors = gathered(run)
     reverse, others = gathered(run, [*HORIZONS_M[::-1], 1.0, 7.0])
     assert reverse.horizons_m.tolist() == [0.5, 1.0, 3.0, 7.0, 10.0]
@@ -149,7 +148,7 @@ def test_neither_order_nor_company_of_horizons_matters(run: FilterRun) -> None:
     assert alone.p95_low[0] == pytest.approx(together.p95_low[2], abs=EQUAL_M)
 
 
-def test_small_tables_and_small_ranges_give_the_same(run: FilterRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     report = dropout(run, HORIZONS_M)
     monkeypatch.setattr(module, "LARGEST_TABLE_BYTES", 1)
     monkeypatch.setattr(module, "STARTS_A_CALL", 333)
@@ -160,7 +159,7 @@ def test_small_tables_and_small_ranges_give_the_same(run: FilterRun, monkeypatch
         np.testing.assert_allclose(np.array(ours.intervals), np.array(theirs.intervals), rtol=0, atol=EQUAL_M)
 
 
-def test_intervals_hold_the_estimate_and_depend_on_the_seed_alone(run: FilterRun) -> None:
+def test_intervals_hold_the_estimate_and_depend_on_the_seed_alone(run: Run) -> None:
     reports = [dropout(run, [2.0], seed=seed) for seed in (1, 1, 2)]
     spans = [(r.results[0].intervals.p95_low[0], r.results[0].intervals.p95_high[0]) for r in reports]
     assert spans[0] == spans[1] != spans[2]
@@ -168,7 +167,7 @@ def test_intervals_hold_the_estimate_and_depend_on_the_seed_alone(run: FilterRun
     assert [r.seed for r in reports] == [1, 1, 2]
 
 
-def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: FilterRun) -> None:
+def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
     for result in dropout(run, HORIZONS_M).results:
         for h, bins in enumerate(result.histograms):
             assert bins.percent.sum() == pytest.approx(100.0)
@@ -177,7 +176,7 @@ def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: FilterRun) -> None
             assert np.count_nonzero(bins.left < result.summary.p95[h]) >= 6
 
 
-def test_horizons_default_to_the_configured_ones(run: FilterRun) -> None:
+def test_horizons_default_to_the_configured_ones(run: Run) -> None:
     assert configured_horizons_m(run) == tuple(float(d) for d in range(1, 21))
     summary = {**run.summary, "config": {**run.summary["config"], "dropout": {"horizons_m": [4.0, 2.0]}}}
     stub = changed(run)
@@ -186,25 +185,25 @@ def test_horizons_default_to_the_configured_ones(run: FilterRun) -> None:
 
 
 @pytest.mark.parametrize("horizons", [[], [0.0], [-1.0], [math.inf], [math.nan]])
-def test_horizons_that_are_no_distances_are_refused(run: FilterRun, horizons: list[float]) -> None:
+def test_horizons_that_are_no_distances_are_refused(run: Run, horizons: list[float]) -> None:
     with pytest.raises(ConfigError, match="horizons"):
         dropout(run, horizons)
 
 
-def test_a_run_of_one_state_is_refused(run: FilterRun) -> None:
+def test_a_run_of_one_state_is_refused(run: Run) -> None:
     stub = changed(run, **{name: column[:1] for name, column in run.table.columns().items()})
     with pytest.raises(DataError, match="1 states"):
         dropout(stub, [1.0])
 
 
-def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..., FilterRun]) -> None:
+def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..., Run]) -> None:
     report = dropout(make_run(duration_s=12.0, troubles=False), [500.0])
     assert report.counts.trials.tolist() == [0]
     assert np.isnan(report.results[0].summary.p95).all()
     assert np.isnan(report.summary.p95_pct).all()
 
 
-def test_standing_states_are_counted(make_run: Callable[..., FilterRun]) -> None:
+def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
     assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
     parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False)
     assert dropout(parked, [1.0]).standing == len(parked.table) - 1
@@ -222,7 +221,7 @@ def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
-def test_two_models_of_one_name_are_refused(run: FilterRun) -> None:
+def test_two_models_of_one_name_are_refused(run: Run) -> None:
     model = models_of(run)[0]
     with pytest.raises(ValueError, match="same name"):
         dropout(run, [1.0], models=[model, model])

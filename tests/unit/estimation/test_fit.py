@@ -12,9 +12,10 @@ import pytest
 from icrtool.calibration.findings import calibrate
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.filter_setup import WarmStart, chi2_gate
+from icrtool.estimation.filter_setup import chi2_gate
 from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf import GATED
+from icrtool.records.run import WarmStart
 from icrtool.records.tables import PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import Drive, Sensors, move, sense
 from icrtool.simulation.paths import PathPlan
@@ -89,7 +90,7 @@ def test_one_wild_fix_is_rejected_and_counted_in_preset_field() -> None:
 
 def test_a_heading_offset_is_found_applied_and_said() -> None:
     run = fit(make_log(heading_offset_deg=12.0), load_config(sets=[WIDTH]))
-    assert math.degrees(run.heading_check.applied_offset_rad) == pytest.approx(12.0, abs=0.5)
+    assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(12.0, abs=0.5)
     assert any("applied" in warning for warning in run.warnings)
     assert run.table.x_icr_m[-1] == pytest.approx(ICRS[2], abs=ICR_TOLERANCE_M)
 
@@ -97,7 +98,7 @@ def test_a_heading_offset_is_found_applied_and_said() -> None:
 def test_a_configured_heading_offset_is_used_as_it_is() -> None:
     config = load_config(sets=[WIDTH, "frames.heading_offset_deg=12.0"])
     run = fit(make_log(heading_offset_deg=12.0), config)
-    assert math.degrees(run.heading_check.applied_offset_rad) == pytest.approx(12.0)
+    assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(12.0)
     assert not any("off the course" in warning for warning in run.warnings)
 
 
@@ -110,11 +111,11 @@ def test_a_heading_of_the_other_convention_is_turned_over_and_said() -> None:
     other = math.pi / 2 - log.heading.heading_rad
     wrong = replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * other))))
     run = fit(wrong, load_config(sets=[WIDTH]))
-    assert run.heading_check.applied_mirror
+    assert run.summary["heading"]["applied_mirror"]
     assert any("other convention" in warning for warning in run.warnings)
     assert run.table.y_icr_right_m[-1] == pytest.approx(ICRS[0], abs=ICR_TOLERANCE_M)
     kept = fit(wrong, load_config(sets=[WIDTH, "frames.heading=enu"]))
-    assert not kept.heading_check.applied_mirror
+    assert not kept.summary["heading"]["applied_mirror"]
     assert any("set frames.heading" in warning for warning in kept.warnings)
 
 
@@ -127,7 +128,7 @@ def test_a_configured_lever_arm_is_taken_off_the_fixes() -> None:
 
 def test_a_warm_start_begins_with_the_other_runs_icrs_and_certainty() -> None:
     first = fit(make_log(), load_config(sets=[WIDTH]))
-    start = WarmStart(np.array(ICRS), first.covariance[3:, 3:])
+    start = WarmStart(np.array(ICRS), first.ended_with.covariance_m2)
     second = fit(make_log(seed=1), load_config(sets=[WIDTH]), warm_start=start)
     assert second.table.y_icr_right_m[0] == ICRS[0]
     assert second.table.std_y_icr_right_m[0] < 0.1 * 0.4

@@ -5,15 +5,18 @@ from __future__ import annotations
 import pytest
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.observability import judge_excitation
+from icrtool.estimation.observability import Excitation, find_excitation
+from icrtool.records.run import Run, drive_of
 from support.exact_drives import CONFIG, simulate
+
+
+def excitation_of(run: Run) -> Excitation:
+    return find_excitation(run.table, drive_of(run), run.track_width_m)
 
 
 @pytest.fixture(scope="module")
 def varied():
-    return judge_excitation(
-        fit(simulate(0, seconds=120.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG)
-    )
+    return excitation_of(fit(simulate(0, seconds=120.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG))
 
 
 def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
@@ -25,21 +28,19 @@ def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
 
 
 def test_a_straight_drive_shows_none_and_asks_for_spins() -> None:
-    found = judge_excitation(fit(simulate(0, path="straight", seconds=60.0, offset_deg=0.0), CONFIG))
+    found = excitation_of(fit(simulate(0, path="straight", seconds=60.0, offset_deg=0.0), CONFIG))
     assert set(found.verdicts.values()) == {"not shown"}
     assert "add two spins each way" in found.sentences[-1]
 
 
 def test_a_circle_asks_for_the_other_way() -> None:
-    found = judge_excitation(fit(simulate(0, path="circle", seconds=60.0, offset_deg=0.0), CONFIG))
+    found = excitation_of(fit(simulate(0, path="circle", seconds=60.0, offset_deg=0.0), CONFIG))
     assert not found.sufficient
     assert "to the left" in found.sentences[-1]
 
 
 def test_more_way_tells_more(varied) -> None:
-    longer = judge_excitation(
-        fit(simulate(0, seconds=240.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG)
-    )
+    longer = excitation_of(fit(simulate(0, seconds=240.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG))
     assert all(longer.std_m[name] < std for name, std in varied.std_m.items())
 
 

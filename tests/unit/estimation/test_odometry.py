@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.estimation.fit import FilterRun
-from icrtool.estimation.odometry import icr_odometry, no_slip_odometry
+from icrtool.estimation.odometry import odometry
+from icrtool.records.run import Run
 
 ROUNDING_M = 1e-9
 
 
-def plain_path(run: FilterRun, y_right: float, y_left: float, x: float) -> np.ndarray:
+def plain_path(run: Run, y_right: float, y_left: float, x: float) -> np.ndarray:
     """Eqs. 8-12, Euler, state by state; over a gap the filter's own motion, seen from the odometry's heading."""
     table = run.table
     place, psi = np.array([table.north_m[0], table.east_m[0]]), table.heading_rad[0]
@@ -35,32 +35,40 @@ def plain_path(run: FilterRun, y_right: float, y_left: float, x: float) -> np.nd
 
 
 @pytest.mark.parametrize("gaps", [(), (700,), (0, 700, 701, 1500), (2000,)])
-def test_odometry_is_the_plain_integration_gaps_included(run: FilterRun, gaps: tuple[int, ...]) -> None:
+def test_odometry_is_the_plain_integration_gaps_included(run: Run, gaps: tuple[int, ...]) -> None:
     in_gap = np.zeros(len(run.table), np.bool_)
     in_gap[list(gaps)] = True
     gappy = replace(run, in_gap=in_gap)
     table = run.table
     expected = plain_path(gappy, table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
-    found = icr_odometry(gappy)
+    found = odometry(gappy).icr
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
     end = np.hypot(expected[0, -1] - table.north_m[-1], expected[1, -1] - table.east_m[-1])
     assert abs(found.end_error_m - end) < ROUNDING_M
 
 
-def test_no_slip_drives_with_half_the_width_on_either_side(run: FilterRun) -> None:
+def test_no_slip_drives_with_half_the_width_on_either_side(run: Run) -> None:
     expected = plain_path(run, 0.3, -0.3, 0.0)
-    found = no_slip_odometry(run)
+    found = odometry(run).no_slip
     assert found is not None
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
 
 
-def test_learned_icrs_lead_closer_than_no_slip(run: FilterRun) -> None:
-    no_slip = no_slip_odometry(run)
+def test_learned_icrs_lead_closer_than_no_slip(run: Run) -> None:
+    no_slip = odometry(run).no_slip
     assert no_slip is not None
-    assert icr_odometry(run).end_error_m < 0.5 * no_slip.end_error_m
+    assert odometry(run).icr.end_error_m < 0.5 * no_slip.end_error_m
 
 
-def test_without_width_there_is_no_no_slip_path(make_run: Callable[..., FilterRun]) -> None:
-    assert no_slip_odometry(make_run(track_width_m=None, duration_s=20.0)) is None
+def test_without_width_there_is_no_no_slip_path(make_run: Callable[..., Run]) -> None:
+    assert odometry(make_run(track_width_m=None, duration_s=20.0)).no_slip is None
+
+
+def test_the_summary_holds_the_end_errors(run: Run) -> None:
+    paths = odometry(run)
+    assert paths.no_slip is not None
+    stored = run.summary["odometry"]
+    assert stored["icr"]["end_error_m"] == paths.icr.end_error_m
+    assert stored["no_slip"]["end_error_m"] == paths.no_slip.end_error_m

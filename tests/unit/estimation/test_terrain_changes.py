@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.estimation.fit import FilterRun, fit
-from icrtool.estimation.summary import ICR_COLUMNS
+from icrtool.estimation.fit import fit
 from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR, find_terrain_changes
 from icrtool.output.figures.icrs import draw_icr_estimates
 from icrtool.output.tables.run import format_run
+from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import Drive, Icrs, Sensors, move, sense
 from icrtool.simulation.paths import PathPlan
@@ -51,19 +51,23 @@ def drive(
 
 
 @cache
-def changed() -> FilterRun:
-    log = drive(3, PATHS["curved"], 240.0, ((80.0, WIDER), (160.0, ICRS)), slip=0.0)
-    return fit(log, CONFIG, find_changes=True)
+def changing_log() -> RobotLog:
+    return drive(3, PATHS["curved"], 240.0, ((80.0, WIDER), (160.0, ICRS)), slip=0.0)
+
+
+@cache
+def changed() -> Run:
+    return fit(changing_log(), CONFIG, find_changes=True)
 
 
 def test_a_robot_on_one_terrain_raises_no_more_alarms_than_stated() -> None:
     runs = [fit(drive(seed, path, 250.0), CONFIG, find_changes=True) for path in PATHS.values() for seed in range(4)]
-    hours = sum(run.terrain.driven_h for run in runs)
+    hours = sum(run.summary["terrain"]["driven_h"] for run in runs)
     assert hours > 1.0
-    assert all(run.terrain.blocks > 20 for run in runs)
+    assert all(run.summary["terrain"]["blocks"] > 20 for run in runs)
     # the stated mean is a tenth of one: two are improbable (0.5 %)
     assert FALSE_ALARMS_PER_HOUR * hours < 0.12
-    assert sum(len(run.terrain.changes) for run in runs) <= 1
+    assert sum(len(run.changes_s) for run in runs) <= 1
 
 
 def test_icrs_that_grow_by_a_third_are_found_within_seconds() -> None:
@@ -72,8 +76,9 @@ def test_icrs_that_grow_by_a_third_are_found_within_seconds() -> None:
     for path in PATHS.values():
         for seed in range(5):
             run = fit(drive(seed, path, 150.0, ((76.0, new),), slip=SLIP / 2), CONFIG, find_changes=True)
-            delays += [change.t_s - 76.0 for change in run.terrain.changes]
-            assert all((change.statistic or 0.0) > run.terrain.threshold for change in run.terrain.changes)
+            delays += [t - 76.0 for t in run.changes_s]
+            terrain = run.summary["terrain"]
+            assert all((change["statistic"] or 0.0) > terrain["threshold"] for change in terrain["changes"])
             late = run.table.t_s > 110.0
             medians = [float(np.median(getattr(run.table, column)[late])) for column in ICR_COLUMNS]
             misses.append(float(np.abs(np.array(medians) - new).max()))
@@ -90,10 +95,11 @@ def test_segments_have_their_own_icrs_and_stand_in_every_result() -> None:
     assert run.changes_s == pytest.approx((80.0, 160.0), abs=3.0)
     assert [change["source"] for change in summary["terrain"]["changes"]] == ["detected", "detected"]
     assert summary["terrain"]["false_alarms_per_hour"] == FALSE_ALARMS_PER_HOUR
+    terrain = summary["terrain"]
     for segment, truth in zip(summary["segments"], (ICRS, WIDER, ICRS), strict=True):
         assert [segment["mean"][column] for column in ICR_COLUMNS] == pytest.approx(truth, abs=0.02)
         assert all(0 <= segment["std"][column] < 0.02 for column in ICR_COLUMNS)
-    assert f"{run.terrain.changes[0].statistic:.1f} σ > {run.terrain.threshold:.1f} σ" in format_run(run)
+    assert f"{terrain['changes'][0]['statistic']:.1f} σ > {terrain['threshold']:.1f} σ" in format_run(run)
     panels = draw_icr_estimates(run).axes
     for t in run.changes_s:
         assert any(t in np.asarray(line.get_xdata()) for axes in panels for line in axes.lines)
@@ -101,14 +107,14 @@ def test_segments_have_their_own_icrs_and_stand_in_every_result() -> None:
 
 def test_a_run_that_is_told_of_what_was_found_is_the_same_run() -> None:
     run = changed()
-    told = fit(run.log, CONFIG, changes_s=run.changes_s)
+    told = fit(changing_log(), CONFIG, changes_s=run.changes_s)
     np.testing.assert_array_equal(told.table.x_icr_m, run.table.x_icr_m)
-    assert [change.source for change in told.terrain.changes] == ["given", "given"]
+    assert [change["source"] for change in told.summary["terrain"]["changes"]] == ["given", "given"]
 
 
 def test_given_changes_are_kept_and_not_found_again() -> None:
-    run = fit(changed().log, CONFIG, changes_s=(80.0,), find_changes=True)
-    assert [change.source for change in run.terrain.changes] == ["given", "detected"]
+    run = fit(changing_log(), CONFIG, changes_s=(80.0,), find_changes=True)
+    assert [change["source"] for change in run.summary["terrain"]["changes"]] == ["given", "detected"]
     assert run.changes_s == pytest.approx((80.0, 160.0), abs=3.0)
 
 
@@ -130,7 +136,7 @@ def test_a_change_beyond_the_drive_is_none_and_said() -> None:
 def test_a_straight_drive_cannot_be_searched_and_says_so() -> None:
     run = fit(drive(0, PathPlan("straight", 0.5), 40.0), CONFIG, find_changes=True)
     assert run.terrain.searched
-    assert run.terrain.changes == ()
+    assert run.changes_s == ()
     assert run.summary["terrain"]["threshold"] is None
     assert "too few turns" in format_run(run)
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.estimation.fit import FilterRun, fit
+from icrtool.estimation.fit import fit
+from icrtool.records.run import Run
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap"
@@ -35,7 +36,7 @@ def expected(clean: RobotLog) -> np.ndarray:
     return icrs(fit(clean, CONFIG))
 
 
-def icrs(run: FilterRun) -> np.ndarray:
+def icrs(run: Run) -> np.ndarray:
     return np.array([run.summary["icr"]["final"][name] for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")])
 
 
@@ -165,7 +166,7 @@ def test_trouble_leaves_the_icrs_of_the_clean_log(
 ) -> None:
     run = fit(spoil(clean), CONFIG)
     assert np.abs(icrs(run) - expected).max() < ICR_TOLERANCE_M
-    applied = math.degrees(run.heading_check.applied_offset_rad)
+    applied = run.summary["heading"]["applied_offset_deg"]
     assert math.remainder(applied - offset_deg, 360.0) == pytest.approx(0.0, abs=OFFSET_TOLERANCE_DEG)
 
 

@@ -9,10 +9,11 @@ import pytest
 
 from icrtool.config import parse_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import FilterRun, fit
+from icrtool.estimation.fit import fit
 from icrtool.motion.window_fit import cut_windows, fit_windows, thin_windows
 from icrtool.motion.window_models import CONSTANT, EXTENDED, MULTIPLIER, WindowModel
 from icrtool.motion.window_solve import drop_windows, fit_of, solve_windows
+from icrtool.records.run import Run
 from support.drives import ICRS, make_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -22,7 +23,7 @@ LARGEST_MISS_M = 0.01
 
 
 @cache
-def made(seed: int, seconds: float = 200.0) -> FilterRun:
+def made(seed: int, seconds: float = 200.0) -> Run:
     """A drive by Euler steps, as the windows drive too: their x_icr is what makes the dropout's steps right."""
     return fit(make_log(seed, seconds, step_heading=0.0), CONFIG)
 

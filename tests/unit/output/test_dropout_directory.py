@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,52 +13,50 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, judge_gate, parse_gate
-from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
+from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError
-from icrtool.estimation.fit import FilterRun
-from icrtool.output.dropout_content import DropoutContent, title_of
-from icrtool.output.dropout_directory import dropout_directory, is_dropout_directory, report_document, write_content
+from icrtool.output.dropout_directory import is_dropout_directory, report_document, report_writer, write_tables
+from icrtool.output.figures.drawing_process import DrawingHere
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.trials_file import trials_file
+from icrtool.records.run import Run
 
 HORIZONS_M = [1.0, 5.0, 10.0, 900.0]
 GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001", "icr.max@900m <= 1")
 
 
-def content_of(run: FilterRun, horizons_m: list[float] | None = None, gates: tuple[str, ...] = GATES) -> DropoutContent:
+def content_of(run: Run, horizons_m: list[float] | None = None, gates: tuple[str, ...] = GATES) -> DropoutReport:
     report = dropout(run, horizons_m or HORIZONS_M)
-    return DropoutContent(
-        title=title_of(run),
-        run_summary=run.summary,
-        report=report,
+    return replace(
+        report,
         budgets=budget_distances(report, 0.5),
-        verdicts=tuple(judge_gate(parse_gate(gate), report) for gate in gates),
-        worst=worst_drives(run),
-        examples=example_drives(run),
+        verdicts=tuple(check_gate(parse_gate(gate), report) for gate in gates),
+        worst=worst_trials(run),
+        examples=example_trials(run),
         outages=(*force_outages(run, plan_outages(run, 4.0, (15.0,))), *real_outages(run)),
     )
 
 
 @pytest.fixture(scope="module")
-def content(run: FilterRun) -> DropoutContent:
+def content(run: Run) -> DropoutReport:
     return content_of(run)
 
 
 @pytest.fixture(scope="module")
-def written(content: DropoutContent, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(content: DropoutReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run")
-    with dropout_directory(directory) as partial:
-        write_content(content, partial)
+    content.write(directory / "dropout", plots=())
     return directory / "dropout"
 
 
-def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: DropoutContent) -> None:
+def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: DropoutReport) -> None:
     read = pd.read_csv(written / "summary.csv")
-    pd.testing.assert_frame_equal(read, content.report.summary, check_exact=True, check_dtype=False)
+    pd.testing.assert_frame_equal(read, content.summary, check_exact=True, check_dtype=False)
     assert list(read.columns)[:9] == [
         "model",
         "horizon_m",
@@ -75,7 +74,7 @@ def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: Drop
     assert "\nicr,900.0,0,,,," in text
 
 
-def test_histogram_csv_holds_all_trials_of_every_model_and_horizon(written: Path, content: DropoutContent) -> None:
+def test_histogram_csv_holds_all_trials_of_every_model_and_horizon(written: Path, content: DropoutReport) -> None:
     read = pd.read_csv(written / "histogram.csv")
     assert list(read.columns) == ["model", "horizon_m", "bin_left_m", "bin_right_m", "percent"]
     sums = read.groupby(["model", "horizon_m"]).percent.sum()
@@ -83,10 +82,10 @@ def test_histogram_csv_holds_all_trials_of_every_model_and_horizon(written: Path
     np.testing.assert_allclose(sums, 100.0)
     assert (read.bin_right_m > read.bin_left_m).all()
     bins = read[(read.model == "icr") & (read.horizon_m == 5.0)]
-    assert bins.percent.tolist() == content.report.results[0].histograms[1].percent.tolist()
+    assert bins.percent.tolist() == content.results[0].histograms[1].percent.tolist()
 
 
-def test_report_json_says_the_same_and_why(written: Path, content: DropoutContent, run: FilterRun) -> None:
+def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport, run: Run) -> None:
     document = json.loads((written / "report.json").read_bytes())
     read = pd.read_csv(written / "summary.csv")
     rows = pd.DataFrame(
@@ -102,7 +101,7 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutConten
         "across_wheel_gap",
         "ends_in_gnss_outage",
     }
-    assert document["bootstrap"]["seed"] == content.report.seed
+    assert document["bootstrap"]["seed"] == content.seed
     assert {"resamples", "level", "block"} <= document["bootstrap"].keys()
     assert document["tolerance_m"] <= 1e-9
     assert document["run"]["inputs"] == json.loads(json_bytes({"x": run.summary["inputs"]}))["x"]
@@ -113,7 +112,7 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutConten
     assert document["budgets"][0].keys() == {"model", "label", "budget_m", "distance_m", "beyond", "between_m"}
 
 
-def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutContent) -> None:
+def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutReport) -> None:
     read = pd.read_csv(written / "worst.csv")
     assert {"rank", "stamp_ns", "t_s", "north_m", "east_m", "heading_change_deg", "speed_mean_mps"} <= set(read.columns)
     assert read["rank"].tolist() == list(range(1, len(content.worst) + 1))
@@ -122,18 +121,18 @@ def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutContent) -> 
     assert read.stamp_ns.tolist() == [drive.stamp_ns for drive in content.worst]
 
 
-def test_without_track_width_the_no_slip_column_is_empty(make_run: Callable[..., FilterRun], tmp_path: Path) -> None:
+def test_without_track_width_the_no_slip_column_is_empty(make_run: Callable[..., Run], tmp_path: Path) -> None:
     run = make_run(track_width_m=None)
-    write_content(content_of(run, gates=()), tmp_path)
+    write_tables(content_of(run, gates=()), tmp_path)
     assert pd.read_csv(tmp_path / "worst.csv").no_slip_error_m.isna().all()
     assert set(pd.read_csv(tmp_path / "summary.csv").model) == {"icr", "icr_final"}
 
 
-def test_the_document_is_json_without_nan(content: DropoutContent) -> None:
+def test_the_document_is_json_without_nan(content: DropoutReport) -> None:
     json.loads(json_bytes(report_document(content)), parse_constant=pytest.fail)
 
 
-def test_trials_are_written_group_by_group_with_the_models_as_categories(run: FilterRun, tmp_path: Path) -> None:
+def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "trials.parquet"
     with trials_file(path, run.table.stamp_ns) as sink:
         report = dropout(run, HORIZONS_M, sink=sink)
@@ -151,22 +150,21 @@ def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Fi
     assert found["max"].tolist() == expected.max_m.tolist()
 
 
-def test_a_report_replaces_an_older_one_and_leaves_no_trace(content: DropoutContent, tmp_path: Path) -> None:
-    for number in range(2):
-        with dropout_directory(tmp_path) as partial:
-            write_content(content, partial)
-            (partial / f"only-{number}").touch()
+def test_a_report_replaces_an_older_one_and_leaves_no_trace(content: DropoutReport, tmp_path: Path) -> None:
+    content.write(tmp_path / "dropout", plots=())
+    (tmp_path / "dropout" / "of-the-old-one").touch()
+    content.write(tmp_path / "dropout", plots=())
     assert [path.name for path in tmp_path.iterdir()] == ["dropout"]
     assert is_dropout_directory(tmp_path / "dropout")
-    assert not (tmp_path / "dropout" / "only-0").exists()
+    assert not (tmp_path / "dropout" / "of-the-old-one").exists()
 
 
-def test_a_report_that_fails_leaves_the_older_one(written: Path, content: DropoutContent) -> None:
+def test_a_report_that_fails_leaves_the_older_one(written: Path, content: DropoutReport) -> None:
     before = (written / "report.json").read_bytes()
 
     def fail() -> None:
-        with dropout_directory(written.parent) as partial:
-            write_content(content, partial)
+        with report_writer(written, DrawingHere(())) as writer:
+            writer.finish(content)
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -175,9 +173,14 @@ def test_a_report_that_fails_leaves_the_older_one(written: Path, content: Dropou
     assert [path.name for path in written.parent.iterdir()] == ["dropout"]
 
 
-def test_what_is_not_ours_is_left_alone(content: DropoutContent, tmp_path: Path) -> None:
+def test_what_is_not_ours_is_left_alone(content: DropoutReport, tmp_path: Path) -> None:
     (tmp_path / "dropout").mkdir()
     (tmp_path / "dropout" / "thesis.txt").write_text("do not lose me", encoding="utf-8")
-    with pytest.raises(OutputError, match="not a dropout report"), dropout_directory(tmp_path) as partial:
-        write_content(content, partial)
+    with pytest.raises(OutputError, match="not a dropout report"):
+        content.write(tmp_path / "dropout", plots=())
     assert (tmp_path / "dropout" / "thesis.txt").is_file()
+
+
+def test_a_report_needs_a_place_where_its_run_has_none(content: DropoutReport) -> None:
+    with pytest.raises(ValueError, match="path"):
+        content.write()

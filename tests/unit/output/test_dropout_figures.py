@@ -14,37 +14,39 @@ import pytest
 from matplotlib.figure import Figure
 
 from icrtool.dropout_analysis import trials as dropout_analysis
-from icrtool.dropout_analysis.example_trials import example_drives, worst_drives
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.estimation.fit import FilterRun
 from icrtool.output.figures import dropout_figures as pictures
 from icrtool.output.figures.drawing_process import DrawingProcess
 from icrtool.output.figures.dropout_errors import draw_histogram, draw_summary
 from icrtool.output.figures.dropout_paths import draw_examples, draw_outages, draw_worst
 from icrtool.output.figures.style import style
-from icrtool.records.dropout import DropoutReport, Outage
+from icrtool.records.dropout import Outage
+from icrtool.records.run import Run
 
 HORIZONS_M = [1.0, 2.0, 5.0, 10.0]
 
 
 @pytest.fixture(scope="module")
-def report(run: FilterRun) -> DropoutReport:
+def report(run: Run) -> DropoutReport:
     return dropout(run, HORIZONS_M)
 
 
 @pytest.fixture(scope="module")
-def outages(run: FilterRun) -> tuple[Outage, ...]:
+def outages(run: Run) -> tuple[Outage, ...]:
     return (*force_outages(run, plan_outages(run, 2.0)), *real_outages(run))
 
 
-def figures(run: FilterRun, report: DropoutReport, outages: tuple[Outage, ...]) -> dict[str, Callable[[], Figure]]:
+def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dict[str, Callable[[], Figure]]:
     return {
-        "summary": lambda: draw_summary("barn", report, outages),
+        "summary": lambda: draw_summary("barn", replace(report, outages=outages)),
         "histogram": lambda: draw_histogram("barn", report, 5.0),
-        "examples": lambda: draw_examples("barn", example_drives(run, 5.0)),
-        "worst": lambda: draw_worst("barn", worst_drives(run, 2.0)),
+        "examples": lambda: draw_examples("barn", example_trials(run, 5.0)),
+        "worst": lambda: draw_worst("barn", worst_trials(run, 2.0)),
         "outages": lambda: draw_outages("barn", run.table.north_m, run.table.east_m, outages),
     }
 
@@ -66,7 +68,7 @@ def texts_of(figure: Figure) -> list[str]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_axes_have_units_and_no_text_lies_on_another(
-    name: str, run: FilterRun, report: DropoutReport, outages: tuple[Outage, ...]
+    name: str, run: Run, report: DropoutReport, outages: tuple[Outage, ...]
 ) -> None:
     figure = drawn(figures(run, report, outages)[name])
     labels = [axes.get_xlabel() for axes in figure.axes] + [axes.get_ylabel() for axes in figure.axes]
@@ -90,7 +92,7 @@ def test_axes_have_units_and_no_text_lies_on_another(
 
 
 def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
-    figure = drawn(lambda: draw_summary("barn", report, outages))
+    figure = drawn(lambda: draw_summary("barn", replace(report, outages=outages)))
     lines = [line.get_ydata() for line in figure.axes[0].lines]
     for name in ("icr", "no_slip", "icr_final"):
         result = report.result(name)
@@ -119,48 +121,54 @@ def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(repo
         assert "expected" in axes.get_title("right")
 
 
-def test_a_histogram_needs_no_other_models_than_it_says(run: FilterRun) -> None:
+def test_a_histogram_needs_no_other_models_than_it_says(run: Run) -> None:
     models = [model for model in models_of(run) if model.name in pictures.HISTOGRAM_MODELS]
     assert len(drawn(lambda: draw_histogram("barn", dropout(run, [5.0], models=models), 5.0)).axes) == 2
 
 
-def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., FilterRun]) -> None:
+def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Run]) -> None:
     run = make_run(track_width_m=None, troubles=False)
     report = dropout(run, HORIZONS_M)
     for draw in (
         lambda: draw_summary("barn", report),
         lambda: draw_histogram("barn", report, 5.0),
-        lambda: draw_examples("barn", example_drives(run, 5.0)),
-        lambda: draw_worst("barn", worst_drives(run, 5.0)),
+        lambda: draw_examples("barn", example_trials(run, 5.0)),
+        lambda: draw_worst("barn", worst_trials(run, 5.0)),
     ):
         assert "no slip" not in " ".join(texts_of(drawn(draw)))
 
 
 @pytest.mark.parametrize("table_bytes", [1, 1 << 30])
-def test_histograms_are_drawn_once_and_as_soon_as_their_models_are_done(
-    run: FilterRun, monkeypatch: pytest.MonkeyPatch, table_bytes: int
+def test_figures_are_drawn_once_and_as_soon_as_their_numbers_are_there(
+    run: Run, monkeypatch: pytest.MonkeyPatch, table_bytes: int
 ) -> None:
     monkeypatch.setattr(dropout_analysis, "LARGEST_TABLE_BYTES", table_bytes)
     drawn: list[tuple[str, int]] = []
+    models: list[int] = []
 
-    def draw(_: object, name: str, title: str, report: DropoutReport, horizon_m: float) -> None:
-        drawn.append((name, len(report.results)))
+    def draw(_: object, name: str, *content: object) -> None:
+        drawn.append((name, models[-1]))
 
-    models = models_of(run)
-    watch = pictures.watch_for_histograms(draw, "barn", [model.name for model in models])
-    report = dropout(run, [5.0, 10.0], models=models, watch=watch)
-    assert len(report.results) == 3
-    assert drawn == [("histogram_05m", 2), ("histogram_10m", 2)]
+    figures = pictures.ReportFigures(draw)
+
+    def watch(report: DropoutReport) -> None:
+        models.append(len(report.results))
+        figures.draw_ready(report)
+
+    figures.draw_rest(dropout_report(run, horizons_m=[5.0, 10.0], comparison=False, watch=watch))
+    assert models == [0, 1, 2, 3]
+    single = [("examples_15m", 0), ("worst", 0), ("outages", 0)]
+    assert drawn == [*single, ("histogram_05m", 2), ("histogram_10m", 2), ("summary", 3)]
 
 
 def test_drawing_needs_no_compiled_code() -> None:
     # What dropout-report loads before it starts the process that draws, and what that process loads.
     before = [
         "cli.dropout_report",
-        "analysis.gates",
-        "report.dropout_source",
-        "report.whole_file",
-        "report.drawing_process",
+        "dropout_analysis.acceptance_limits",
+        "output.stored_run",
+        "output.atomic_file",
+        "output.figures.drawing_process",
     ]
     loads = "; ".join(f"import icrtool.{module}" for module in before)
     code = (
@@ -173,14 +181,13 @@ def test_drawing_needs_no_compiled_code() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="forks from a process with threads, as pytest's is, only there")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_the_second_process_draws_what_there_is(
-    run: FilterRun, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
+    run: Run, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
     with DrawingProcess(("png", "svg")) as process, process.into(tmp_path / "plots") as draw:
-        pictures.draw_examples(draw, "barn", example_drives(run, 15.0))
-        pictures.draw_worst(draw, "barn", worst_drives(run))
-        pictures.draw_outages(draw, "barn", run.table, outages)
-        pictures.draw_histograms(draw, "barn", report)
-        pictures.draw_summary(draw, "barn", report, outages)
+        whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
+        figures = pictures.ReportFigures(draw)
+        figures.draw_ready(whole)
+        figures.draw_rest(whole)
     names = {path.stem for path in (tmp_path / "plots").iterdir()}
     assert names == {"summary", "histogram_05m", "histogram_10m", "examples_15m", "worst", "outages"}
     assert len(list((tmp_path / "plots").iterdir())) == 2 * len(names)
@@ -192,7 +199,7 @@ def test_what_goes_wrong_in_the_second_process_is_raised_here(report: DropoutRep
 
     def draw_all() -> None:
         with DrawingProcess(("png",)) as process, process.into(tmp_path / "plots") as draw:
-            pictures.draw_histograms(draw, "barn", report)
+            pictures.ReportFigures(draw).draw_ready(report)
 
     with pytest.raises(OSError, match="histogram_05m"):
         draw_all()
@@ -200,5 +207,5 @@ def test_what_goes_wrong_in_the_second_process_is_raised_here(report: DropoutRep
 
 def test_without_formats_nothing_is_started_or_drawn(report: DropoutReport, tmp_path: Path) -> None:
     with DrawingProcess(()) as process, process.into(tmp_path / "plots") as draw:
-        pictures.draw_histograms(draw, "barn", report)
+        pictures.ReportFigures(draw).draw_ready(report)
     assert list(tmp_path.iterdir()) == []

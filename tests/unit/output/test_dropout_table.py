@@ -9,37 +9,35 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, judge_gate, parse_gate
-from icrtool.dropout_analysis.example_trials import worst_drives
+from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.example_trials import worst_trials
 from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
-from icrtool.estimation.fit import FilterRun
 from icrtool.output.atomic_file import check_place
-from icrtool.output.dropout_content import DropoutContent, p95_at, shown_horizons, title_of
 from icrtool.output.exports.acceptance import format_markdown, write_junit, write_markdown
-from icrtool.output.tables.dropout import budget_lines, format_dropout
+from icrtool.output.tables.dropout import budget_lines, format_dropout, p95_at, shown_horizons
+from icrtool.records.run import Run
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
 GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001")
 
 
-def content_of(run: FilterRun, horizons_m: list[float], gates: tuple[str, ...] = ()) -> DropoutContent:
+def content_of(run: Run, horizons_m: list[float], gates: tuple[str, ...] = ()) -> DropoutReport:
     report = dropout(run, horizons_m)
-    return DropoutContent(
-        title=title_of(run),
-        run_summary=run.summary,
-        report=report,
+    return replace(
+        report,
         budgets=budget_distances(report, 0.05) + budget_distances(report, 50.0),
-        verdicts=tuple(judge_gate(parse_gate(gate), report) for gate in gates),
-        worst=worst_drives(run),
+        verdicts=tuple(check_gate(parse_gate(gate), report) for gate in gates),
+        worst=worst_trials(run),
         examples=(),
         outages=real_outages(run),
     )
 
 
 @pytest.fixture(scope="module")
-def content(run: FilterRun) -> DropoutContent:
+def content(run: Run) -> DropoutReport:
     return content_of(run, HORIZONS_M, GATES)
 
 
@@ -47,14 +45,14 @@ def row_of(text: str, begin: str) -> list[str]:
     return next(line for line in text.splitlines() if line.startswith(begin)).removeprefix(begin).split()
 
 
-def test_the_table_shows_the_horizons_nearest_to_1_5_10_and_20_m(content: DropoutContent) -> None:
-    assert shown_horizons(content.report) == [1, 2, 3, 4]
-    assert row_of(format_dropout(content), "way driven blind") == ["1", "m", "5", "m", "9", "m", "30", "m"]
+def test_the_table_shows_the_horizons_nearest_to_1_5_10_and_20_m(content: DropoutReport) -> None:
+    assert shown_horizons(content) == [1, 2, 3, 4]
+    assert row_of(format_dropout(content), "distance without GNSS") == ["1", "m", "5", "m", "9", "m", "30", "m"]
 
 
-def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: DropoutContent) -> None:
+def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: DropoutReport) -> None:
     text = format_dropout(content)
-    icr, no_slip = content.report.result("icr"), content.report.result("no_slip")
+    icr, no_slip = content.result("icr"), content.result("no_slip")
     assert icr is not None
     assert no_slip is not None
     p95 = float(icr.summary.p95[1])
@@ -66,27 +64,27 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
     assert not any(line != line.rstrip() for line in text.splitlines())
 
 
-def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutContent) -> None:
-    text, counts = format_dropout(content), content.report.counts
+def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutReport) -> None:
+    text, counts = format_dropout(content), content.counts
     assert row_of(text, "trials")[0] == f"{counts.trials[1]:,}"
-    assert row_of(text, "no trial: too little way")[0] == f"{counts.short[1]:,}"
-    assert row_of(text, "across a wheel gap")[0] == f"{counts.gap[1]:,}"
-    assert row_of(text, "ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
+    assert row_of(text, "not counted: log ends")[0] == f"{counts.short[1]:,}"
+    assert row_of(text, "  across a wheel gap")[0] == f"{counts.gap[1]:,}"
+    assert row_of(text, "  ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
 
 
-def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutContent) -> None:
-    (outage,), icr = content.outages, content.report.result("icr")
+def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
+    (outage,), icr = content.outages, content.result("icr")
     assert icr is not None
-    usual = p95_at(icr, content.report, outage.distance_m)
+    usual = p95_at(icr, content, outage.distance_m)
     assert usual == icr.summary.p95[2]
-    assert p95_at(icr, content.report, 31.0) is None
+    assert p95_at(icr, content, 31.0) is None
     line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
     assert f"{outage.end_error_m:.3f} m" in line
     assert usual > 1
     assert line.endswith(f"{usual:.2f} m")
 
 
-def test_verdicts_are_lines_of_the_table(content: DropoutContent) -> None:
+def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
     lines = format_dropout(content).splitlines()
     assert [verdict.line() for verdict in content.verdicts] == lines[-2:]
     assert not content.passed
@@ -105,7 +103,7 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
     ]
 
 
-def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., FilterRun]) -> None:
+def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:
     parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False, track_width_m=None)
     text = format_dropout(content_of(parked, [5.0]))
     assert "nothing can be said of budgets" in text
@@ -113,8 +111,9 @@ def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[
     assert "the robot stood at 100 % of the states" in text
 
 
-def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutContent, tmp_path: Path) -> None:
-    odd = replace(content, title='a <b> & "c" \x01', verdicts=content.verdicts[1:])
+def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_path: Path) -> None:
+    strange = {**content.run_summary, "log": 'a <b> & "c" \x01', "config": {"robot": {"name": None}}}
+    odd = replace(content, run_summary=strange, verdicts=content.verdicts[1:])
     error = RunError("runs/x", "edited", "fit <again> & again")
     write_junit(tmp_path / "j.xml", [("barn", content), ("odd", odd), ("runs/x", error)])
     root = ET.parse(tmp_path / "j.xml").getroot()
@@ -138,7 +137,7 @@ def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutContent, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["j.xml"]
 
 
-def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutContent, tmp_path: Path) -> None:
+def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport, tmp_path: Path) -> None:
     write_markdown(tmp_path / "m.md", [("barn", content), ("runs/x", RunError("runs/x", "was edited"))])
     text = (tmp_path / "m.md").read_text(encoding="utf-8")
     assert text.startswith("## barn")
@@ -151,7 +150,7 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutContent, t
     assert "All gates passed." in format_markdown(replace(content, verdicts=content.verdicts[:1]))
 
 
-def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutContent, tmp_path: Path) -> None:
+def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutReport, tmp_path: Path) -> None:
     (tmp_path / "j.xml").write_text("old", encoding="utf-8")
     write_junit(tmp_path / "j.xml", [("barn", content)])
     ET.parse(tmp_path / "j.xml")

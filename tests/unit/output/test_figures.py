@@ -8,17 +8,17 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from icrtool.estimation.fit import FilterRun
-from icrtool.estimation.odometry import icr_odometry
+from icrtool.estimation.odometry import odometry
 from icrtool.output.figures.run_figures import FIGURES
 from icrtool.output.figures.style import new_figure, save, style
+from icrtool.records.run import Run
 
 BAD_FIXES = 4
 CELL = 1 / 700
 """Two points closer than this part of the view are one dot."""
 
 
-def drawn(name: str, run: FilterRun) -> Figure:
+def drawn(name: str, run: Run) -> Figure:
     with style():
         figure = FIGURES[name](run)
         figure.canvas.draw()
@@ -34,7 +34,7 @@ def line_labelled(axes: Axes, begin: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_axis_has_a_name_and_a_unit(name: str, run: FilterRun) -> None:
+def test_every_axis_has_a_name_and_a_unit(name: str, run: Run) -> None:
     figure = drawn(name, run)
     lowest_row = [axes for axes in figure.axes if axes.get_subplotspec().is_last_row()]
     first_column = [axes for axes in figure.axes if axes.get_subplotspec().is_first_col()]
@@ -56,7 +56,7 @@ def test_every_axis_has_a_name_and_a_unit(name: str, run: FilterRun) -> None:
     ids=["usual", "bare", "parked", "one second", "long"],
 )
 def test_no_text_leaves_the_picture_or_covers_another(
-    name: str, drive: dict[str, object], make_run: Callable[..., FilterRun]
+    name: str, drive: dict[str, object], make_run: Callable[..., Run]
 ) -> None:
     figure = drawn(name, make_run(**drive))
     boxes = [(text.get_text(), text.get_window_extent()) for text in texts_of(figure)]
@@ -83,7 +83,7 @@ def texts_of(figure: Figure) -> list[mpl.text.Text]:
     return [text for text in found if text.get_text().strip()]
 
 
-def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: FilterRun) -> None:
+def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> None:
     figure = drawn("trajectory", run)
     (axes,) = figure.axes
     texts = legend_texts(figure)
@@ -101,36 +101,36 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: FilterRun
     view = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     path = line_labelled(axes, "filter")
     assert np.allclose(path[[0, -1]], np.column_stack([run.table.east_m, run.table.north_m])[[0, -1]])
-    odometry = icr_odometry(run)
-    assert np.allclose(line_labelled(axes, "ICR odometry")[-1], [odometry.east_m[-1], odometry.north_m[-1]])
+    path_end = odometry(run).icr
+    assert np.allclose(line_labelled(axes, "ICR odometry")[-1], [path_end.east_m[-1], path_end.north_m[-1]])
     for states, line in ((run.table.east_m, path[:, 0]), (run.table.north_m, path[:, 1])):
         assert abs(line.max() - states.max()) < CELL * view
         assert abs(line.min() - states.min()) < CELL * view
     assert len(line_labelled(axes, "GNSS fixes, rejected")) == BAD_FIXES
 
 
-def test_trajectory_without_width_has_no_no_slip_path(make_run: Callable[..., FilterRun]) -> None:
+def test_trajectory_without_width_has_no_no_slip_path(make_run: Callable[..., Run]) -> None:
     texts = legend_texts(drawn("trajectory", make_run(track_width_m=None, datum=False, troubles=False)))
     assert not any("no-slip" in text for text in texts)
     assert "position reference" in texts
 
 
-def test_trajectory_far_from_the_origin_keeps_short_ticks(make_run: Callable[..., FilterRun]) -> None:
+def test_trajectory_far_from_the_origin_keeps_short_ticks(make_run: Callable[..., Run]) -> None:
     near = make_run(troubles=False, datum=False, duration_s=20.0)
-    for column in (near.table.north_m, near.log.gnss.north_m):
+    for column in (near.table.north_m, near.sensors.fixes.north_m):
         np.add(column, 5_412_300.0, out=column)
     (axes,) = drawn("trajectory", near).axes
     assert axes.get_ylabel() == "North [m]  + 5,412,000 m"
     assert max(len(tick.get_text()) for tick in axes.get_yticklabels()) < 7
 
 
-def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., FilterRun]) -> None:
+def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., Run]) -> None:
     run = make_run(duration_s=300.0, track_width_m=20.0, troubles=False)
     figure = drawn("trajectory", run)
     assert any(text.endswith("(out of view)") for text in legend_texts(figure))
 
 
-def test_icr_estimates_show_bands_rises_and_outage(run: FilterRun) -> None:
+def test_icr_estimates_show_bands_rises_and_outage(run: Run) -> None:
     figure = drawn("icr_estimates", run)
     texts = legend_texts(figure)
     assert texts == ["estimate", "±2σ", "10 %", "90 % of the way", "no slip (±b/2, 0)", "no usable GNSS"]
@@ -146,7 +146,7 @@ def test_icr_estimates_show_bands_rises_and_outage(run: FilterRun) -> None:
     ]  # fmt: skip
 
 
-def test_icr_clusters_add_up_to_all_of_the_time(run: FilterRun) -> None:
+def test_icr_clusters_add_up_to_all_of_the_time(run: Run) -> None:
     figure = drawn("icr_clusters", run)
     for axes in figure.axes:
         (filled,) = axes.collections
@@ -158,7 +158,7 @@ def test_icr_clusters_add_up_to_all_of_the_time(run: FilterRun) -> None:
     assert figure.axes[0].get_title().splitlines()[1] == "no slip: −0.300 m"
 
 
-def test_gnss_difference_marks_rejected_fixes_and_breaks_at_the_outage(run: FilterRun) -> None:
+def test_gnss_difference_marks_rejected_fixes_and_breaks_at_the_outage(run: Run) -> None:
     figure = drawn("gnss_difference", run)
     (axes,) = figure.axes
     texts = legend_texts(figure)
@@ -183,7 +183,7 @@ def test_line_styles_differ_in_grey() -> None:
     assert len({str(pen.dash) for pen in (FILTER, ICR, NO_SLIP)}) == 3
 
 
-def test_a_users_settings_change_nothing(tmp_path, run: FilterRun) -> None:
+def test_a_users_settings_change_nothing(tmp_path, run: Run) -> None:
     with style():
         save(FIGURES["gnss_difference"](run), tmp_path / "plain", ("png",))
     with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "savefig.dpi": 20, "text.usetex": True}):
@@ -193,7 +193,7 @@ def test_a_users_settings_change_nothing(tmp_path, run: FilterRun) -> None:
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "set.png").read_bytes()
 
 
-def test_a_pdf_has_the_same_bytes_every_time(tmp_path, run: FilterRun) -> None:
+def test_a_pdf_has_the_same_bytes_every_time(tmp_path, run: Run) -> None:
     for place in ("one", "two"):
         with style():
             save(FIGURES["gnss_difference"](run), tmp_path / place, ("pdf",))

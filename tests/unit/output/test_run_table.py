@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 
-from icrtool.estimation.fit import FilterRun
 from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
-from icrtool.output.text_format import TABLE_WIDTH, duration_text, length_text, signed, way_text
+from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, length_text, signed
+from icrtool.records.run import Run
 
 
 def line_of(text: str, begin: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(begin))
 
 
-def test_the_table_says_what_was_read_and_learned(run: FilterRun) -> None:
+def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
     text = format_run(run)
     icr, drive = run.summary["icr"], run.summary["drive"]
     assert text.splitlines()[0] == "barn  (segway-rmp400)"
@@ -45,12 +45,12 @@ def test_the_table_says_what_was_read_and_learned(run: FilterRun) -> None:
     assert "off the course" in text.splitlines()[-2]
 
 
-def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: FilterRun) -> None:
-    long_names = tuple(
-        replace(stream, topic="/robot/namespace" * 9, message_type="some_vendor_msgs/msg/VeryLongNameOfAMessageIndeed")
-        for stream in run.log.streams
-    )
-    wide = replace(run, log=replace(run.log, streams=long_names))
+def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: Run) -> None:
+    long_names = [
+        {**stream, "topic": "/robot/namespace" * 9, "message_type": "some_vendor_msgs/msg/VeryLongNameOfAMessageIndeed"}
+        for stream in run.summary["streams"]
+    ]
+    wide = replace(run, summary={**run.summary, "streams": long_names})
     for text in (format_run(run), format_run(wide)):
         assert max(map(len, text.splitlines())) <= TABLE_WIDTH
         assert "\x1b" not in text
@@ -61,7 +61,7 @@ def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: FilterRun) -> None:
     assert wheels.split()[1].endswith("/robot/namespace")
 
 
-def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., FilterRun]) -> None:
+def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(track_width_m=None, datum=False, troubles=False, duration_s=20.0))
     assert "robot.track_width_m is not known" in line_of(text, "multiplier")
     assert "filter to position reference" in text
@@ -69,13 +69,13 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., F
     assert " 0 rejected" in text
 
 
-def test_a_parked_robot_has_a_table_too(make_run: Callable[..., FilterRun]) -> None:
+def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(speed_mps=0.0, duration_s=20.0))
     assert line_of(text, "y right").count("hardly moved") == 1
     assert "too little straight driving" in text
 
 
-def test_warnings_are_not_in_the_table(run: FilterRun) -> None:
+def test_warnings_are_not_in_the_table(run: Run) -> None:
     assert run.warnings
     assert not any(warning in format_run(run) for warning in run.warnings)
 
@@ -102,11 +102,11 @@ def test_lengths_read_well() -> None:
         "99.9 cm",
         "3.46 m",
     ]
-    assert [way_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
+    assert [distance_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
     assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
 
 
-def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: FilterRun) -> None:
+def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
     steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
     speed = run.summary["drive"]["speed_mean_mps"]
     said = f"not shown by this drive; 0.1 s late would move x by {length_text(0.1 * speed)}"

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from icrtool.estimation.fit import FilterRun
 from icrtool.output.states_file import CHUNK_ROWS, StatesFileError, StatesFormat, read_states, write_states
+from icrtool.records.run import Run
 from icrtool.records.tables import States
 
 AWKWARD = [
@@ -31,19 +31,19 @@ def assert_same_bits(one: States, other: States) -> None:
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-def test_every_bit_comes_back(tmp_path: Path, run: FilterRun, form: StatesFormat) -> None:
+def test_every_bit_comes_back(tmp_path: Path, run: Run, form: StatesFormat) -> None:
     for number, table in enumerate((run.table, table_of(np.array(AWKWARD)))):
         digest = write_states(table, tmp_path / str(number), form)
         assert digest == hashlib.blake2b((tmp_path / str(number)).read_bytes()).hexdigest()
         assert_same_bits(table, read_states(tmp_path / str(number), form))
 
 
-def test_pandas_reads_the_csv_as_the_frame_of_the_run(tmp_path: Path, run: FilterRun) -> None:
+def test_pandas_reads_the_csv_as_the_frame_of_the_run(tmp_path: Path, run: Run) -> None:
     write_states(run.table, tmp_path / "states.csv", "csv")
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "states.csv"), run.states, check_exact=True)
 
 
-def test_columns_of_whole_numbers_stay_floating_point(tmp_path: Path, run: FilterRun) -> None:
+def test_columns_of_whole_numbers_stay_floating_point(tmp_path: Path, run: Run) -> None:
     table = replace(run.table, x_icr_m=np.zeros(len(run.table)), v_left_mps=np.full(len(run.table), -2.0))
     write_states(table, tmp_path / "states.csv", "csv")
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "states.csv"), table.frame(), check_exact=True)
@@ -78,7 +78,7 @@ def test_other_columns_are_refused(tmp_path: Path, text: str) -> None:
         read_states(tmp_path / "states.csv", "csv")
 
 
-def test_an_existing_file_is_not_overwritten(tmp_path: Path, run: FilterRun) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path, run: Run) -> None:
     (tmp_path / "states.csv").write_text("mine")
     with pytest.raises(FileExistsError):
         write_states(run.table, tmp_path / "states.csv", "csv")
