@@ -1,7 +1,7 @@
 """Which side is which, which way a heading turns: hypotheses compared by their likelihood.
 
 Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
-with v the mean of the sides' speeds and u half their difference, and its changes in ∫u and ∫v. Sides that are swapped or
+with v the mean of the sides' speeds and u half their difference, its changes in ∫u and ∫v. Sides that are swapped or
 reversed exchange v and u or change their signs; a heading or a position of the other handedness turns psi round. One
 robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis says what they
 should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left side. Its cost is the squared
@@ -52,7 +52,7 @@ class Convention(NamedTuple):
     position: int
 
     def faults(self, offset: float, gyro_sense: int) -> float:
-        """Return how many things would be wrong; `gyro_sense` is +1 where it turns as the heading is named, 0 unknown."""
+        """Return how many things would be wrong; `gyro_sense` as in `decide_conventions`."""
         count = FAULTS["swapped"] * self.swapped
         signs = self.sign_left + self.sign_right
         count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
@@ -200,3 +200,27 @@ def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
     away = turn / size - np.array([1.0, 0.0])
     cost += float(away @ np.linalg.solve(spread / size**2 + np.diag(EXPECTED_STD[4:] ** 2), away))
     return cost, math.remainder(offset * one.position, 2 * math.pi)
+
+
+def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
+    """Say which sides or senses are not as named; the heading's own is reported with its offset."""
+    one, done = decision.convention, ": corrected" if corrects else ""
+    notes = []
+    if one.swapped:
+        notes.append(f"left and right wheels are swapped{done}")
+    signs = (one.sign_left, one.sign_right)
+    reversed_ = {(-1, 1): "the left wheels count", (1, -1): "the right wheels count", (-1, -1): "both wheels count"}
+    if signs in reversed_:
+        notes.append(f"{reversed_[signs]} backwards{done}")
+    if one.position < 0:
+        notes.append(f"positions are mirrored (east for west){done}")
+    if decision.as_likely is not None:
+        notes.append(f"{_in_words(decision.as_likely)} would explain the log as well: check the wheels' names")
+    return notes
+
+
+def _in_words(one: Convention) -> str:
+    parts = ["swapped sides"] * one.swapped
+    parts += ["a reversed left side"] * (one.sign_left < 0) + ["a reversed right side"] * (one.sign_right < 0)
+    parts += ["a mirrored heading"] * (one.heading < 0) + ["mirrored positions"] * (one.position < 0)
+    return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"

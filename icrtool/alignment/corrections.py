@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.conventions import AS_NAMED, Convention, Decision, decide_conventions
+from icrtool.alignment.conventions import AS_NAMED, Convention, Decision, convention_notes, decide_conventions
 from icrtool.alignment.course_over_ground import FEWEST_WINDOWS, Course, measure_course
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
@@ -48,7 +48,7 @@ SMALLEST_DELAY_S, SMALLEST_LEAD_S, LARGEST_DELAY_STD_S = 0.08, 0.2, 0.04
 correction, one that lags does."""
 
 STANDS_SHARE, STILL = 0.8, 0.2
-"""The robot does not move where in this share of the windows displacement and turn are below this part of the wheels'."""
+"""The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
 
 LEAST_START_STD, INFLATION = 0.15, 3.0
 """The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
@@ -133,7 +133,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     if corrects:
         log = _apply(log, decision.convention)
         drive = _apply_to_drive(drive, decision.convention)
-    notes += _convention_notes(decision, corrects=corrects)
+    notes += convention_notes(decision, corrects=corrects)
     mirrored = corrects and decision.convention.heading < 0
     _refuse_standing(log, drive, windows)
     course = measure_course(_turned_over(log) if mirrored else log)
@@ -152,10 +152,10 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     a, a_std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     wheels = WheelCheck(log, a, a_std, scale, share, tuple(f"{log.name}: {note}" for note in notes), course)
     heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored)
-    delays = _delays(log, config, fit, derived)
+    delays = _delays(log, config, fit)
     log = delays.log
     return AlignedStreams(
-        log, replace(wheels, log=log), heading, delays, fit, derived,
+        log, wheels, heading, delays, fit, derived,
         (*wheels.warnings, *heading.warnings, *delays.warnings),
     )  # fmt: skip
 
@@ -209,30 +209,6 @@ def _apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
         heading=convention.heading * drive.heading,
         fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
     )
-
-
-def _convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
-    """Say which sides or senses are not as named; the heading's own is reported with its offset."""
-    one, done = decision.convention, ": corrected" if corrects else ""
-    notes = []
-    if one.swapped:
-        notes.append(f"left and right wheels are swapped{done}")
-    signs = (one.sign_left, one.sign_right)
-    reversed_ = {(-1, 1): "the left wheels count", (1, -1): "the right wheels count", (-1, -1): "both wheels count"}
-    if signs in reversed_:
-        notes.append(f"{reversed_[signs]} backwards{done}")
-    if one.position < 0:
-        notes.append(f"positions are mirrored (east for west){done}")
-    if decision.as_likely is not None:
-        notes.append(f"{_in_words(decision.as_likely)} would explain the log as well: check the wheels' names")
-    return notes
-
-
-def _in_words(one: Convention) -> str:
-    parts = ["swapped sides"] * one.swapped
-    parts += ["a reversed left side"] * (one.sign_left < 0) + ["a reversed right side"] * (one.sign_right < 0)
-    parts += ["a mirrored heading"] * (one.heading < 0) + ["mirrored positions"] * (one.position < 0)
-    return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"
 
 
 def _turned_over(log: RobotLog) -> RobotLog:
@@ -295,10 +271,8 @@ def _fused_note(log: RobotLog) -> list[str]:
     apart = log.wheels.v_left_mps - log.wheels.v_right_mps
     if not (np.ptp(rate) > 0.1 and np.ptp(apart) > 0 and float(np.corrcoef(rate, apart)[0, 1]) > FUSED_CORRELATION):
         return []
-    return [
-        f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip; "
-        "name the wheels' own topic with topics.wheels"
-    ]
+    fact = f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip"
+    return [f"{fact}; name the wheels' own topic with topics.wheels"]
 
 
 def _heading_check(
@@ -361,7 +335,7 @@ def _significant(offset: float, std: float) -> bool:
     return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)
 
 
-def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None, derived: DerivedHeading | None) -> StreamDelays:
+def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
     """Return the delays of heading and positions against the wheels, with what is clear, or configured, corrected."""
     field = config.filter.preset == "field"
     found = {"heading": UNKNOWN, "position": UNKNOWN}

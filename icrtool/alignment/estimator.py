@@ -53,7 +53,9 @@ SAME_CLOCK_STD_S = 1e-3
 STEP_S = 0.02
 """Delays are differentiated over this step."""
 
-OVERLAP = 8.0
+OVERLAP = 1.0
+"""Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
+
 FEWEST_WINDOWS = 16
 MOST_STEPS = 15
 
@@ -201,7 +203,9 @@ class _Model:
         nose = np.exp(1j * (heading_at(self.middle_t) + offset))
         rate = (heading_at(self.middle_t + STEP_S) - heading_at(self.middle_t - STEP_S)) / (2 * STEP_S)
         sideways = 1j * self.v * 2 * self.u / self.b
-        body = x[A] * self.v + x[M] * self.u + 1j * x[C] * self.u + x[L] * sideways
+        # the turn rate, as a speed difference: with an asymmetry it does not vanish where both sides are equal
+        turning = self.u + x[Q] / (2.0 * x[K]) * self.v
+        body = x[A] * self.v + x[M] * self.u + 1j * x[C] * turning + x[L] * sideways
         t = drive.fix_t - late_p
         begin, end = windows.begin, windows.end
 
@@ -215,7 +219,7 @@ class _Model:
         speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
         slopes = np.zeros((len(begin), len(x)), np.complex128)
         slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
-        slopes[:, C], slopes[:, L] = 1j * slopes[:, M], between(sideways * nose)
+        slopes[:, C], slopes[:, L] = between(1j * turning * nose), between(sideways * nose)
         slopes[:, D] = 1j * predicted
         slopes[:, TP] = -(speed[end] - speed[begin])
         slopes[:, TH] = slopes[:, TP] + between(1j * rate * body * nose)

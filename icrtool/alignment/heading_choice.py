@@ -91,7 +91,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     if pair is not None:
         source, topic = "antennas", f"{log.other_receivers[0].topic} + {topic}"
     words = {
-        "antennas": f"direction between two antennas {0.0 if pair is None else pair[0]:.2f} m apart, turn rate and course",
+        "antennas": f"two antennas {0.0 if pair is None else pair[0]:.2f} m apart, turn rate and course over ground",
         "gyro": f"turn rate and course over ground, bias {math.degrees(found.constants[1]):+.2f} deg/s at the end",
         "wheels": "course over ground and wheels: no inertial unit in the log",
     }

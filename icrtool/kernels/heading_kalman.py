@@ -1,7 +1,7 @@
 """Kalman filter and smoother of a heading with linear constants beside it, event by event.
 
-State x = (heading, bias, scale error, further constants). Between events the heading grows by (1 + scale) dG - bias dt,
-with dG the integrated turn rate. Every event measures one number: z = h x + noise, wrapped where it is an angle.
+State x = (heading, bias, scale error, further constants). Between events the heading grows by (1 + scale) turn - bias dt,
+with turn the integrated turn rate. Every event measures one number: z = h x + noise, wrapped where it is an angle.
 Filter: Kalman 1960. Smoother: Rauch, Tung, Striebel 1965.
 """
 
@@ -24,12 +24,12 @@ class HeadingEvents(NamedTuple):
 
     Attributes
     ----------
-    dt : seconds since the event before; dG : integrated turn rate over them [rad]
+    dt : seconds since the event before; turn : integrated turn rate over them [rad]
     z : measured; h : (n, k) its derivative by the state; r : variance; angle : whether z is one
     """
 
     dt: Floats
-    dG: Floats
+    turn: Floats
     z: Floats
     h: Floats
     r: Floats
@@ -67,17 +67,17 @@ def _forward(events: HeadingEvents, x: Floats, P: Floats, q: Floats, out: Headin
     n, k = events.h.shape
     T, Ph = np.empty((k, k)), np.empty(k)
     for i in range(n):
-        dt, dG = events.dt[i], events.dG[i]
-        x[0] += (1.0 + x[2]) * dG - x[1] * dt
-        # F is the identity but for its first row (1, -dt, dG, 0, ...)
+        dt, turn = events.dt[i], events.turn[i]
+        x[0] += (1.0 + x[2]) * turn - x[1] * dt
+        # F is the identity but for its first row (1, -dt, turn, 0, ...)
         for b in range(k):
             for a in range(k):
                 T[a, b] = P[a, b]
-            T[0, b] = P[0, b] - dt * P[1, b] + dG * P[2, b]
+            T[0, b] = P[0, b] - dt * P[1, b] + turn * P[2, b]
         for a in range(k):
             for b in range(k):
                 P[a, b] = T[a, b]
-            P[a, 0] = T[a, 0] - dt * T[a, 1] + dG * T[a, 2]
+            P[a, 0] = T[a, 0] - dt * T[a, 1] + turn * T[a, 2]
             P[a, a] += q[a] * dt
         out.x_predicted[i], out.P_predicted[i] = x, P
         S, y = events.r[i], events.z[i]
@@ -102,7 +102,7 @@ def smooth_headings(events: HeadingEvents, passes: HeadingPasses) -> tuple[Float
     """Return smoothed states (n, k) and their covariances (n, k, k)."""
     k = events.h.shape[1]
     F = np.tile(np.eye(k), (len(events.z) - 1, 1, 1))
-    F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.dG[1:]
+    F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.turn[1:]
     solved = np.asarray(np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]), np.float64)
     gains = np.ascontiguousarray(solved.transpose(0, 2, 1))
     x, P = passes.x.copy(), passes.P.copy()
