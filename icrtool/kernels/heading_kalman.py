@@ -1,7 +1,7 @@
 """Kalman filter and smoother of a heading with linear constants beside it, event by event.
 
-State x = (heading, bias, scale error, further constants). Between events the heading grows by (1 + scale) turn - bias dt,
-with turn the integrated turn rate. Every event measures one number: z = h x + noise, wrapped where it is an angle.
+State x = (heading, bias, scale error, further constants). Between events it grows by (1 + scale) turn - bias dt,
+with turn the integrated rate. Every event measures one number: z = h x + noise, wrapped where it is an angle.
 Filter: Kalman 1960. Smoother: Rauch, Tung, Striebel 1965.
 """
 
