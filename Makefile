@@ -7,6 +7,7 @@ DEMO_OPTIONS ?= --robot segway-rmp400
 DEMO_RUN      = icrtool-runs/$(basename $(notdir $(DEMO_LOG)))
 BENCH        ?= benchmarks/run.py
 SAMPLES      ?= sample_logs/generate.py
+JOBS         ?= 2
 
 BIN   := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -52,8 +53,9 @@ words: $(READY)  ## count the words that docs/glossary.md asks to avoid, by pack
 types: $(READY)  ## mypy, strict
 	$(BIN)/mypy
 
-test: $(READY)  ## the tests, without the stress tests
-	$(BIN)/python -m pytest -q
+# Two processes, each with whole files of tests: fixtures of a module are made once.
+test: $(READY)  ## the tests, without the stress tests; JOBS=0 runs them in one process
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
 
 stress: $(READY)  ## the long and large tests alone
 	$(BIN)/python -m pytest -q -m stress

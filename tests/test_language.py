@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("## Words not to use")[2]
 
-DONE: tuple[str, ...] = ()
+DONE: tuple[str, ...] = ("__init__", "figures")
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PAGES = (

@@ -155,8 +155,7 @@ def dropout(
 
 def configured_horizons_m(run: Run) -> tuple[float, ...]:
     """Return the horizons [m] of the configuration a run was made with."""
-    horizons: Iterable[float] = run.summary["config"]["dropout"]["horizons_m"]
-    return tuple(horizons)
+    return run.config.dropout.horizons_m
 
 
 def check_horizons(horizons_m: Iterable[float]) -> Floats:

@@ -10,7 +10,7 @@ from icrtool.kernels.window_errors import NEUTRAL
 from icrtool.records.tables import Floats
 
 USUAL_MULTIPLIER = 1.4
-"""W / b of the prior: published skid factors are 1.1 to 1.9 (logs.md, section 1)."""
+"""W / b of the prior: skid factors in the published settings of Clearpath and Husarion robots are 1.1 to 1.9."""
 
 TERMS = ("separation", "asymmetry", "x_icr", "scale", "scale_difference", "bend", "speed", "late")
 """What can be fitted: W [m], (y_r + y_l) / 2 [m], x_icr [m], scale of both sides, left minus right, and ``bend``,

@@ -223,15 +223,27 @@ class RunDocument(TypedDict):
     excitation: ExcitationDocument
 
 
+TOGETHER = (
+    ("gnss", "mean_difference_m", "max_difference_m"),
+    ("gnss", "delay_s", "delay_std_s"),
+    ("heading", "delay_s", "delay_std_s"),
+    ("heading", "offset_deg", "offset_std_deg"),
+)
+"""Section, and two keys of it that are both known or both null."""
+
+
 def check_run_document(document: dict[str, Any]) -> None:
     """Refuse plain data that is no run.
 
     Raises
     ------
     ValueError
-        A key is missing or of another type; its path is named.
+        A key is missing, of another type, or null without its companion; its path is named.
     """
     try:
         msgspec.convert(document, RunDocument)
     except msgspec.ValidationError as err:
         raise ValueError(str(err)) from err
+    for section, one, other in TOGETHER:
+        if (document[section][one] is None) != (document[section][other] is None):
+            raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")

@@ -1,8 +1,9 @@
-"""The typed tables that cross rooms: what was measured, and what the filter made of it."""
+"""The typed tables that packages exchange: what was measured, and what the filter made of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from html import escape
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -185,7 +186,7 @@ class InputFile:
     sha256: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class RobotLog:
     """What a robot measured on one drive: the tables the filter needs, and where they came from.
 
@@ -214,6 +215,24 @@ class RobotLog:
     gyro: GyroSamples | None = None
     gyros: tuple[GyroAxes, ...] = ()
     other_receivers: tuple[OtherReceiver, ...] = ()
+
+    def __repr__(self) -> str:
+        spans = [samples.stamp_ns[[0, -1]] for samples in self._by_role().values() if len(samples.stamp_ns)]
+        duration_s = (max(int(span[1]) for span in spans) - min(int(span[0]) for span in spans)) / 1e9 if spans else 0.0
+        counts = ", ".join(f"{len(samples.stamp_ns):,} {role}" for role, samples in self._by_role().items())
+        return f"<RobotLog {self.name!r}: {duration_s:.1f} s, {counts}, {len(self.warnings)} warnings>"
+
+    def _by_role(self) -> dict[str, WheelSamples | PositionFixes | HeadingSamples]:
+        return {"wheels": self.wheels, "gnss": self.gnss, "heading": self.heading}
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{escape(stream.role)}</td><td>{escape(stream.topic)}</td><td>{escape(stream.message_type)}</td>"
+            f"<td>{stream.count:,}</td><td>{stream.rate_hz:.1f} Hz</td></tr>"
+            for stream in self.streams
+        )
+        heads = "".join(f"<th>{head}</th>" for head in ("stream", "topic", "type", "samples", "rate"))
+        return f"<p>{escape(repr(self))}</p><table><tr>{heads}</tr>{rows}</table>"
 
 
 @dataclass(frozen=True, slots=True)

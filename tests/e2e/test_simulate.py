@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,16 +14,22 @@ from click.testing import CliRunner
 from icrtool.cli import main
 from icrtool.cli.simulate import command
 
-ROOT = Path(__file__).resolve().parents[2]
 SHORT = ("--duration", "3")
 
 
-def icrtool(directory: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error:::icrtool"}
-    line = [sys.executable, "-m", "icrtool", *map(str, arguments)]
-    return subprocess.run(
-        line, cwd=directory, env=environment, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
-    )
+@pytest.fixture
+def run_in(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """Run a command in a directory, in this process."""
+
+    def run(directory: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+        monkeypatch.chdir(directory)
+        line = ["icrtool", *map(str, arguments)]
+        monkeypatch.setattr(sys, "argv", line)
+        with pytest.raises(SystemExit) as left:
+            main()
+        return subprocess.CompletedProcess(line, int(left.value.code or 0), *capfd.readouterr())
+
+    return run
 
 
 @pytest.fixture
@@ -43,13 +48,13 @@ def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], 
     return run
 
 
-def test_terrain_changes_are_found_said_and_drawn(tmp_path: Path) -> None:
-    made = icrtool(
+def test_terrain_changes_are_found_said_and_drawn(run_in, tmp_path: Path) -> None:
+    made = run_in(
         tmp_path, "simulate", "-o", "drive.mcap", "--robot", "segway-rmp400", "--icrs", "0.63,-0.76,0.06",
         "--change", "60:0.85,-1.0,0", "--path", "figure-eight", "--duration", 120,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
-    fitted = icrtool(tmp_path, "fit", "drive.mcap", "--robot", "segway-rmp400", "--terrain-change", "auto", "-o", "run")
+    fitted = run_in(tmp_path, "fit", "drive.mcap", "--robot", "segway-rmp400", "--terrain-change", "auto", "-o", "run")
     assert fitted.returncode == 0, fitted.stderr
     assert "1 change of the ICRs found" in fitted.stdout
     assert "by chance: 0.1 an hour at most" in fitted.stdout
@@ -57,21 +62,19 @@ def test_terrain_changes_are_found_said_and_drawn(tmp_path: Path) -> None:
     terrain = json.loads((tmp_path / "run" / "run.json").read_text())["terrain"]
     assert [change["t_s"] for change in terrain["changes"]] == pytest.approx([60.0], abs=3.0)
     assert terrain["changes"][0]["statistic"] > terrain["threshold"]
-    refused = icrtool(tmp_path, "fit", "drive.mcap", "--terrain-change", "soon")
+    refused = run_in(tmp_path, "fit", "drive.mcap", "--terrain-change", "soon")
     assert refused.returncode == 2
     assert "give seconds or auto" in refused.stderr
 
 
-def test_a_simulated_log_is_fitted_like_any_other(tmp_path: Path) -> None:
-    made = icrtool(
-        tmp_path, "simulate", "-o", "drive.mcap", "--robot", "husky-a200", "--duration", 60, "--gnss", "waas"
-    )
+def test_a_simulated_log_is_fitted_like_any_other(run_in, tmp_path: Path) -> None:
+    made = run_in(tmp_path, "simulate", "-o", "drive.mcap", "--robot", "husky-a200", "--duration", 60, "--gnss", "waas")
     assert made.returncode == 0, made.stderr
     assert made.stderr == ""
     assert "husky-a200, b = 0.555 m" in made.stdout
     assert "y right +0.416, y left -0.416, x +0.000 m" in made.stdout
     assert made.stdout.endswith("written to drive.mcap, truth to drive.mcap.truth.csv\n")
-    fitted = icrtool(tmp_path, "fit", "drive.mcap", "--robot", "husky-a200", "--plots", "none")
+    fitted = run_in(tmp_path, "fit", "drive.mcap", "--robot", "husky-a200", "--plots", "none")
     assert fitted.returncode == 0, fitted.stderr
     states = pd.read_csv(tmp_path / "icrtool-runs" / "drive" / "states.csv")
     truth = pd.read_csv(tmp_path / "drive.mcap.truth.csv")

@@ -114,7 +114,7 @@ def _icr_lines(run: Run) -> list[str]:
 
 def _multiplier_lines(run: Run) -> list[str]:
     width, multiplier = run.track_width_m, run.summary["icr"]["separation_multiplier"]
-    if multiplier is None:
+    if width is None or multiplier is None:
         return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -107,15 +108,7 @@ def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
     """The report of one model with these p95 at 1, 2.5 and 10 m."""
     result = report.results[0]
     summary = result.summary._replace(p95=np.array(p95))
-    return DropoutReport(
-        name="x",
-        horizons_m=report.horizons_m,
-        results=(result._replace(summary=summary),),
-        counts=report.counts,
-        states=1,
-        standing=0,
-        seed=1,
-    )
+    return replace(report, results=(result._replace(summary=summary),))
 
 
 @pytest.mark.parametrize(

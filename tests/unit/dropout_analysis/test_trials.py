@@ -7,12 +7,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import icrtool
+from icrtool.config import DropoutConfig
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.trials import Model, configured_horizons_m, dropout, models_of
 from icrtool.errors import ConfigError, DataError
@@ -36,15 +36,8 @@ def gathered(run, horizons_m=HORIZONS_M, **options):
     return dropout(run, horizons_m, sink=sink, **options), errors
 
 
-def changed(run: Run, **columns) -> SimpleNamespace:
-    return SimpleNamespace(
-        name=run.name,
-        table=replace(run.table, **columns),
-        in_gap=run.in_gap,
-        outages_ns=run.outages_ns,
-        track_width_m=run.track_width_m,
-        summary=run.summary,
-    )
+def changed(run: Run, **columns) -> Run:
+    return replace(run, table=replace(run.table, **columns))
 
 
 def test_every_single_error_equals_brute_force_for_all_models(run: Run) -> None:
@@ -178,10 +171,8 @@ def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
 
 def test_horizons_default_to_the_configured_ones(run: Run) -> None:
     assert configured_horizons_m(run) == tuple(float(d) for d in range(1, 21))
-    summary = {**run.summary, "config": {**run.summary["config"], "dropout": {"horizons_m": [4.0, 2.0]}}}
-    stub = changed(run)
-    stub.summary = summary
-    assert dropout(stub).horizons_m.tolist() == [2.0, 4.0]
+    config = replace(run.config, dropout=DropoutConfig(horizons_m=(4.0, 2.0)))
+    assert dropout(replace(run, config=config)).horizons_m.tolist() == [2.0, 4.0]
 
 
 @pytest.mark.parametrize("horizons", [[], [0.0], [-1.0], [math.inf], [math.nan]])

@@ -135,7 +135,7 @@ def test_a_change_beyond_the_drive_is_none_and_said() -> None:
 
 def test_a_straight_drive_cannot_be_searched_and_says_so() -> None:
     run = fit(drive(0, PathPlan("straight", 0.5), 40.0), CONFIG, find_changes=True)
-    assert run.terrain.searched
+    assert run.summary["terrain"]["searched"]
     assert run.changes_s == ()
     assert run.summary["terrain"]["threshold"] is None
     assert "too few turns" in format_run(run)
