@@ -26,7 +26,7 @@ from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, deri
 from icrtool.alignment.heading_offset_cause import NO_NAME, name_offset
 from icrtool.alignment.reference_delay import delayed
 from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.stream_delays import UNKNOWN, Delay, StreamDelays
+from icrtool.alignment.stream_delays import LARGEST_STD_S, UNKNOWN, Delay, StreamDelays
 from icrtool.alignment.wheel_alignment import WheelCheck, dead_or_copied, held_note, held_share
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -43,10 +43,6 @@ FACTOR_TWO_TOLERANCE = 0.04
 """A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
-SMALLEST_DELAY_S, SMALLEST_LEAD_S, LARGEST_DELAY_STD_S = 0.08, 0.2, 0.04
-"""A robot answers its wheels late, by 0.1 s on rigid-body simulated robots: a stream that leads by as much needs no
-correction, one that lags does."""
-
 STANDS_SHARE, STILL = 0.8, 0.2
 """The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
 
@@ -87,6 +83,11 @@ class AlignedStreams(NamedTuple):
         return None if self.fit is None else self.fit.geometry()
 
     @property
+    def as_named(self) -> RobotLog:
+        """The log with sides, handedness and scale corrected, offset and delays not."""
+        return _turned_over(self.wheels.log) if self.heading.applied_mirror else self.wheels.log
+
+    @property
     def source(self) -> str:
         """What the heading was made of."""
         return "orientation" if self.derived is None else self.derived.source
@@ -96,7 +97,7 @@ class AlignedStreams(NamedTuple):
         found = self.geometry
         if found is None:
             return {}
-        std = np.sqrt(np.diag(found.covariance))
+        std = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
         scale = self.wheels.applied_scale
         rows = {
             "left_scale": (3, scale, "both sides are scaled alike"),
@@ -342,7 +343,7 @@ def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDe
     if fit is not None:
         for what in found:
             value, std = fit.estimate(f"{what}_delay")
-            found[what] = Delay(value, std) if std < 2 * LARGEST_DELAY_STD_S else UNKNOWN
+            found[what] = Delay(value, std) if std < 2 * LARGEST_STD_S else UNKNOWN
     topics = {stream.role: stream.topic for stream in log.streams}
     together = "gnss" in topics and topics["gnss"] == topics.get("heading")
     given = {"heading": config.frames.heading_delay_s, "position": config.frames.reference_delay_s}
@@ -352,9 +353,9 @@ def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDe
         applied[what] = 0.0
         if field and setting != "auto":
             applied[what] = setting
-        elif field and _is_clear(delay):
+        elif field and delay.is_clear:
             applied[what] = delay.value_s
-            lags = "lags" if delay.value_s > 0 else "leads"
+            lags = ("lag" if together else "lags") if delay.value_s > 0 else ("lead" if together else "leads")
             subject = "the position and its heading" if together else f"the {what}"
             if not (together and what == "heading"):
                 notes.append(
@@ -373,12 +374,6 @@ def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDe
     )
 
 
-def _is_clear(delay: Delay) -> bool:
-    if not (delay.std_s < LARGEST_DELAY_STD_S and abs(delay.value_s) > SIGNIFICANT_SIGMAS * delay.std_s):
-        return False
-    return delay.value_s > SMALLEST_DELAY_S or delay.value_s < -SMALLEST_LEAD_S
-
-
 def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:
     """Return the ICRs to start the filter from; None in preset ``paper``.
 
@@ -391,7 +386,7 @@ def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: C
     least = LEAST_START_STD * b
     if found is not None:
         right, left, x = found.values[:3].tolist()
-        std, width = np.sqrt(np.diag(found.covariance)), float(found.values[5])
+        std, width = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)), float(found.values[5])
         shown = std[5] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
         icrs = (right + antenna_m[1], left + antenna_m[1], x + antenna_m[0])
         if shown and icrs[0] > least > -least > icrs[1] and float(std[:3].max()) < b:

@@ -90,9 +90,11 @@ class AlignmentFit(NamedTuple):
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
         if name == "position_delay":
             both = self.fit.covariance[np.ix_([TP, TH], [TP, TH])]
-            return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(float(both.sum()))
+            return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
         row = NAMES.index(name)
-        return float(self.fit.x[row]), float(self.fit.std[row])
+        variance = float(self.fit.covariance[row, row])
+        # rounding may leave a variance below zero where the drive hardly shows the parameter
+        return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
 
     @property
     def heading_scatter(self) -> float:

@@ -54,8 +54,10 @@ def test_the_standard_deviation_covers_the_error_over_many_drives() -> None:
     for seed in range(8):
         log, truth = without_heading(seed)
         found = derive_heading(log, WIDTH_M)
-        for samples in (found.smoothed, found.causal):
-            inside.append(np.mean(np.abs(error_deg(samples, truth)) < 2.0 * np.degrees(np.sqrt(samples.var_rad2))))
+        inside += [
+            np.mean(np.abs(error_deg(samples, truth)) < 2.0 * np.degrees(np.sqrt(samples.var_rad2)))
+            for samples in (found.smoothed, found.causal)
+        ]
     assert np.mean(inside) > 0.85
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from icrtool.alignment import stream_delays
-from icrtool.alignment.stream_delays import heading_delay
+from icrtool.alignment.drive_windows import cut_windows, drive_arrays
+from icrtool.alignment.estimator import estimate_alignment
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
-from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from icrtool.records.tables import Datum, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
 
 START_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)
@@ -89,18 +88,6 @@ def test_a_late_stream_is_found_and_taken_out_alone(stream: str, delay: float) -
     assert icr_error(run) < ICR_TOLERANCE_M
 
 
-def test_a_search_that_does_not_settle_finds_nothing() -> None:
-    """A robot that is parked and then drives a circle: the one change of speed says this, and then that."""
-    rng = np.random.default_rng(1)
-    design = np.column_stack([np.ones(400), rng.normal(0.0, 0.1, 400), np.ones(400)])
-
-    def explain(at: float) -> tuple[Floats, Floats, Callable[[Floats], float]]:
-        seen = design[:, 1] * (0.15 if at < 0.1 else -0.15) + rng.normal(0.0, 1e-4, 400)
-        return design, seen, lambda _: 1.0
-
-    assert np.isnan(stream_delays._search(explain).value_s)
-
-
 def test_configured_delays_are_used_as_they_are() -> None:
     sets = [WIDTH, "frames.heading_delay_s=0.2", "frames.reference_delay_s=0.3"]
     run = fit(stop_and_go(heading_late_s=0.2, fixes_late_s=0.3), load_config(sets=sets))
@@ -145,11 +132,13 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
     wheels, heading = replace(log.wheels, stamp_ns=stray[0]), replace(log.heading, stamp_ns=stray[1])
     tracemalloc.start()
     try:
-        found = heading_delay(replace(log, wheels=wheels, heading=heading))
+        drive = drive_arrays(replace(log, wheels=wheels, heading=heading))
+        found = estimate_alignment(drive, cut_windows(drive), 0.8)
         most = tracemalloc.get_traced_memory()[1]
     except MemoryError:
         pytest.fail("an array over the time between first and last stamp")
     finally:
         tracemalloc.stop()
-    assert found.value_s == pytest.approx(0.3, abs=DELAY_TOLERANCE_S)
+    assert found is not None
+    assert found.estimate("heading_delay")[0] == pytest.approx(0.3, abs=DELAY_TOLERANCE_S)
     assert most < 50e6
