@@ -133,9 +133,9 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     decision = _decide(log, config, drive, windows, derived)
     if corrects:
         log = _apply(log, decision.convention)
-        drive = _apply_to_drive(drive, decision.convention)
+    drive = _apply_to_drive(drive, decision.convention)
     notes += convention_notes(decision, corrects=corrects)
-    mirrored = corrects and decision.convention.heading < 0
+    mirrored = decision.convention.heading < 0
     _refuse_standing(log, drive, windows)
     course = measure_course(_turned_over(log) if mirrored else log)
     free = config.frames.heading_offset_deg == "auto" and corrects
@@ -292,7 +292,7 @@ def _heading_check(
         )  # fmt: skip
     if fit is None:
         return HeadingCheck(
-            len(course.angle), *nothing, applied_mirror=mirrored, applied_offset_rad=fixed, applied_std_rad=0.0,
+            len(course.angle), *nothing, applied_mirror=mirrored and corrects, applied_offset_rad=fixed, applied_std_rad=0.0,
             applied_correlation_s=0.0, name=NO_NAME, warnings=(),
         )  # fmt: skip
     turn, std = fit.estimate("offset")
@@ -305,7 +305,9 @@ def _heading_check(
     cause = f" ({name.text})" if name.text else ""
     text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(std):.1f}°"
     applied, notes = fixed, []
-    if mirrored:
+    if mirrored and not corrects:
+        notes.append("the heading turns the other way than the course: set frames.heading to the other of enu and ned")
+    elif mirrored:
         applied = offset if given == "auto" else fixed
         notes.append(
             "the heading turns the other way than the course: its yaw is of the other convention (ENU/NED), "
@@ -325,7 +327,7 @@ def _heading_check(
     return HeadingCheck(
         windows=len(course.angle), offset_rad=offset, offset_std_rad=std, scatter_rad=scatter,
         agreement=course.agreement if len(course.angle) else math.nan,
-        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan, applied_mirror=mirrored,
+        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan, applied_mirror=mirrored and corrects,
         applied_offset_rad=applied, applied_std_rad=scatter if noisy else 0.0,
         applied_correlation_s=course.duration_s if noisy else 0.0, name=name,
         warnings=tuple(f"{log.name}: {note}" for note in notes),
