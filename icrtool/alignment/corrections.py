@@ -292,7 +292,8 @@ def _heading_check(
         )  # fmt: skip
     if fit is None:
         return HeadingCheck(
-            len(course.angle), *nothing, applied_mirror=mirrored and corrects, applied_offset_rad=fixed, applied_std_rad=0.0,
+            len(course.angle), *nothing, applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
+            applied_std_rad=0.0,
             applied_correlation_s=0.0, name=NO_NAME, warnings=(),
         )  # fmt: skip
     turn, std = fit.estimate("offset")
@@ -327,7 +328,8 @@ def _heading_check(
     return HeadingCheck(
         windows=len(course.angle), offset_rad=offset, offset_std_rad=std, scatter_rad=scatter,
         agreement=course.agreement if len(course.angle) else math.nan,
-        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan, applied_mirror=mirrored and corrects,
+        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan,
+        applied_mirror=mirrored and corrects,
         applied_offset_rad=applied, applied_std_rad=scatter if noisy else 0.0,
         applied_correlation_s=course.duration_s if noisy else 0.0, name=name,
         warnings=tuple(f"{log.name}: {note}" for note in notes),

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.ekf import FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterParameters, Measurements
 from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
 from icrtool.records.tables import Floats, Ints

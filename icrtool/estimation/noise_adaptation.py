@@ -8,7 +8,8 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, configured_process_position_mps, set_up_filter
-from icrtool.kernels.ekf import UNSEEN, FilterOutput, run_filter
+from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.filter_records import UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
 

@@ -10,7 +10,7 @@ from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, check_start, set_up_filter, wheel_gap_s
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.estimation.terrain_changes import TerrainTest, find_terrain_changes, given_changes
-from icrtool.kernels.ekf import UNSEEN, Codes, FilterOutput
+from icrtool.kernels.filter_records import UNSEEN, Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples

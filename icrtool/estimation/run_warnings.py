@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_process_position_mps
-from icrtool.kernels.ekf import GATED, UNSEEN
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.run import MeasurementOutcome
 from icrtool.records.tables import Floats, States

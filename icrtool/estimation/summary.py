@@ -15,7 +15,7 @@ from icrtool.estimation.observability import find_excitation
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings
-from icrtool.kernels.ekf import GATED, RECOVERED, UNSEEN
+from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
@@ -137,8 +137,9 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     Returns
     -------
     dict
-        By column: seconds at which the estimate has gone 10 % and 90 % of the change from its start to its settled
-        value (median over the second half of the run), or None where it hardly moved or never settled.
+        By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
+        (median over the second half of the run), and time from which on it stays within 10 % of that change for
+        `SETTLED_S`; None where the change is below `SMALLEST_CHANGE_M` or the estimate never settles.
 
     Notes
     -----

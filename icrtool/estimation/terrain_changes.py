@@ -160,7 +160,7 @@ def find_terrain_changes(
 
     Parameters
     ----------
-    table, in_gap, outages_ns : a finished run, see `icrtool.estimation.fit.FilterRun`
+    table, in_gap, outages_ns : a finished run, see `icrtool.records.run.Run`
     innovations : times (h,) [s] and innovations (h,) [rad] of all headings, those rejected too: wrong ICRs reject them
     given_s : changes that are known, seconds since the first recorded state
 

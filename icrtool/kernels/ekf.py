@@ -1,122 +1,36 @@
 """The ICR EKF, compiled: event-driven propagation and updates (Pentzer 2014, Section 3, Eqs. 13-25).
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
-`icrtool.kernels.ekf_plain` is the same filter in matrix form, the one to read; the tests hold this one to it.
+The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
+`filter_rows` is the one event loop: the filter, the smoother's forward pass and the runs of a study call it.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.ekf_step import (
-    DIAGONAL,
-    EAST,
-    HEADING,
-    NORTH,
-    Floats,
-    correct,
-    measured_column,
-    predict,
-    wrap,
+from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, measured_column, predict, wrap
+from icrtool.kernels.filter_records import (
+    GATED,
+    RECOVERED,
+    USED,
+    FilterOutput,
+    FilterParameters,
+    FilterState,
+    Measurements,
+    Nodes,
 )
-
-Codes = NDArray[np.uint8]
-
-UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+from icrtool.kernels.kinematics import Floats
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
 
-
-class FilterParameters(NamedTuple):
-    """Constants of one run.
-
-    Attributes
-    ----------
-    process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
-    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
-    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
-        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
-    gnss_gate, heading_gate : largest NIS accepted; inf accepts all
-    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
-    antenna_forward, antenna_right : lever arm of the antenna [m], body frame
-    wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
-    gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
-    recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
-    icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
-    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
-    """
-
-    process_variance: tuple[float, float, float, float, float, float]
-    rate_invariant: bool
-    step_heading: float
-    gnss_gate: float
-    heading_gate: float
-    heading_correlation: float
-    antenna_forward: float
-    antenna_right: float
-    wheel_gap_s: float
-    gap_speed_variance: float
-    gap_turn_variance: float
-    recovery_count: int
-    recovery_s: float
-    icr_inflation_m2: float
-    least_icr: float
-
-
-class Measurements(NamedTuple):
-    """Inputs of one run: times [s] since any one epoch, non-decreasing.
-
-    Attributes
-    ----------
-    wheel_t : (n,); v_left, v_right : (n,) [m/s], held over [k, k+1)
-    gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
-    heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
-    change_t : (c,) times of terrain changes
-    """
-
-    wheel_t: Floats
-    v_left: Floats
-    v_right: Floats
-    gnss_t: Floats
-    gnss_z: Floats
-    gnss_r: Floats
-    heading_t: Floats
-    heading_z: Floats
-    heading_r: Floats
-    change_t: Floats
-
-
-class FilterOutput(NamedTuple):
-    """What one run leaves behind.
-
-    Attributes
-    ----------
-    x : (k, 6) states after all updates at the stamps of the last k wheel samples; variance : (k, 6) diagonal of P
-    distance : (k,) path length [m]
-    gnss_nis, heading_nis : (m,), (h,) normalised innovation squared, NaN where unseen
-    gnss_code, heading_code : UNSEEN, USED, GATED or RECOVERED
-    gnss_residual : (m, 2) fix minus estimate after the update [m]
-    heading_innovation : (h,) [rad]
-    P : (21,) upper triangle of the covariance at the end, row by row
-    """
-
-    x: Floats
-    variance: Floats
-    distance: Floats
-    gnss_nis: Floats
-    gnss_code: Codes
-    gnss_residual: Floats
-    heading_nis: Floats
-    heading_code: Codes
-    heading_innovation: Floats
-    P: Floats
+BLOCK_EVENTS = 500_000
+"""Events in one compiled call of `run_filter`: some 0.2 s, between which Ctrl-C and SIGTERM are acted on."""
 
 
 @njit
@@ -168,8 +82,8 @@ def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
 def take_fix(
     t: float, z_n: float, z_e: float, r_n: float, r_e: float, x: Floats, P: Floats, PH: Floats, run: Floats,
     parameters: FilterParameters, residual: Floats,
-) -> tuple[int, float]:  # fmt: skip
-    """Gate and apply one fix z [m] of variances r [m^2]; return what became of it, and its NIS.
+) -> tuple[int, float, float, float]:  # fmt: skip
+    """Gate and apply one fix z [m] of variances r [m^2]; return its code, its NIS and its innovation [m].
 
     North and east are applied one after the other, which equals the joint update since their noises are independent.
     """
@@ -198,7 +112,7 @@ def take_fix(
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
     residual[0] = z_n - x[0] - a_n
     residual[1] = z_e - x[1] - a_e
-    return code, nis
+    return code, nis, nu_n, nu_e
 
 
 @njit
@@ -241,7 +155,7 @@ def advance(
         P[6] += parameters.gap_speed_variance * dt
         P[11] += parameters.gap_turn_variance * dt
     else:
-        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading)
+        travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading, parameters.guard)
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]
@@ -249,16 +163,28 @@ def advance(
 
 
 @njit
-def filter_loop(  # noqa: C901 - the order of events, in one place
-    data: Measurements, t0: float, first: int, start: tuple[int, int, int], x: Floats, P: Floats,
-    parameters: FilterParameters, out: FilterOutput,
-) -> None:  # fmt: skip
-    """Run from time t0 over all wheel samples from `first` on, filling `out`; x and P end as the last state."""
-    j, h, c = start
+def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
+    data: Measurements, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
+    nodes: Nodes | None,
+) -> int:  # fmt: skip
+    """Run the filter over wheel samples [begin, end); return the number of events.
+
+    Parameters
+    ----------
+    state : as the rows before left it; changed to what these leave
+    out : its x, variance and distance are of these rows (end - begin, ...), the rest is of all measurements
+    nodes : filled with every event; None: nothing is kept (compiled as a function of its own)
+
+    Notes
+    -----
+    At equal stamps: wheel speeds, terrain changes, GNSS, heading, then the state is recorded.
+    """
+    x, P, PH = state.x, state.P, np.zeros(6)
+    gnss_run, heading_run = state.rejected[0], state.rejected[1]
     n_gnss, n_heading, n_change = len(data.gnss_t), len(data.heading_t), len(data.change_t)
-    gnss_run, heading_run, PH = np.zeros(4), np.zeros(4), np.zeros(6)
-    t, travelled = t0, 0.0
-    for k in range(first, len(data.wheel_t)):
+    t, travelled, j, h, c = state.t[0], state.distance[0], state.place[0], state.place[1], state.place[2]
+    count = 0
+    for k in range(begin, end):
         held = max(k - 1, 0)
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
@@ -270,48 +196,78 @@ def filter_loop(  # noqa: C901 - the order of events, in one place
                 t_next = min(t_next, data.heading_t[h])
             if c < n_change:
                 t_next = min(t_next, data.change_t[c])
-            if t_next > t:
-                travelled += advance(t_next - t, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
+            dt = max(t_next - t, 0.0)
+            if dt > 0.0:
+                travelled += advance(dt, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
                     P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
                 c += 1
+            if nodes is not None:
+                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
+                nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
-                out.gnss_code[j], out.gnss_nis[j] = take_fix(
+                out.gnss_code[j], out.gnss_nis[j], nu_n, nu_e = take_fix(
                     t, data.gnss_z[j, 0], data.gnss_z[j, 1], data.gnss_r[j, 0], data.gnss_r[j, 1],
                     x, P, PH, gnss_run, parameters, out.gnss_residual[j],
                 )  # fmt: skip
+                if nodes is not None and out.gnss_code[j] == RECOVERED:
+                    nodes.P_predicted[count, 0] += nu_n * nu_n
+                    nodes.P_predicted[count, 6] += nu_e * nu_e
                 j += 1
             while h < n_heading and data.heading_t[h] <= t:
-                out.heading_code[h], out.heading_nis[h], out.heading_innovation[h] = take_heading(
+                out.heading_code[h], out.heading_nis[h], nu = take_heading(
                     t, data.heading_z[h], data.heading_r[h], x, P, PH, heading_run, parameters
                 )
+                out.heading_innovation[h] = nu
+                if nodes is not None and out.heading_code[h] == RECOVERED:
+                    nodes.P_predicted[count, 11] += nu * nu
                 h += 1
+            if nodes is not None:
+                nodes.x[count], nodes.P[count] = x, P
+                nodes.row[count] = k - begin if t >= t_wheel else -1
+            count += 1
             if t >= t_wheel:
                 break
         for i in range(6):
-            out.x[k - first, i] = x[i]
-            out.variance[k - first, i] = P[DIAGONAL[i]]
-        out.distance[k - first] = travelled
+            out.x[k - begin, i] = x[i]
+            out.variance[k - begin, i] = P[DIAGONAL[i]]
+        out.distance[k - begin] = travelled
+    state.t[0], state.distance[0], state.place[0], state.place[1], state.place[2] = t, travelled, j, h, c
+    return count
 
 
 def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
-    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 over all that follows.
+    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
 
     Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
-    first = int(np.searchsorted(data.wheel_t, t0))
-    j, h, c = (int(np.searchsorted(times, t0, side="right")) for times in (data.gnss_t, data.heading_t, data.change_t))
-    out = empty_output(data, first, P0)
-    filter_loop(data, t0, first, (j, h, c), x0.astype(np.float64), out.P, parameters, out)
-    return out
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    state, out = start_state(data, t0, x0, P0), empty_output(data, last - first)
+    events = last + len(data.gnss_t) + len(data.heading_t)
+    for begin, end in pairwise((*range(first, last, max(last * BLOCK_EVENTS // max(events, 1), 1)), last)):
+        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), None)
+    return out._replace(P=state.P)
 
 
-def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
-    """Return the output of a run from wheel sample `first` on, before it has run; its P holds P0 (6, 6)."""
-    rows, n_gnss, n_heading = len(data.wheel_t) - first, len(data.gnss_t), len(data.heading_t)
+def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> FilterState:
+    """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
+    times = (data.gnss_t, data.heading_t, data.change_t)
+    return FilterState(
+        t=np.array([t0], np.float64),
+        distance=np.zeros(1),
+        place=np.array([np.searchsorted(stamps, t0, side="right") for stamps in times], np.int64),
+        rejected=np.zeros((2, 4)),
+        x=x0.astype(np.float64),
+        P=P0[np.triu_indices(6)].astype(np.float64),
+    )
+
+
+def empty_output(data: Measurements, rows: int) -> FilterOutput:
+    """Return the output of a run of so many recorded states, before it has run."""
+    n_gnss, n_heading = len(data.gnss_t), len(data.heading_t)
     return FilterOutput(
         x=np.empty((rows, 6)),
         variance=np.empty((rows, 6)),
@@ -322,5 +278,23 @@ def empty_output(data: Measurements, first: int, P0: Floats) -> FilterOutput:
         heading_nis=np.full(n_heading, np.nan),
         heading_code=np.zeros(n_heading, np.uint8),
         heading_innovation=np.full(n_heading, np.nan),
-        P=P0[np.triu_indices(6)].astype(np.float64),
+        P=np.empty(21),
+    )
+
+
+def output_rows(out: FilterOutput, begin: int, end: int) -> FilterOutput:
+    """Return a view of an output that holds its recorded states [begin, end) only."""
+    rows = slice(begin, end)
+    return out._replace(x=out.x[rows], variance=out.variance[rows], distance=out.distance[rows])
+
+
+def empty_nodes(events: int) -> Nodes:
+    """Return nodes for so many events, to be filled."""
+    return Nodes(
+        x_predicted=np.empty((events, 6)),
+        P_predicted=np.empty((events, 21)),
+        x=np.empty((events, 6)),
+        P=np.empty((events, 21)),
+        step=np.empty((events, 4)),
+        row=np.empty(events, np.int64),
     )

@@ -3,7 +3,7 @@
 State x = (N, E, psi, y_r, y_l, x_v), shape (6,). The covariance P is its upper triangle row by row, shape (21,):
 ``NN NE Np Nr Nl Nx  EE Ep Er El Ex  pp pr pl px  rr rl rx  ll lx  xx``. Both are changed in place.
 The sums are written out: loops over a 6 x 6 array take three times as long.
-`icrtool.kernels.ekf_plain` is the same filter in matrix form, the one to read; the tests hold this one to it.
+The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ import math
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.kinematics import body_velocity, icr_separation
-
-Floats = NDArray[np.float64]
+from icrtool.kernels.kinematics import Floats, step_jacobian
 
 NORTH, EAST, HEADING = (cast(int, np.int64(axis)) for axis in range(3))
 """What is measured. With a type: of a function that is called with a plain number numba compiles a copy for it."""
@@ -45,37 +42,23 @@ def row_times(G0: float, G1: float, G2: float, G3: float, p: float, r: float, l:
 
 
 @njit
-def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, step_heading: float) -> float:
+def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, step_heading: float, guard: int) -> float:
     """Propagate state and covariance over dt [s] with the track speeds [m/s] held; return the path length [m].
 
     Parameters
     ----------
-    step_heading : where in the step's turn the heading is taken, see `icrtool.kernels.ekf.FilterParameters`
+    step_heading, guard : see `icrtool.kernels.ekf.FilterParameters`
 
     Notes
     -----
     Eq. 14 (Euler where step_heading is 0) and F P F^T of Eq. 16 with F = I + G (Eqs. 17, 27-29); only rows N, E, psi
-    and columns psi, y_r, y_l, x_v of G differ from zero. The process noise is `icrtool.kernels.ekf.advance`'s.
+    and columns psi, y_r, y_l, x_v of G differ from zero. `icrtool.kernels.ekf.advance` adds the process noise.
     """
-    N, E, psi, y_r, y_l, x_v = x[0], x[1], x[2], x[3], x[4], x[5]
     NN, NE, Np, Nr, Nl, Nx = P[0], P[1], P[2], P[3], P[4], P[5]
     EE, Ep, Er, El, Ex = P[6], P[7], P[8], P[9], P[10]
     pp, pr, pl, px = P[11], P[12], P[13], P[14]
     rr, rl, rx, ll, lx, xx = P[15], P[16], P[17], P[18], P[19], P[20]
-    v_x, v_y, omega = body_velocity(v_left, v_right, y_r, y_l, x_v)
-    W = icr_separation(y_r, y_l)
-    sign = 1.0 if y_r >= y_l else -1.0
-    ahead = step_heading * dt
-    c, s = math.cos(psi + ahead * omega), math.sin(psi + ahead * omega)
-    vx_r, vx_l = (v_left - v_x * sign) / W, (v_x * sign - v_right) / W
-    w_r, w_l = -omega * sign / W, omega * sign / W
-    n0, e0 = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
-    # the ICRs move the place by the body velocity, and by the heading at which it is turned into the world
-    a_r, a_l = ahead * w_r, ahead * w_l
-    n1, e1 = dt * (vx_r * c + w_r * x_v * s) + n0 * a_r, dt * (vx_r * s - w_r * x_v * c) + e0 * a_r
-    n2, e2 = dt * (vx_l * c + w_l * x_v * s) + n0 * a_l, dt * (vx_l * s - w_l * x_v * c) + e0 * a_l
-    n3, e3 = dt * omega * s, -dt * omega * c
-    p1, p2 = dt * w_r, dt * w_l
+    n0, n1, n2, n3, e0, e1, e2, e3, p1, p2, turn, length = step_jacobian(x, v_left, v_right, dt, step_heading, guard)
     # M = (I + G) P, the parts of it that P' needs
     M_NN = NN + row_times(n0, n1, n2, n3, Np, Nr, Nl, Nx)
     M_NE = NE + row_times(n0, n1, n2, n3, Ep, Er, El, Ex)
@@ -101,10 +84,10 @@ def predict(x: Floats, P: Floats, v_left: float, v_right: float, dt: float, step
     P[8], P[9], P[10] = M_Er, M_El, M_Ex
     P[11] = M_pp + p1 * M_pr + p2 * M_pl
     P[12], P[13], P[14] = M_pr, M_pl, M_px
-    x[0] = N + e0
-    x[1] = E - n0
-    x[2] = psi + dt * omega
-    return dt * math.sqrt(v_x * v_x + v_y * v_y)
+    x[0] += e0
+    x[1] -= n0
+    x[2] += turn
+    return length
 
 
 @njit

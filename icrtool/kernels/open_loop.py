@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.kinematics import body_velocity
+from icrtool.kernels.kinematics import euler_step
 from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints, OpenLoopPath, TrialCounts
 
 SHORT = -1
@@ -21,26 +21,6 @@ GAP = -2
 """No trial: the way spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
-
-
-@njit
-def euler_step(
-    north: float,
-    east: float,
-    heading: float,
-    dt: float,
-    v_left: float,
-    v_right: float,
-    y_icr_right: float,
-    y_icr_left: float,
-    x_icr: float,
-) -> tuple[float, float, float]:
-    """Return north, east, heading after one Euler step of `dt` [s] (Eqs. 8-12; speeds [m/s], ICRs [m])."""
-    v_x, v_y, omega = body_velocity(v_left, v_right, y_icr_right, y_icr_left, x_icr)
-    cos_psi, sin_psi = math.cos(heading), math.sin(heading)
-    north += dt * (v_x * cos_psi - v_y * sin_psi)
-    east += dt * (v_x * sin_psi + v_y * cos_psi)
-    return north, east, heading + dt * omega
 
 
 @njit

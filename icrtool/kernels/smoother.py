@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.ekf import RECOVERED, FilterParameters, Measurements, advance, antenna, take_fix, take_heading
-from icrtool.kernels.ekf_step import DIAGONAL, Floats, wrap
-from icrtool.kernels.kinematics import body_velocity, icr_separation
+from icrtool.kernels.ekf import empty_nodes, empty_output, filter_rows, start_state
+from icrtool.kernels.filter_records import FilterParameters, Measurements, Nodes
+from icrtool.kernels.kinematics import Floats, step_jacobian
 
 Ints = NDArray[np.int64]
 
@@ -29,93 +29,11 @@ CHUNK_ROWS = 8192
 """Wheel samples whose nodes are kept at once: some 15 MB."""
 
 
-class Nodes(NamedTuple):
-    """Events of a chunk, in order; (m, ...) each.
-
-    Attributes
-    ----------
-    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
-    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap of the wheel data
-    row : int64 (m,), row of the state recorded here, -1 where none is
-    """
-
-    x_predicted: Floats
-    P_predicted: Floats
-    x: Floats
-    P: Floats
-    step: Floats
-    row: Ints
-
-
 class Smoothed(NamedTuple):
     """Smoothed states: x (k, 6), variance (k, 6), the diagonal of P."""
 
     x: Floats
     variance: Floats
-
-
-@njit
-def record_chunk(  # noqa: C901, PLR0912 - the order of events is the filter's
-    data: Measurements, first: int, begin: int, end: int, clock: Floats, place: Ints, runs: Floats,
-    x: Floats, P: Floats, parameters: FilterParameters, nodes: Nodes,
-) -> int:  # fmt: skip
-    """Run the filter over wheel samples [begin, end), keeping every event; return their number.
-
-    Parameters
-    ----------
-    first : wheel sample of the first recorded state
-    clock : (1,) time reached; place : (3,) next fix, heading, terrain change; runs : (2, 4) rejected runs;
-        x (6,), P (21,) : all as the chunk before left them, and changed to what this one leaves
-    """
-    n_gnss, n_heading, n_change = len(data.gnss_t), len(data.heading_t), len(data.change_t)
-    PH, residual, count = np.zeros(6), np.zeros(2), 0
-    for k in range(begin, end):
-        held = max(k - 1, 0)
-        t_wheel = data.wheel_t[k]
-        in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
-        while True:
-            t_next = t_wheel
-            if place[0] < n_gnss:
-                t_next = min(t_next, data.gnss_t[place[0]])
-            if place[1] < n_heading:
-                t_next = min(t_next, data.heading_t[place[1]])
-            if place[2] < n_change:
-                t_next = min(t_next, data.change_t[place[2]])
-            dt = max(t_next - clock[0], 0.0)
-            if dt > 0.0:
-                advance(dt, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
-                clock[0] = t_next
-            t = clock[0]
-            while place[2] < n_change and data.change_t[place[2]] <= t:
-                for i in range(3, 6):
-                    P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
-                place[2] += 1
-            nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
-            nodes.x_predicted[count], nodes.P_predicted[count] = x, P
-            while place[0] < n_gnss and data.gnss_t[place[0]] <= t:
-                z_n, z_e = data.gnss_z[place[0]]
-                r_n, r_e = data.gnss_r[place[0]]
-                a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
-                nu_n, nu_e = z_n - x[0] - a_n, z_e - x[1] - a_e
-                code, _ = take_fix(t, z_n, z_e, r_n, r_e, x, P, PH, runs[0], parameters, residual)
-                if code == RECOVERED:
-                    nodes.P_predicted[count, 0] += nu_n * nu_n
-                    nodes.P_predicted[count, 6] += nu_e * nu_e
-                place[0] += 1
-            while place[1] < n_heading and data.heading_t[place[1]] <= t:
-                nu = wrap(data.heading_z[place[1]] - x[2])
-                code, _, _ = take_heading(
-                    t, data.heading_z[place[1]], data.heading_r[place[1]], x, P, PH, runs[1], parameters
-                )
-                if code == RECOVERED:
-                    nodes.P_predicted[count, 11] += nu * nu
-                place[1] += 1
-            nodes.x[count], nodes.P[count] = x, P
-            nodes.row[count] = k - first if t >= t_wheel else -1
-            count += 1
-            if t >= t_wheel:
-                break
-    return count
 
 
 @njit
@@ -129,7 +47,7 @@ def square(upper: Floats, full: Floats) -> None:
 
 
 @njit
-def transition(x: Floats, step: Floats, step_heading: float, F: Floats) -> None:
+def transition(x: Floats, step: Floats, step_heading: float, guard: int, F: Floats) -> None:
     """Fill F (6, 6) of Eqs. 17, 27-29 at state x for a step of `Nodes`; the identity through a gap."""
     for i in range(6):
         for k in range(6):
@@ -137,19 +55,9 @@ def transition(x: Floats, step: Floats, step_heading: float, F: Floats) -> None:
     dt = step[0]
     if dt == 0.0 or step[3] != 0.0:
         return
-    v_x, v_y, omega = body_velocity(step[1], step[2], x[3], x[4], x[5])
-    W = icr_separation(x[3], x[4])
-    sign = 1.0 if x[3] >= x[4] else -1.0
-    ahead = step_heading * dt
-    c, s = math.cos(x[2] + ahead * omega), math.sin(x[2] + ahead * omega)
-    F[0, 2], F[1, 2] = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
-    for column, vx_by, w_by in (
-        (3, (step[1] - v_x * sign) / W, -omega * sign / W), (4, (v_x * sign - step[2]) / W, omega * sign / W)
-    ):  # fmt: skip
-        F[0, column] = dt * (vx_by * c + w_by * x[5] * s) + F[0, 2] * ahead * w_by
-        F[1, column] = dt * (vx_by * s - w_by * x[5] * c) + F[1, 2] * ahead * w_by
-        F[2, column] = dt * w_by
-    F[0, 5], F[1, 5] = dt * omega * s, -dt * omega * c
+    F[0, 2], F[0, 3], F[0, 4], F[0, 5], F[1, 2], F[1, 3], F[1, 4], F[1, 5], F[2, 3], F[2, 4], _, _ = step_jacobian(
+        x, step[1], step[2], dt, step_heading, guard
+    )
 
 
 @njit
@@ -191,13 +99,13 @@ def multiply(A: Floats, B: Floats, out: Floats) -> None:
 
 @njit
 def smooth_chunk(
-    nodes: Nodes, count: int, step_heading: float, later: Floats, xs: Floats, Ps: Floats, out: Smoothed
+    nodes: Nodes, count: int, step_heading: float, guard: int, later: Floats, xs: Floats, Ps: Floats, out: Smoothed
 ) -> None:
     """Smooth the first `count` nodes of a chunk backwards, filling `out` at their rows.
 
     Parameters
     ----------
-    step_heading : as in `FilterParameters`
+    step_heading, guard : as in `FilterParameters`
     later : (31,) the first node of the chunk that follows: x_predicted, P_predicted, step; step NaN where none follows
     xs, Ps : (6,), (6, 6) smoothed there; they end as the smoothed first node of this chunk. `later` likewise
     """
@@ -209,7 +117,7 @@ def smooth_chunk(
         if math.isnan(later[27]):
             xs[:], Ps[:] = nodes.x[m], P
         else:
-            transition(nodes.x[m], later[27:31], step_heading, F)
+            transition(nodes.x[m], later[27:31], step_heading, guard, F)
             square(later[6:27], P_predicted)
             multiply(F, P, X)
             D[:] = Ps - P_predicted
@@ -245,44 +153,26 @@ def run_smoother(
     Smoothed
         One state per recorded state of the filter; the last one equals the filter's.
     """
-    first = int(np.searchsorted(data.wheel_t, t0))
-    place = np.array(
-        [np.searchsorted(times, t0, side="right") for times in (data.gnss_t, data.heading_t, data.change_t)], np.int64
-    )
-    clock, runs = np.array([t0]), np.zeros((2, 4))
-    x, P = x0.astype(np.float64), P0[np.triu_indices(6)].astype(np.float64)
-    borders = [*range(first, len(data.wheel_t), chunk_rows), len(data.wheel_t)]
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    borders = [*range(first, last, chunk_rows), last]
+    state, forward = start_state(data, t0, x0, P0), empty_output(data, min(chunk_rows, last - first))
     saved = []
     for begin, end in pairwise(borders):
-        saved.append((clock.copy(), place.copy(), runs.copy(), x.copy(), P.copy()))
-        if end < len(data.wheel_t):
-            nodes = _room(data, place, begin, end)
-            record_chunk(data, first, begin, end, clock, place, runs, x, P, parameters, nodes)
-    rows = len(data.wheel_t) - first
-    out = Smoothed(np.empty((rows, 6)), np.empty((rows, 6)))
+        saved.append(state.copy())
+        if end < last:
+            filter_rows(data, begin, end, state, parameters, forward, None)
+    out = Smoothed(np.empty((last - first, 6)), np.empty((last - first, 6)))
     later, xs, Ps = np.full(31, np.nan), np.zeros(6), np.zeros((6, 6))
-    for chunk in range(len(saved) - 1, -1, -1):
-        clock, place, runs, x, P = saved[chunk]
-        begin, end = borders[chunk], borders[chunk + 1]
-        nodes = _room(data, place, begin, end)
-        count = record_chunk(data, first, begin, end, clock, place, runs, x, P, parameters, nodes)
-        smooth_chunk(nodes, count, parameters.step_heading, later, xs, Ps, out)
+    for (begin, end), state in zip(reversed(list(pairwise(borders))), reversed(saved), strict=True):
+        nodes = empty_nodes(most_events(data, state.place, begin, end))
+        count = filter_rows(data, begin, end, state, parameters, forward, nodes)
+        rows = Smoothed(out.x[begin - first : end - first], out.variance[begin - first : end - first])
+        smooth_chunk(nodes, count, parameters.step_heading, parameters.guard, later, xs, Ps, rows)
     return out
 
 
-def _room(data: Measurements, place: Ints, begin: int, end: int) -> Nodes:
-    """Return nodes for all events from `place` and wheel samples [begin, end), at least."""
-    last = data.wheel_t[end - 1]
-    events = sum(
-        max(int(np.searchsorted(times, last, side="right")) - int(at), 0)
-        for times, at in zip((data.gnss_t, data.heading_t, data.change_t), place, strict=True)
-    )
-    m = events + end - begin
-    return Nodes(
-        np.empty((m, 6)),
-        np.empty((m, 21)),
-        np.empty((m, 6)),
-        np.empty((m, 21)),
-        np.empty((m, 4)),
-        np.empty(m, np.int64),
-    )
+def most_events(data: Measurements, place: Ints, begin: int, end: int) -> int:
+    """Return the largest number of events from `place` (3,) on in the wheel samples [begin, end)."""
+    stamps = (data.gnss_t, data.heading_t, data.change_t)
+    stop = [int(np.searchsorted(times, data.wheel_t[end - 1], side="right")) for times in stamps]
+    return end - begin + sum(max(one - int(at), 0) for one, at in zip(stop, place, strict=True))

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.kernels.batch_filter import PRINTED, TOOL, UNGUARDED
+from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
 from icrtool.records.tables import Floats
 from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult
 from icrtool.simulation.study_measures import inverted, trace
 from icrtool.simulation.study_runs import Chunk, Progress, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
 
-GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": TOOL}
+GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": GUARDED}
 """Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as the tool has them."""
 
 CONVERGED_M = 0.1

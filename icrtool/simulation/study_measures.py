@@ -1,4 +1,4 @@
-"""What a study asks of its runs: errors, convergence times, consistency, blind driving. One row a run."""
+"""Numbers of each run of a study: ICR errors, convergence times, NIS, open-loop errors without GNSS. One row a run."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
 
 SETTLED_SHARE = 0.1
 SETTLED_M = 0.02
-"""An estimate has settled when it stays within a tenth of its way, or within 2 cm, of the truth."""
+"""An estimate has settled when its error stays below a tenth of its initial error, or below 2 cm."""
 
 TRACE_POINTS = 400
 
-BLIND_M = 10.0
-BLIND_STARTS = 40
-"""Starts of blind driving, evenly over a run."""
+TRIAL_M = 10.0
+TRIAL_STARTS = 40
+"""Open-loop trials per run; their starts are evenly spaced."""
 
 
 def measure_errors(chunk: Chunk) -> dict[str, Floats]:
@@ -51,22 +51,27 @@ def measure_times(chunk: Chunk, since_s: float = 0.0, until_s: float = np.inf) -
 
 
 def rise_times(t: Floats, value: Floats, target: float) -> Floats:
-    """Return the time (runs,) [s] from 10 % to 90 % of the way from the first value to the target; NaN: never there.
+    """Return the time (runs,) [s] between the first samples past 10 % and past 90 % of the change to the target.
 
     Parameters
     ----------
-    t : (k,) [s]; value : (runs, k)
+    t : (k,) [s]; value : (runs, k); target : the true ICR [m]
+
+    Returns
+    -------
+    (runs,) [s], NaN where a run does not reach 90 %. An estimate that jumps past the target has 0.
 
     Notes
     -----
-    Pentzer 2014, Section 5.2, as `icrtool.estimation.summary.converge` has it: the first passage of each mark. An
-    estimate that overshoots passes both at once.
+    Pentzer 2014, Section 5.2. `icrtool.estimation.summary.converge` computes another time, of a run without a known
+    truth: its target is the median of the run's second half, and from its end on the estimate must stay within 10 %
+    of the change for some seconds. `settling_times` is the time to stay near the truth.
     """
-    way = target - value[:, :1]
+    change = target - value[:, :1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        gone = (value - value[:, :1]) / way
+        shares = (value - value[:, :1]) / change
     times = np.full(len(value), np.nan)
-    for run, share in enumerate(gone):
+    for run, share in enumerate(shares):
         first = int(np.argmax(share >= 0.1))
         last = first + int(np.argmax(share[first:] >= 0.9))
         if share[first] >= 0.1 and share[last] >= 0.9:
@@ -86,7 +91,7 @@ def settling_times(t: Floats, value: Floats, target: float) -> Floats:
 
 
 def inverted(chunk: Chunk) -> Bools:
-    """Say which runs (runs,) ended with the right ICR left of the left one, or with no number at all."""
+    """Return which runs (runs,) ended with y_icr_right <= y_icr_left, or with NaN."""
     return ~(chunk.x[:, -1, 3] > chunk.x[:, -1, 4])
 
 
@@ -98,8 +103,8 @@ def trace(chunk: Chunk, until_s: float = np.inf) -> dict[str, Floats]:
     return {"trace": np.concatenate([times, chunk.x[:, rows, 3:]], axis=2)}
 
 
-def blind_errors(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
-    """Return the 95th percentile (runs,) of how far wheels alone miss after 10 m [m]: with the final ICRs, and no slip.
+def open_loop_errors(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
+    """Return the 95th percentile (runs,) of the open-loop error after 10 m [m]: with the final ICRs, and without slip.
 
     Notes
     -----
@@ -110,22 +115,22 @@ def blind_errors(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
     for run in range(runs):
         no_slip = np.array([track_width_m / 2, -track_width_m / 2, 0.0])
         for name, icrs in zip(columns, (chunk.x[run, -1, 3:], no_slip), strict=True):
-            columns[name][run] = np.percentile(_blind_misses(chunk, run, icrs), 95)
+            columns[name][run] = np.percentile(_open_loop_errors(chunk, run, icrs), 95)
     return columns
 
 
-def _blind_misses(chunk: Chunk, run: int, icrs: Floats) -> Floats:
+def _open_loop_errors(chunk: Chunk, run: int, icrs: Floats) -> Floats:
     truth = chunk.truths[run]
     north, east = truth.pose[:, 0], truth.pose[:, 1]
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(north), np.diff(east)))])
-    ends = np.searchsorted(way, way + BLIND_M)
-    possible = np.flatnonzero(ends < len(way))
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(north), np.diff(east)))])
+    ends = np.searchsorted(distance, distance + TRIAL_M)
+    possible = np.flatnonzero(ends < len(distance))
     if not len(possible):
         return np.full(1, np.nan)
-    misses = []
-    for first in possible[np.linspace(0, len(possible) - 1, BLIND_STARTS).astype(np.int64)]:
+    errors = []
+    for first in possible[np.linspace(0, len(possible) - 1, TRIAL_STARTS).astype(np.int64)]:
         rows = slice(first, int(ends[first]) + 1)
         t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
         end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
-        misses.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
-    return np.array(misses)
+        errors.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
+    return np.array(errors)

@@ -13,7 +13,8 @@ import numpy as np
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
-from icrtool.kernels.batch_filter import TOOL, Batch, BatchOutput, run_batch
+from icrtool.kernels.batch_filter import Batch, BatchOutput, run_batch
+from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import Drive, Icrs, Readings, Sensors, Truth, move, sense
 from icrtool.simulation.paths import PathPlan
@@ -33,7 +34,7 @@ class Scenario:
     config : its filter section is used, and its robot for the start of preset ``field``
     vary_path : every run of a ``curved`` path begins elsewhere in its rhythms
     inflate : tell the filter of the drive's ICR changes (Section 5.2)
-    guard : which kernel, see `icrtool.kernels.batch_filter`
+    guard : sign guard, of `icrtool.kernels.kinematics`; other than GUARDED the filter takes the Euler steps of Eq. 14
     """
 
     plan: Drive
@@ -41,7 +42,7 @@ class Scenario:
     config: Config
     vary_path: bool = True
     inflate: bool = False
-    guard: int = TOOL
+    guard: int = GUARDED
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,10 @@ def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float,
     data = setup.data
     stops = np.unique(np.append(np.searchsorted(data.wheel_t, stops_s, side="right") - 1, len(data.wheel_t) - 1))
     batch = stack(readings, setup, stops[data.wheel_t[stops] >= setup.t0])
-    out = run_batch(batch, setup.parameters, scenario.guard)
+    parameters = setup.parameters
+    if scenario.guard != GUARDED:
+        parameters = parameters._replace(guard=scenario.guard, step_heading=0.0)
+    out = run_batch(batch, parameters)
     times = readings[0].wheel_t[len(data.wheel_t) - out.x.shape[1] :]
     at_stops = readings[0].wheel_t[batch.stops]
     return Chunk(

@@ -13,7 +13,7 @@ from icrtool.records.tables import Floats
 from icrtool.simulation.drives import Sensors, move, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult, statistics
-from icrtool.simulation.study_measures import ICR_NAMES, blind_errors, measure_errors, measure_times, trace
+from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_errors, trace
 from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
 
 HIDDEN = frozenset({"trace", "zoom"})
@@ -174,7 +174,7 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
     width = cast(float, request.config.robot.track_width_m)
 
     def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {**measure_errors(chunk), **measure_times(chunk), **blind_errors(chunk, width)}
+        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_errors(chunk, width)}
 
     levels = []
     for preset in request.presets:

@@ -13,20 +13,20 @@ import pytest
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a signal cannot come again later there")
 
 LOADING = """
-import os, signal, sys, time
+import os, signal
 for _ in range(int(os.environ["TIMES"])):
     os.kill(os.getpid(), int(os.environ["SIGNAL"]))
-    time.sleep(0.03)
+    signal.pause()  # until the alarm of the signal that has to wait
 print("loaded")
 """
 
 COMMAND = """
-import signal, sys, time
+import signal
 from icrtool.cli.interrupts import end_in_order
 
 def command():
     import loading
-    time.sleep(10)
+    signal.pause()
 
 end_in_order(command.__code__)
 try:
@@ -67,5 +67,5 @@ def test_an_import_further_out_is_no_matter(tmp_path: Path) -> None:
 
 
 def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
-    before = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import time; time.sleep = lambda s: None\n"
+    before = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); signal.pause = lambda: None\n"
     assert load(tmp_path, signal.SIGINT, before=before) == (0, ["loaded"])

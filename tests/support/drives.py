@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from support.matrix_filter import step_state
 
 EPOCH_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.kernels.ekf import GATED, UNSEEN
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import BAD_FIX_COLOR, BAR_COLOR, FLOAT_COLOR, MEAN, inches, new_figure, shade_spans
 from icrtool.output.text_format import length_text, position_word, run_title

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change
 from icrtool.output.figures.study_special import draw_consistency, draw_initial
 from icrtool.output.figures.style import Pen, inches, new_figure, save, style
-from icrtool.output.tables.study import capital, study_title
+from icrtool.output.tables.study import capital, runs_text, study_title
 from icrtool.records.tables import Floats
 from icrtool.simulation.studies import KINDS, StudyName, StudyResult
 from icrtool.simulation.study_measures import ICR_NAMES
@@ -61,7 +61,7 @@ def subtitle(result: StudyResult) -> str:
     """Return what was studied, on which path, and how often."""
     request = result.request
     path = request.plan.path
-    what = f"{getattr(path, 'speed_mps', 0):g} m/s, {request.runs} runs of {request.plan.duration_s:g} s"
+    what = f"{getattr(path, 'speed_mps', 0):g} m/s, {runs_text(request)}"
     if request.name != "turn-radius":
         what = f"{getattr(path, 'kind', '')} path, {what}"
     return f"{capital(KINDS[request.name].about)}; {what}"

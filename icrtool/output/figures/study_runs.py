@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from icrtool.output.figures.style import inches, new_figure
-from icrtool.output.tables.study import capital, study_title
+from icrtool.output.tables.study import capital, runs_text, study_title
 from icrtool.records.tables import Floats
 from icrtool.simulation.studies import KINDS, StudyResult
 
@@ -31,7 +31,7 @@ def draw_convergence(result: StudyResult) -> Figure:
     request, curves = result.request, result.curves
     figure = new_figure(
         study_title(result),
-        f"{capital(KINDS['convergence'].about)}; {request.runs} runs of {request.plan.duration_s:g} s, start of preset "
+        f"{capital(KINDS['convergence'].about)}; {runs_text(request)}, start of preset "
         f"{' and '.join(request.presets)}",
         width_in=7.2, height_in=6.4,
     )  # fmt: skip
@@ -80,7 +80,7 @@ def draw_icr_change(result: StudyResult) -> Figure:
     request = result.request
     figure = new_figure(
         study_title(result),
-        f"{request.runs} runs; lines: median, bands: 5 to 95 %; dashed: the truth; left all, right the first change",
+        f"{runs_text(request)}; lines: median, bands: 5 to 95 %; dashed: the truth; left all, right the first change",
         width_in=7.2, height_in=0.9 + 1.75 * len(names) + 0.5,
     )  # fmt: skip
     panels = figure.subplots(len(names), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 1)})

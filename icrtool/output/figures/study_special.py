@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Patch
 
 from icrtool.output.figures.style import inches, new_figure
-from icrtool.output.tables.study import study_title
+from icrtool.output.tables.study import runs_text, study_title
 from icrtool.records.tables import Floats
 from icrtool.simulation.studies import StudyResult
 from icrtool.simulation.study_initial import GUARDS
@@ -31,8 +31,8 @@ def draw_initial(result: StudyResult) -> Figure:
     request = result.request
     figure = new_figure(
         study_title(result),
-        f"Initial y ICRs {starts.min():g} to {starts.max():g} m, preset {request.presets[0]}; {request.runs} runs of "
-        f"{request.plan.duration_s:g} s from every start",
+        f"Initial y ICRs {starts.min():g} to {starts.max():g} m, preset {request.presets[0]}; {runs_text(request)} "
+        "from every start",
         width_in=7.2, height_in=5.6,
     )  # fmt: skip
     panels = figure.subplots(2, len(GUARDS), sharey="row")
@@ -73,7 +73,7 @@ def draw_consistency(result: StudyResult) -> Figure:
     request = result.request
     figure = new_figure(
         study_title(result),
-        f"{request.runs} runs of {request.plan.duration_s:g} s; model: truth drawn from Q and R, "
+        f"{runs_text(request)}; model: truth drawn from Q and R, "
         "paper and field: exact kinematics, preset's start",
         width_in=7.2, height_in=5.6,
     )  # fmt: skip

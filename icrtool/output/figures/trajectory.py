@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
-from icrtool.kernels.ekf import GATED, UNSEEN
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from icrtool.simulation.studies import KINDS, Finding, StudyResult
+from icrtool.simulation.studies import KINDS, Finding, StudyRequest, StudyResult
 
 ERRORS = tuple(
     (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
@@ -35,7 +35,7 @@ def format_study(result: StudyResult) -> str:
     driven = f"{getattr(path, 'kind', 'path')} at {getattr(path, 'speed_mps', 0):g} m/s, ICRs {icrs} m"
     lines = [
         f"{request.name}{figures}: {kind.about}",
-        f"{request.runs} runs of {request.plan.duration_s:g} s each, seed {request.seed}; {driven}",
+        f"{runs_text(request)} each, seed {request.seed}; {driven}",
         "",
     ]
     lines += [*_level_lines(result), ""] if request.name in SHOWN else []
@@ -96,6 +96,11 @@ def _number(value: float) -> str:
     if value == 0 or abs(value) < 1e-3:
         return "0.000" if abs(value) < 5e-4 else f"{value:.3f}"
     return f"{value:.3f}" if abs(value) < 1 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+
+
+def runs_text(request: StudyRequest) -> str:
+    """Return number and length of the runs, as ``1 run of 60 s``."""
+    return f"{request.runs} run{'s' if request.runs != 1 else ''} of {request.plan.duration_s:g} s"
 
 
 def study_title(result: StudyResult) -> str:

@@ -13,10 +13,10 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
 from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from support.drives import ICRS, make_log
+from support.matrix_filter import step_state
 
 WIDTH = "robot.track_width_m=0.8"
 ICR_TOLERANCE_M = 0.02

@@ -12,9 +12,9 @@ from icrtool.alignment.drive_windows import cut_windows, drive_arrays
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
 from icrtool.records.tables import Datum, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from support.matrix_filter import step_state
 
 START_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)

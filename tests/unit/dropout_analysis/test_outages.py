@@ -13,9 +13,9 @@ from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart
 from support.barn import simulate
+from support.matrix_filter import step_state
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.records.run import Run
 from support.drives import ICRS, make_log
+from support.matrix_filter import step_state
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 NOISY_M = 0.3

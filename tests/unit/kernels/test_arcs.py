@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from icrtool.kernels import arcs as simulate
-from icrtool.kernels.ekf_plain import step_state
 from icrtool.kernels.kinematics import body_velocity
+from support.matrix_filter import step_state
 
 EXACT = 1e-9
 """Arcs are exact; what is left is rounding over some ten thousand steps [m, rad]."""

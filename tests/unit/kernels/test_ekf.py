@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.ekf import GATED, RECOVERED, UNSEEN, USED, FilterParameters, Measurements, run_filter
-from icrtool.kernels.ekf_plain import run_filter_plain, state_jacobian, step_state
+from icrtool.kernels.ekf import run_filter
 from icrtool.kernels.ekf_step import wrap
+from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN, USED, FilterParameters, Measurements
+from support.matrix_filter import run_filter_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)
 TWIN_TOLERANCE = 1e-9
@@ -124,12 +125,22 @@ def test_the_kernel_equals_its_python_function() -> None:
     data, _ = drive(5, seconds=3.0)
     t0, x0, P0 = start(data)
     out = run_filter(data, t0, x0, P0, parameters())
-    again = ekf.empty_output(data, int(np.searchsorted(data.wheel_t, t0)), P0)
-    places = tuple(int(np.searchsorted(t, t0, side="right")) for t in (data.gnss_t, data.heading_t, data.change_t))
-    first = int(np.searchsorted(data.wheel_t, t0))
-    ekf.filter_loop.py_func(data, t0, first, places, x0.copy(), again.P, parameters(), again)  # type: ignore[attr-defined]
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    state, again = ekf.start_state(data, t0, x0, P0), ekf.empty_output(data, last - first)
+    ekf.filter_rows.py_func(data, first, last, state, parameters(), again, None)  # type: ignore[attr-defined]
+    again = again._replace(P=state.P)
     for name in out._fields:
         np.testing.assert_allclose(getattr(out, name), getattr(again, name), rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_the_size_of_compiled_blocks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, _ = drive(6, seconds=5.0)
+    t0, x0, P0 = start(data)
+    settings = parameters(gnss_gate=9.0, heading_gate=6.0)
+    whole = run_filter(data, t0, x0, P0, settings)
+    monkeypatch.setattr("icrtool.kernels.ekf.BLOCK_EVENTS", 50)
+    for name, one, other in zip(whole._fields, whole, run_filter(data, t0, x0, P0, settings), strict=True):
+        np.testing.assert_array_equal(one, other, err_msg=name)
 
 
 @pytest.mark.parametrize("step_heading", [0.0, 0.5])

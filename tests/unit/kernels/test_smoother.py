@@ -1,18 +1,19 @@
-"""The smoother against a dense batch least squares of the same linearised problem, and against its own chunks."""
+"""The smoother compared with a dense batch least squares of the same linearised problem, and over chunk sizes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from icrtool.kernels.ekf import REFERENCE_STEP_S, FilterParameters, Measurements, run_filter
+from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_nodes, empty_output, filter_rows, run_filter, start_state
 from icrtool.kernels.ekf_step import wrap
+from icrtool.kernels.filter_records import FilterParameters, Measurements, Nodes
 from icrtool.kernels.smoother import (
-    Nodes,
-    _room,
-    record_chunk,
+    Smoothed,
+    most_events,
     run_smoother,
     smooth_chunk,
     solve_positive,
@@ -57,13 +58,12 @@ X0 = np.array([0.0, 0.0, 0.1, 0.5, -0.5, 0.05])
 P0 = np.diag([1e-2, 1e-2, 1e-2, 0.09, 0.09, 0.04])
 
 
-def nodes_of(data: Measurements, settings: FilterParameters) -> tuple[Nodes, int]:
-    place, end = np.zeros(3, np.int64), len(data.wheel_t)
-    nodes = _room(data, place, 0, end)
-    count = record_chunk(
-        data, 0, 0, end, np.array([0.0]), place, np.zeros((2, 4)), X0.copy(), P0[UPPER].copy(), settings, nodes
-    )
-    return nodes, count
+def nodes_of(data: Measurements, settings: FilterParameters, rows: Callable[..., int] = filter_rows) -> Nodes:
+    end = len(data.wheel_t)
+    state = start_state(data, 0.0, X0, P0)
+    nodes = empty_nodes(most_events(data, state.place, 0, end))
+    count = rows(data, 0, end, state, settings, empty_output(data, end), nodes)
+    return Nodes(*(column[:count] for column in nodes))
 
 
 def full(upper: np.ndarray) -> np.ndarray:
@@ -74,7 +74,8 @@ def full(upper: np.ndarray) -> np.ndarray:
 
 def test_smoothed_states_are_the_batch_solution() -> None:
     data, settings = measurements(), parameters()
-    nodes, count = nodes_of(data, settings)
+    nodes = nodes_of(data, settings)
+    count = len(nodes.row)
     information, vector = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
 
     def add(rows: dict[int, np.ndarray], target: np.ndarray, covariance: np.ndarray) -> None:
@@ -92,7 +93,7 @@ def test_smoothed_states_are_the_batch_solution() -> None:
             add({0: np.eye(6)}, X0, P0)
         else:
             F = np.empty((6, 6))
-            transition(nodes.x[i - 1], nodes.step[i], settings.step_heading, F)
+            transition(nodes.x[i - 1], nodes.step[i], settings.step_heading, settings.guard, F)
             dt, gap = nodes.step[i, 0], nodes.step[i, 3]
             Q = np.diag(settings.process_variance) * REFERENCE_STEP_S * dt
             Q += gap * dt * np.diag([4.0, 4.0, 1.0, 0.0, 0.0, 0.0])
@@ -117,16 +118,15 @@ def test_smoothed_states_are_the_batch_solution() -> None:
     batch = np.linalg.solve(information, vector).reshape(count, 6)
     variance = np.diag(np.linalg.inv(information)).reshape(count, 6)
     smoothed = run_smoother(data, 0.0, X0, P0, settings)
-    recorded = nodes.row[:count] >= 0
+    recorded = nodes.row >= 0
     assert np.allclose(smoothed.x, batch[recorded], rtol=BATCH_TOLERANCE, atol=BATCH_TOLERANCE)
     assert np.allclose(smoothed.variance, variance[recorded], rtol=1e-5, atol=1e-10)
 
 
 def test_the_forward_pass_is_the_filters() -> None:
     data, settings = measurements(200), parameters(gnss_gate=9.0, heading_gate=9.0)
-    nodes, count = nodes_of(data, settings)
-    recorded = nodes.row[:count] >= 0
-    assert np.array_equal(nodes.x[:count][recorded], run_filter(data, 0.0, X0, P0, settings).x)
+    nodes = nodes_of(data, settings)
+    assert np.array_equal(nodes.x[nodes.row >= 0], run_filter(data, 0.0, X0, P0, settings).x)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 64, 200])
@@ -137,7 +137,7 @@ def test_chunks_do_not_matter(rows: int) -> None:
     assert np.array_equal(whole.variance, parts.variance)
 
 
-def test_smoothing_never_adds_doubt_and_ends_where_the_filter_does() -> None:
+def test_smoothing_never_adds_variance_and_ends_where_the_filter_does() -> None:
     data, settings = measurements(300), parameters()
     filtered, smoothed = run_filter(data, 0.0, X0, P0, settings), run_smoother(data, 0.0, X0, P0, settings)
     assert np.all(smoothed.variance <= filtered.variance * (1 + 1e-9) + 1e-15)
@@ -159,19 +159,13 @@ def test_positive_systems_are_solved() -> None:
 
 def test_kernels_equal_their_python_source() -> None:
     data, settings = measurements(25), parameters()
-    nodes, count = nodes_of(data, settings)
-    plain = _room(data, np.zeros(3, np.int64), 0, 25)
-    record_chunk.py_func(
-        data, 0, 0, 25, np.array([0.0]), np.zeros(3, np.int64), np.zeros((2, 4)), X0.copy(), P0[UPPER].copy(), settings,
-        plain,
-    )  # fmt: skip
-    assert all(np.allclose(a[:count], b[:count], rtol=1e-12) for a, b in zip(nodes, plain, strict=True))
+    nodes = nodes_of(data, settings)
+    plain = nodes_of(data, settings, filter_rows.py_func)  # type: ignore[attr-defined]
+    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(nodes, plain, strict=True))
     results = []
     for kernel in (smooth_chunk, smooth_chunk.py_func):
-        from icrtool.kernels.smoother import Smoothed
-
         out = Smoothed(np.empty((25, 6)), np.empty((25, 6)))
-        kernel(nodes, count, 0.5, np.full(31, np.nan), np.zeros(6), np.zeros((6, 6)), out)
+        kernel(nodes, len(nodes.row), 0.5, settings.guard, np.full(31, np.nan), np.zeros(6), np.zeros((6, 6)), out)
         results.append(out)
     assert np.allclose(results[0].x, results[1].x, rtol=1e-12)
     assert np.allclose(results[0].variance, results[1].variance, rtol=1e-9)

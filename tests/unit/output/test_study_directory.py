@@ -13,7 +13,7 @@ import pytest
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
 from icrtool.output.study_directory import check_study_target, write_study
-from icrtool.output.tables.study import finding_text, format_study
+from icrtool.output.tables.study import finding_text, format_study, runs_text
 from icrtool.output.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.simulation.drives import Drive, Sensors
 from icrtool.simulation.paths import PathPlan
@@ -87,6 +87,11 @@ def test_the_table_names_the_robot_settings_and_the_paper(tmp_path: Path) -> Non
     assert "turn-radius (Fig. 10): convergence after a change" in text
     assert "2 runs of 25 s each, seed 0; circle at 0.4 m/s, ICRs +0.500, -0.750, -0.250 m" in text
     assert "0.1 s (Fig. 10)" in text
+
+
+def test_one_run_is_singular() -> None:
+    request = small("rate").request
+    assert runs_text(replace(request, runs=1)).startswith("1 run of")
 
 
 @pytest.mark.parametrize(

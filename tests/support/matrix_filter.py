@@ -1,7 +1,7 @@
-"""The ICR EKF in matrices, as the paper writes it: the one to read, and the one the compiled filter is held to.
+"""The ICR EKF in matrices, as the paper writes it: an independent oracle of `icrtool.kernels.ekf`.
 
-Pentzer 2014, Section 3. Slow, and meant to be: no scalar is worked out by hand, F is assembled from Eqs. 17 and 27-29,
-updates are joint (north, east) with K = P H^T (H P H^T + R)^-1.
+Pentzer 2014, Section 3. F is assembled from Eqs. 17 and 27-29, updates are joint (north, east) with
+K = P H^T (H P H^T + R)^-1. Slow; shares no equation with the compiled filter.
 """
 
 from __future__ import annotations
@@ -10,18 +10,10 @@ import math
 
 import numpy as np
 
-from icrtool.kernels.ekf import (
-    GATED,
-    RECOVERED,
-    REFERENCE_STEP_S,
-    USED,
-    FilterOutput,
-    FilterParameters,
-    Measurements,
-    empty_output,
-)
-from icrtool.kernels.ekf_step import Floats, wrap
-from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
+from icrtool.kernels.ekf_step import wrap
+from icrtool.kernels.filter_records import GATED, RECOVERED, USED, FilterOutput, FilterParameters, Measurements
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, Floats
 
 
 def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
@@ -66,7 +58,7 @@ def run_filter_plain(
 ) -> FilterOutput:
     """Do what `icrtool.kernels.ekf.run_filter` does, with matrices; the same arguments and result."""
     first = int(np.searchsorted(data.wheel_t, t0))
-    out = empty_output(data, first, P0)
+    out = empty_output(data, len(data.wheel_t) - first)
     x, P, t, travelled = x0.astype(float), P0.astype(float), t0, 0.0
     events = sorted(
         [(time, 0, i) for i, time in enumerate(data.change_t) if time > t0]

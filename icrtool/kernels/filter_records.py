@@ -1,0 +1,145 @@
+"""Records of the compiled filter: its constants, inputs, outputs and what it carries from event to event."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.kinematics import GUARDED, Floats
+
+Codes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
+
+UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
+"""What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+
+
+class FilterParameters(NamedTuple):
+    """Constants of one run.
+
+    Attributes
+    ----------
+    process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
+    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
+    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
+        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
+    gnss_gate, heading_gate : largest NIS accepted; inf accepts all
+    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
+    antenna_forward, antenna_right : lever arm of the antenna [m], body frame
+    wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
+    gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
+    recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
+    icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
+    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
+    guard : sign guard of the kinematics, of `icrtool.kernels.kinematics`; other than GUARDED in studies only
+    """
+
+    process_variance: tuple[float, float, float, float, float, float]
+    rate_invariant: bool
+    step_heading: float
+    gnss_gate: float
+    heading_gate: float
+    heading_correlation: float
+    antenna_forward: float
+    antenna_right: float
+    wheel_gap_s: float
+    gap_speed_variance: float
+    gap_turn_variance: float
+    recovery_count: int
+    recovery_s: float
+    icr_inflation_m2: float
+    least_icr: float
+    guard: int = GUARDED
+
+
+class Measurements(NamedTuple):
+    """Inputs of one run: times [s] since any one epoch, non-decreasing.
+
+    Attributes
+    ----------
+    wheel_t : (n,); v_left, v_right : (n,) [m/s], held over [k, k+1)
+    gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
+    heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
+    change_t : (c,) times of terrain changes
+    """
+
+    wheel_t: Floats
+    v_left: Floats
+    v_right: Floats
+    gnss_t: Floats
+    gnss_z: Floats
+    gnss_r: Floats
+    heading_t: Floats
+    heading_z: Floats
+    heading_r: Floats
+    change_t: Floats
+
+
+class FilterOutput(NamedTuple):
+    """What one run leaves behind.
+
+    Attributes
+    ----------
+    x : (k, 6) states after all updates at the stamps of the last k wheel samples; variance : (k, 6) diagonal of P
+    distance : (k,) path length [m]
+    gnss_nis, heading_nis : (m,), (h,) normalised innovation squared, NaN where unseen
+    gnss_code, heading_code : UNSEEN, USED, GATED or RECOVERED
+    gnss_residual : (m, 2) fix minus estimate after the update [m]
+    heading_innovation : (h,) [rad]
+    P : (21,) upper triangle of the covariance at the end, row by row
+    """
+
+    x: Floats
+    variance: Floats
+    distance: Floats
+    gnss_nis: Floats
+    gnss_code: Codes
+    gnss_residual: Floats
+    heading_nis: Floats
+    heading_code: Codes
+    heading_innovation: Floats
+    P: Floats
+
+
+class FilterState(NamedTuple):
+    """All that a run needs to go on from the rows before. Changed in place.
+
+    Attributes
+    ----------
+    t : (1,) time reached [s]; distance : (1,) path length up to there [m]
+    place : (3,) next fix, next heading, next terrain change
+    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
+    x : (6,); P : (21,) upper triangle of the covariance, row by row
+    """
+
+    t: Floats
+    distance: Floats
+    place: Ints
+    rejected: Floats
+    x: Floats
+    P: Floats
+
+    def copy(self) -> FilterState:
+        """Return a state that later rows do not change."""
+        t, distance, place, rejected, x, P = self
+        return FilterState(t.copy(), distance.copy(), place.copy(), rejected.copy(), x.copy(), P.copy())
+
+
+class Nodes(NamedTuple):
+    """Events in order, for the smoother; (m, ...) each.
+
+    Attributes
+    ----------
+    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
+    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap of the wheel data
+    row : int64 (m,), row of the state recorded here, -1 where none is
+    """
+
+    x_predicted: Floats
+    P_predicted: Floats
+    x: Floats
+    P: Floats
+    step: Floats
+    row: Ints
