@@ -136,6 +136,10 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     drive = _apply_to_drive(drive, decision.convention)
     notes += convention_notes(decision, corrects=corrects)
     mirrored = decision.convention.heading < 0
+    if derived is None and config.frames.heading != "auto":
+        free_hand = decide_conventions(drive, windows, metric=False)
+        if free_hand.convention.heading < 0:
+            notes.append("the heading turns the other way than the course: set frames.heading to the other of enu, ned")
     _refuse_standing(log, drive, windows)
     course = measure_course(_turned_over(log) if mirrored else log)
     free = config.frames.heading_offset_deg == "auto" and corrects

@@ -72,6 +72,10 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     DataError
         Too little distance.
     """
+    if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2:
+        raise DataError(
+            log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
+        )
     drive = drive_arrays(log)
     epoch = int(log.wheels.stamp_ns[0])
     turns = [turn for turn in (_vertical_rate(drive, gyro, epoch) for gyro in log.gyros) if turn is not None]
