@@ -170,7 +170,7 @@ def _decide(
 ) -> Decision:
     free = config.frames.heading == "auto" and derived is None
     return decide_conventions(
-        drive, windows, metric=log.datum is None and derived is None, gyro_sense=_gyro_sense(log, drive),
+        drive, windows, metric=log.datum is None and free, gyro_sense=_gyro_sense(log, drive),
         mirror_allowed=free,
     )  # fmt: skip
 
