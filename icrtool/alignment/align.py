@@ -14,6 +14,7 @@ from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import StreamDelays
 from icrtool.alignment.wheel_alignment import WheelCheck
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
 from icrtool.records.tables import PositionFixes, RobotLog
@@ -37,6 +38,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
+    log = with_wheel_speeds(log, config)
     found = align_streams(log, config)
     wheels, heading, delays = found.wheels, found.heading, found.delays
     quality = judge_fixes(found.log, config, heading)
@@ -66,6 +68,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
             "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
             "gnss": delays.gnss_summary(),
         },
+        streams=found.log.streams,
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",

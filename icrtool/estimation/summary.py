@@ -62,7 +62,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "log": log.name,
             "inputs": [asdict(file) for file in log.inputs],
             "config": config.effective(),
-            "streams": [asdict(stream) for stream in log.streams],
+            "streams": [asdict(stream) for stream in measurements.streams],
             "warnings": warnings,
             "alignment": {name: asdict(finding) for name, finding in measurements.findings.items()},
             "drive": drive_summary(table),

@@ -7,14 +7,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
-from icrtool.logs.containers.channel import Block, Channel, Container
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
 from icrtool.logs.streams.gyro import find_gyro, find_gyros
@@ -22,10 +24,11 @@ from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
-from icrtool.logs.streams.stamps import increasing, rate_and_jitter
+from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
+from icrtool.logs.table_file import is_table, read_table
 from icrtool.records.tables import (
     Datum,
     HeadingSamples,
@@ -36,7 +39,9 @@ from icrtool.records.tables import (
     RobotLog,
     Role,
     StreamChoice,
+    rate_and_jitter,
 )
+from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
 
@@ -47,8 +52,8 @@ NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 class Survey:
     """A log after one pass: its channels, all candidates, what was lost, its files."""
 
-    name: str
-    path: str
+    name: LogText
+    path: LogText
     channels: tuple[Channel, ...]
     tables: tuple[TopicTable, ...]
     candidates: Candidates
@@ -56,13 +61,21 @@ class Survey:
     inputs: tuple[InputFile, ...]
 
 
-def survey_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> Survey:
+def survey_log(
+    path: str | Path,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    *,
+    start: Moment | None = None,
+    end: Moment | None = None,
+) -> Survey:
     """Read all candidate topics of a log.
 
     Parameters
     ----------
     path : a log as `open_log` knows them
     progress : called with the share of the log read so far, 0 to 1
+    start, end : as `read_log` takes them
 
     Raises
     ------
@@ -71,19 +84,27 @@ def survey_log(path: str | Path, config: Config | None = None, progress: Progres
     """
     config = config if config is not None else Config()
     path = Path(path)
+    begin, stop = moment(start, "start"), moment(end, "end")
     container = open_log(path)
+    ended = Event()
     try:
         with ThreadPoolExecutor(2) as pool:
-            hashes = [pool.submit(_fingerprint, file) for file in container.files]
-            tables, unread = _collect(container, config, pool, progress)
-            problems = tuple(container.problems)
-            inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+            try:
+                hashes = [pool.submit(_fingerprint, file, ended) for file in container.files]
+                cut = cut_of(container, begin, stop, path)
+                tables, unread = _collect(container, config, pool, progress, cut)
+                problems = tuple(container.problems)
+                inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+            except BaseException:
+                # The pool waits for its threads before Ctrl-C, or an error, goes on.
+                ended.set()
+                raise
         channels = tuple(container.channels)
     finally:
         container.close()
     return Survey(
-        name=log_name(path),
-        path=str(path),
+        name=LogText(log_name(path)),
+        path=LogText(str(path)),
         channels=channels,
         tables=tuple(tables),
         candidates=find_candidates(tables, config, unread),
@@ -92,14 +113,23 @@ def survey_log(path: str | Path, config: Config | None = None, progress: Progres
     )
 
 
-def read_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> RobotLog:
+def read_log(
+    path: str | Path,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    *,
+    start: Moment | None = None,
+    end: Moment | None = None,
+) -> RobotLog:
     """Read wheels, position and heading of a log into tables.
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
-    progress : called with the share of the bytes that are read
+    progress : called with the share of the bytes that are read, 0 to 1
+    start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
+        a `datetime` or ISO 8601 text, in UTC where it has no zone. Static transforms are read from all of the log.
 
     Raises
     ------
@@ -113,7 +143,9 @@ def read_log(path: str | Path, config: Config | None = None, progress: Progress 
         Streams without usable samples.
     """
     config = config if config is not None else Config()
-    return assemble(survey_log(path, config, progress), config)
+    if is_table(Path(path)):
+        return read_table(Path(path), start, end)
+    return assemble(survey_log(path, config, progress, start=start, end=end), config)
 
 
 def log_name(path: Path) -> str:
@@ -144,19 +176,20 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
             warnings.append(f"{name}: {role}: {one.stamps.note}; log time is used")
     gnss, datum, rejected = _fixes(position, config, clock, name)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
-    samples, how, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, gnss, name)
+    samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
     if source is not None and source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
+    quantity = "position" if samples.from_position else "speed"
     streams: tuple[StreamChoice, ...] = (
-        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
+        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {quantity}"),
         _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
     )
     if source is not None:
         streams += (_stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),)
-    unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
+    unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
@@ -194,27 +227,45 @@ def _place_in_words(antenna: tuple[float, float] | None) -> str:
 
 
 def _collect(
-    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None
+    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Take the columns of all channels that some role may need, in one pass over the log."""
     unread: dict[str, str] = {}
-    collectors: dict[int, Collector] = {}
+    collectors: dict[int, Collector | None] = {}
     by_id = {channel.id: channel for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
-    wanted |= {channel.id: FIELDS for channel in container.channels if is_static(channel)}
-    for number, paths in wanted.items():
-        try:
-            collectors[number] = collector_for(by_id[number], paths)
-        except DefinitionError as err:
-            unread[by_id[number].topic] = str(err)
-    for block in _ahead(container.blocks(frozenset(collectors)), pool):
-        for number, collector in collectors.items():
-            chosen = block.channel == number
-            if chosen.any():
-                collector.feed(block, chosen)
+    static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
+    wanted |= static
+    cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
+    for whole in _ahead(container.blocks(frozenset(wanted), cut), pool):
+        block = cut.of(whole)
+        for number in np.unique(block.channel).tolist():
+            if number not in wanted:
+                continue
+            if number not in collectors:
+                # A definition is compiled when its first message comes: a log may declare any number of topics.
+                collectors[number] = _collector(by_id[number], wanted[number], unread)
+            if (collector := collectors[number]) is not None:
+                collector.feed(block, block.channel == number)
         if progress is not None:
             progress(container.share_read())
-    return merge_tables([collector.table() for collector in collectors.values()]), unread
+    tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
+    silent = [by_id[number] for number in wanted if number not in collectors]
+    tables += [_empty_table(channel) for channel in silent]
+    return merge_tables(tables), unread
+
+
+def _collector(channel: Channel, paths: tuple[str, ...], unread: dict[str, str]) -> Collector | None:
+    """Return what gathers a channel's columns; None, with the reason in `unread`, where its definition is refused."""
+    try:
+        return collector_for(channel, paths)
+    except DefinitionError as err:
+        unread[channel.topic] = str(err)
+        return None
+
+
+def _empty_table(channel: Channel) -> TopicTable:
+    return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0, "")
 
 
 def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]:
@@ -225,9 +276,13 @@ def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]
         yield block
 
 
-def _fingerprint(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+def _fingerprint(file: Path, ended: Event) -> str:
+    """Return the SHA-256 of a file, or of its beginning once `ended` is set."""
+    digest, piece = hashlib.sha256(), bytearray(1 << 20)
+    with file.open("rb", buffering=0) as stream:
+        while not ended.is_set() and (count := stream.readinto(piece)):
+            digest.update(memoryview(piece)[:count])
+    return digest.hexdigest()
 
 
 def _input_of(file: Path, pending: Future[str]) -> InputFile:
@@ -282,7 +337,7 @@ def _fixes(
         var_north,
         var_east,
         covariance,
-        told_class=None if source.told_class is None else source.told_class[rows],
+        stated_class=None if source.stated_class is None else source.stated_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 

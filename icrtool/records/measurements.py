@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, WheelSamples
+from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
@@ -105,7 +105,7 @@ class SensorData:
 
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""
-        wheels = WheelSamples(*(getattr(self.wheels, field.name)[rows] for field in fields(self.wheels)))
+        wheels = self.wheels.cut(rows)
         span = wheels.stamp_ns[[0, -1]]
         fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
         samples = slice(*np.searchsorted(self.headings.stamp_ns, span))
@@ -137,6 +137,7 @@ class Measurements:
     Attributes
     ----------
     findings : by name with unit; run.json has them as ``alignment``
+    streams : the log's chosen topics; ``why`` also names the unit of the wheels
     sections : more numbers for run.json, by section (``wheels``, ``heading``, ``gnss``)
     position_delay_s : correction of the position's clock that `sensors` holds
     antenna_is_known : its place was configured, or in the log
@@ -146,6 +147,7 @@ class Measurements:
     sensors: SensorData
     findings: dict[str, Finding]
     sections: dict[str, dict[str, Scalar]]
+    streams: tuple[StreamChoice, ...]
     fix_statistics: FixStatistics
     position_delay_s: float
     antenna_is_known: bool

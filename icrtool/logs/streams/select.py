@@ -148,7 +148,7 @@ def _read_all(
 
 def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
     topics = config.topics
-    by_topic = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
+    by_topic: dict[str, TopicTable] = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
     if topics.wheel_left is not None and topics.wheel_right is not None:
         left, right = by_topic.get(topics.wheel_left), by_topic.get(topics.wheel_right)
         return [pair_motion(left, right, config)] if left is not None and right is not None else []
@@ -256,7 +256,7 @@ def _pair_name(topics: TopicsConfig) -> str | None:
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Hold a configured pair against the log."""
-    types = {channel.topic: channel.message_type for channel in channels}
+    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     for side in ("left", "right"):
         topic = getattr(topics, f"wheel_{side}")
         if topic is None:
@@ -285,7 +285,7 @@ def _check_configured(
     """Hold a configured topic against the log. One with a mere doubt about it is used, as it was asked for."""
     if configured is None:
         return
-    types = {channel.topic: channel.message_type for channel in channels}
+    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
     if configured not in types:
         raise ConfigError(key, f"{configured} is not in {log}", f"it holds {', '.join(_listing(channels, unread))}")

@@ -20,7 +20,7 @@ from icrtool.records.run import Run
 from icrtool.records.tables import (
     FIXED_FIX,
     FLOAT_FIX,
-    NOT_TOLD,
+    NOT_STATED,
     OTHER_FIX,
     RTK_FIX,
     Bools,
@@ -74,8 +74,8 @@ def confess(log: RobotLog, float_: Bools, how: str) -> RobotLog:
     if how == "status":
         told[float_] = OTHER_FIX
     if how == "not":
-        told = np.full(len(float_), NOT_TOLD, np.uint8)
-    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), told_class=told))
+        told = np.full(len(float_), NOT_STATED, np.uint8)
+    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), stated_class=told))
 
 
 def icrs(run: Run) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_outliers_are_no_jumps_and_no_float() -> None:
 def test_float_throughout_is_no_loss_and_keeps_the_variance_it_states() -> None:
     log = clean()
     told = np.full(len(log.gnss.stamp_ns), FLOAT_FIX, np.uint8)
-    run = fit(replace(log, gnss=replace(log.gnss, told_class=told)), load_config(sets=[WIDTH]))
+    run = fit(replace(log, gnss=replace(log.gnss, stated_class=told)), load_config(sets=[WIDTH]))
     assert not run.sensors.fixes.down_weighted.any()
     assert not len(run.outages_ns)
     assert np.array_equal(run.sensors.fixes.var_north_m2, log.gnss.var_north_m2)
@@ -208,7 +208,7 @@ def park_then_drive(told: int, jitter_s: float = 0.03) -> RobotLog:
     )
 
 
-@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_TOLD])
+@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_STATED])
 def test_stamps_that_jitter_are_no_float_where_a_robot_parks_and_then_drives(told: int) -> None:
     log = park_then_drive(told)
     run = fit(log, load_config(sets=[WIDTH]))

@@ -108,7 +108,7 @@ def test_preset_paper_and_one_topic_for_both_take_nothing_out() -> None:
 def test_a_constant_speed_tells_no_delay_of_the_fixes() -> None:
     log = stop_and_go(fixes_late_s=0.3)
     even = np.full(len(log.wheels.stamp_ns), 0.6)
-    turning = replace(log, wheels=replace(log.wheels, v_left_mps=even + 0.1, v_right_mps=even - 0.1))
+    turning = replace(log, wheels=replace(log.wheels, left=even + 0.1, right=even - 0.1))
     x = np.zeros((len(even), 6))
     x[0] = [0.0, 0.0, 0.3, *ICRS]
     for k in range(len(even) - 1):

@@ -21,7 +21,7 @@ ICR_TOLERANCE_M = 0.05
 
 
 def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
-    return replace(log, wheels=replace(log.wheels, v_left_mps=left, v_right_mps=right))
+    return replace(log, wheels=replace(log.wheels, left=left, right=right))
 
 
 def test_good_wheels_are_left_as_they_are() -> None:

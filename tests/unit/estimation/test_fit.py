@@ -148,7 +148,7 @@ def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() 
     log = make_log(faster=8.0)
     slip = np.repeat(np.random.default_rng(0).normal(1.0, 0.3, len(log.wheels.stamp_ns) // 25 + 1), 25)
     slip = slip[: len(log.wheels.stamp_ns)]
-    late = replace(log.wheels, v_left_mps=slip * log.wheels.v_left_mps, v_right_mps=slip * log.wheels.v_right_mps)
+    late = replace(log.wheels, left=slip * log.wheels.left, right=slip * log.wheels.right)
     run = fit(replace(log, wheels=late), load_config(sets=[WIDTH]))
     assert run.process_position_mps > 0.3
     assert any("position noise raised" in warning for warning in run.warnings)
@@ -158,7 +158,7 @@ def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() 
 
 def test_a_parked_robot_is_said_to_have_learned_nothing() -> None:
     log = make_log()
-    still = replace(log.wheels, v_left_mps=0 * log.wheels.v_left_mps, v_right_mps=0 * log.wheels.v_right_mps)
+    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
     n = len(log.gnss.stamp_ns)
     gnss = PositionFixes(
         log.gnss.stamp_ns, np.zeros(n), np.zeros(n), *(np.full(n, 1e-4) for _ in range(2)), np.zeros(n)
@@ -186,7 +186,7 @@ def test_a_robot_that_spun_on_the_spot_has_learned_its_icrs_and_is_told_no_less(
 
 def test_a_parked_robot_whose_heading_drifts_has_learned_nothing() -> None:
     log = spun(60.0)
-    still = replace(log.wheels, v_left_mps=0 * log.wheels.v_left_mps, v_right_mps=0 * log.wheels.v_right_mps)
+    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
     run = fit(replace(log, wheels=still), load_config(sets=[WIDTH]))
     assert any("nothing was learned" in warning for warning in run.warnings)
 

@@ -55,7 +55,7 @@ def test_scales_are_recovered() -> None:
     from dataclasses import replace
 
     log = make_log(2, 200.0)
-    log = replace(log, wheels=replace(log.wheels, v_left_mps=log.wheels.v_left_mps / 1.02))
+    log = replace(log, wheels=replace(log.wheels, left=log.wheels.v_left_mps / 1.02))
     config = parse_config({"robot": {"track_width_m": 0.6}, "wheels": {"left_scale": 1.0}})
     found = fit_windows(cut_windows(fit(log, config)), EXTENDED[0])
     assert found.parameters[3] / found.parameters[4] == pytest.approx(1.02, abs=0.004)
