@@ -162,7 +162,7 @@ def rows(straight_m: float = 40.0, speed: float = 1.0) -> RobotLog:
 @pytest.mark.parametrize("left_scale", [0.98, 1.0, 1.02])
 def test_a_heading_in_whole_degrees_on_straight_rows_is_not_stuck(left_scale: float) -> None:
     log = rows()
-    wheels = replace(log.wheels, v_left_mps=left_scale * log.wheels.v_left_mps)
+    wheels = replace(log.wheels, left=left_scale * log.wheels.left)
     check = align_streams(replace(log, wheels=wheels), load_config(sets=[WIDTH])).heading
     assert check.warnings == ()
     assert check.agreement > 0.99
