@@ -77,7 +77,15 @@ def test_a_log_is_fitted_and_reported_on_in_one_go(fitted: Path) -> None:
     assert "Traceback" not in err
     assert (fitted / RUN / "states.csv").is_file()
     assert (fitted / RUN / "plots" / "trajectory.png").is_file()
-    files = {"summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
+    files = {
+        "summary.csv",
+        "histogram.csv",
+        "ladder.csv",
+        "worst.csv",
+        "report.json",
+        "trials.parquet",
+        ".icrtool-files",
+    }
     pictures = {f"plots/{name}.png" for name in PICTURES | {"outages"}}
     assert files_in(fitted / RUN / "dropout") == files | pictures
     assert "stays within 0.5 m (95 %) for" in out
@@ -117,6 +125,7 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
         "ladder.csv",
         "worst.csv",
         "report.json",
+        ".icrtool-files",
     }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])
