@@ -100,7 +100,18 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         "too_little_way_left",
         "across_wheel_gap",
         "ends_in_gnss_outage",
+        "from_standstill",
     }
+    assert [row["why_none"] is None for row in document["trials"]] == [row["trials"] > 0 for row in document["trials"]]
+    own, split = content.reference_error, content.by_learning
+    assert own is not None
+    assert split is not None
+    assert [row["p95_m"] for row in document["reference_error"]][0] == own.p95[0]
+    assert document["by_learning"]["learned_s"] == split.learned_s
+    for part, summary in (("before", split.before), ("after", split.after)):
+        rows = document["by_learning"][part]
+        assert [row["trials"] for row in rows] == summary.trials.tolist()
+        assert [row["p95_m"] for row in rows] == [None if np.isnan(p95) else p95 for p95 in summary.p95]
     assert document["bootstrap"]["seed"] == content.seed
     assert {"resamples", "level", "block"} <= document["bootstrap"].keys()
     assert document["tolerance_m"] <= 1e-9

@@ -17,7 +17,7 @@ from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
 from icrtool.output.atomic_file import check_place
 from icrtool.output.exports.acceptance import format_markdown, write_junit, write_markdown
-from icrtool.output.tables.dropout import budget_lines, format_dropout, p95_at, shown_horizons
+from icrtool.output.tables.dropout import budget_lines, format_dropout, p95_at, shown_horizons, why_no_trial
 from icrtool.records.run import Run
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
@@ -70,6 +70,24 @@ def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutReport) -
     assert row_of(text, "not counted: log ends")[0] == f"{counts.short[1]:,}"
     assert row_of(text, "  across a wheel gap")[0] == f"{counts.gap[1]:,}"
     assert row_of(text, "  ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
+
+
+def test_horizons_beyond_the_log_are_printed_with_the_reason(run: Run) -> None:
+    report = dropout(run, [1.0, 500.0, 700.0])
+    text = " ".join(format_dropout(report).split())
+    driven = f"{run.summary['drive']['distance_m']:.1f} m"
+    assert f"no trial of 500, 700 m: less than that is left of the {driven} driven" in text
+    assert why_no_trial(report, 0) is None
+    assert "no trial of" not in format_dropout(dropout(run, [1.0]))
+
+
+def test_the_reference_and_the_run_up_stand_in_the_table(content: DropoutReport) -> None:
+    text, own, split = format_dropout(content), content.reference_error, content.by_learning
+    assert own is not None
+    assert split is not None
+    assert row_of(text, "reference alone 95 %")[0] == f"{own.p95[1]:.3f}"
+    assert row_of(text, "  before")[:3] == [f"{split.before.p95[1]:.3f}", "/", f"{split.before.expected[1]:.3f}"]
+    assert row_of(text, "  after")[0] == f"{split.after.p95[1]:.3f}"
 
 
 def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
