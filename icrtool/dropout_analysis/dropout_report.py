@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from icrtool.calibration.model_comparison import Ladder, judge_ladder
+from icrtool.calibration import model_comparison
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
@@ -114,9 +114,9 @@ def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]
     return horizons
 
 
-def _compare(compared: Run, run: Run) -> tuple[Ladder | None, str]:
+def _compare(compared: Run, run: Run) -> tuple[model_comparison.Ladder | None, str]:
     """Compare the models of a run; where that cannot be, None and why."""
     try:
-        return judge_ladder(compared, measured_headings(run)), ""
+        return model_comparison.judge_ladder(compared, measured_headings(run)), ""
     except DataError as err:
         return None, f"{err.why}, {err.advice}"

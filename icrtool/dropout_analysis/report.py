@@ -61,7 +61,7 @@ class DropoutReport:
     examples : a cornering and a straight trial; empty where no trial is that long
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
-    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` says why
+    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     """
 
     name: str

@@ -10,17 +10,17 @@ from pathlib import Path
 
 from icrtool.errors import OutputError
 
-Judge = Callable[[Path], bool]
-"""Says whether a directory is one that we wrote and may replace."""
+IsOurs = Callable[[Path], bool]
+"""Whether a directory is one that we wrote and may replace."""
 
 
-def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
+def check_place(directory: Path, ours: IsOurs, *, kind: str) -> None:
     """Refuse a place where a directory of ours cannot be put.
 
     Parameters
     ----------
     directory : where it shall appear; nothing, an empty directory and one of ours may be there
-    ours : says which directories may be replaced
+    ours : whether a directory may be replaced
     kind : what is being written, for the message ("run directory")
 
     Raises
@@ -42,7 +42,7 @@ def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
 
 
 @contextmanager
-def whole_directory(directory: Path, ours: Judge, *, kind: str) -> Iterator[Path]:
+def atomic_directory(directory: Path, ours: IsOurs, *, kind: str) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
 
     Parameters
@@ -98,7 +98,7 @@ def _make_parents(place: Path) -> list[Path]:
 
 
 def _put(partial: Path, place: Path) -> None:
-    """Move `partial` to `place`, an old directory there out of the way first and back again if that fails."""
+    """Move `partial` to `place`, an old directory there aside first and back again if that fails."""
     if not place.exists():
         partial.rename(place)
         return

@@ -11,7 +11,7 @@ from icrtool.errors import OutputError
 
 
 @contextmanager
-def whole_file(file: Path) -> Iterator[Path]:
+def atomic_file(file: Path) -> Iterator[Path]:
     """Give a path beside a file to write to; at the end of the block it is moved to its place.
 
     Raises
@@ -26,7 +26,7 @@ def whole_file(file: Path) -> Iterator[Path]:
     except OSError as err:
         raise OutputError(file, "cannot be written", err.strerror or str(err)) from err
     finally:
-        # Where nothing can be written nothing can be removed either, and why has been told.
+        # Where nothing can be written nothing can be removed either; the error already states why.
         with suppress(OSError):
             partial.unlink(missing_ok=True)
 

@@ -17,7 +17,7 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
-from icrtool.output.atomic_directory import whole_directory
+from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.figures.dropout_figures import ReportFigures
 from icrtool.output.run_directory import json_bytes
@@ -62,7 +62,7 @@ def report_writer(directory: Path, drawer: Drawer, stamp_ns: Ints | None = None)
         Something that is not a dropout report stands in its place, or the disk does not take it.
     """
     with (
-        whole_directory(directory, is_dropout_directory, kind="dropout report") as partial,
+        atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial,
         drawer.into(partial / "plots") as draw,
         trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink,
     ):

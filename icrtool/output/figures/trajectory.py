@@ -54,7 +54,7 @@ FIX_LOOKS: dict[int, dict[str, Any]] = {
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
 REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
-"""Markers by class: shape and luminance tell them apart."""
+"""Markers by class: shape and luminance distinguish them."""
 
 
 def draw_trajectory(run: Run, odometry: Odometry) -> Figure:

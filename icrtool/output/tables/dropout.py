@@ -28,7 +28,7 @@ NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
 
 NEAR_HORIZONS_M = 1.5
-"""Between horizons that are further apart an interpolated distance is said to be one."""
+"""Between horizons that are further apart an interpolated distance is marked as one."""
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -79,7 +79,7 @@ def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> flo
 def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     """Return a sentence a budget: how far each model stays within it."""
     if not budgets:
-        return ["no trial is as long as the shortest horizon: nothing can be said of budgets"]
+        return ["no trial is as long as the shortest horizon: no budget can be evaluated"]
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)

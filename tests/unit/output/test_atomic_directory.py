@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.atomic_directory import check_place, whole_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 
 
 def marked(directory: Path) -> bool:
@@ -14,12 +14,12 @@ def marked(directory: Path) -> bool:
 
 
 def write(directory: Path, text: str = "new") -> None:
-    with whole_directory(directory, marked, kind="report") as partial:
+    with atomic_directory(directory, marked, kind="report") as partial:
         (partial / "mark").write_text(text)
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
-    with whole_directory(tmp_path / "a", marked, kind="report") as partial:
+    with atomic_directory(tmp_path / "a", marked, kind="report") as partial:
         (partial / "mark").write_text("new")
         assert not (tmp_path / "a").exists()
     assert (tmp_path / "a" / "mark").read_text() == "new"
@@ -77,7 +77,7 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
     write(tmp_path / "a", "old")
 
     def fill() -> None:
-        with whole_directory(tmp_path / "a", marked, kind="report") as partial:
+        with atomic_directory(tmp_path / "a", marked, kind="report") as partial:
             (partial / "mark").write_text("half")
             raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -90,7 +90,7 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
 def test_an_interruption_leaves_nothing_not_even_parents(tmp_path: Path, stop: type[BaseException]) -> None:
     def interrupted() -> None:
-        with whole_directory(tmp_path / "a" / "b", marked, kind="report") as partial:
+        with atomic_directory(tmp_path / "a" / "b", marked, kind="report") as partial:
             (partial / "mark").write_text("half")
             raise stop
 
@@ -119,7 +119,7 @@ def test_the_old_one_is_put_back_when_the_new_one_cannot_take_its_place(
 
 def test_what_came_into_the_place_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     def surprised() -> None:
-        with whole_directory(tmp_path / "a", marked, kind="report") as partial:
+        with atomic_directory(tmp_path / "a", marked, kind="report") as partial:
             (partial / "mark").write_text("new")
             (tmp_path / "a").mkdir()
             (tmp_path / "a" / "thesis.txt").write_text("years of work")

@@ -6,19 +6,19 @@ from pathlib import Path
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.atomic_file import whole_file
+from icrtool.output.atomic_file import atomic_file
 from icrtool.output.exports.acceptance import write_junit, write_markdown
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
-    with whole_file(tmp_path / "a.txt") as partial:
+    with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
         assert not (tmp_path / "a.txt").exists()
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "new")]
 
 
 def write_half(file: Path, failure: BaseException) -> None:
-    with whole_file(file) as partial:
+    with atomic_file(file) as partial:
         partial.write_text("half")
         raise failure
 
