@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from icrtool.output.atomic_directory import check_place, atomic_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states

@@ -14,7 +14,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_directory import check_place, atomic_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 
 
 def marked(directory: Path) -> bool:

@@ -8,7 +8,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_file import check_place, atomic_file
+from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.exports.acceptance import write_junit, write_markdown
 
 
