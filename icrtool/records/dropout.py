@@ -65,7 +65,8 @@ class Outage:
     ----------
     begin_s, end_s : seconds since the first recorded state
     distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: miss at re-acquisition (both the same)
+    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
+        the same)
     north_m, east_m : (m,) the path without GNSS, for a picture
     """
 
@@ -94,6 +95,36 @@ class Rung:
     fitted: str
     measured_heading: bool
     summary: Summary
+
+
+class ReferenceErrors(NamedTuple):
+    """The error that the reference itself puts into trials, by horizon; (h,) [m] each, NaN where there is no trial.
+
+    Attributes
+    ----------
+    std : root mean square
+    expected, p95 : mean and 95th percentile: what a perfect motion model would show
+    """
+
+    std: Floats
+    expected: Floats
+    p95: Floats
+
+
+class LearnedSplit(NamedTuple):
+    """Trials of the momentary ICRs that start before and after the ICRs were first learned.
+
+    Attributes
+    ----------
+    learned_s, distance_m : when and where they were learned, seconds and metres since the first recorded state; None
+        where they never were: all trials are before
+    before, after : by horizon
+    """
+
+    learned_s: float | None
+    distance_m: float | None
+    before: Summary
+    after: Summary
 
 
 class BudgetDistance(NamedTuple):

@@ -68,7 +68,7 @@ SAVE: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Pen:
-    """How a line is told apart: by dash and by luminance, so that a grey print still reads."""
+    """How a line is distinguished: by dash and by luminance, so that a grey print still reads."""
 
     color: str
     dash: str | tuple[float, tuple[float, ...]] = "-"
@@ -95,7 +95,7 @@ MEAN = Pen("black", (0, (5, 2)), 1.1)
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc says."""
+    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc sets."""
     settings = cast(dict[str, Any], mpl.rcParams)
     defaults = cast(dict[str, Any], mpl.rcParamsDefault)
     with mpl.rc_context():
