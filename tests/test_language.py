@@ -40,9 +40,13 @@ INSTEAD = re.compile(
 )
 
 
+COLUMNS = re.compile(r"\bblind_(?:icr|no_slip)_10m_p95_m\b|(?:change\{n\}_)?\brise_\{\w+\}_s\b")
+"""Columns of a study's CSV, which are public and keep their names."""
+
+
 def found_in_text(text: str) -> list[str]:
     """List the words not to use in a text, each with what to use instead."""
-    text = re.sub(r"\s+", " ", text.replace("_", " "))
+    text = re.sub(r"\s+", " ", COLUMNS.sub("", text).replace("_", " "))
     rest = INSTEAD.sub(lambda hit: " " * len(hit.group()), text)
     return [f"{hit.group()}: write {WORDS[hit.group().lower()]}" for hit in PATTERN.finditer(rest)]
 

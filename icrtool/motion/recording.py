@@ -1,4 +1,4 @@
-"""What motion models are fitted to and judged by: wheel speeds, a reference trajectory, a gyro, and windows of it."""
+"""Data to fit and test motion models: wheel speeds, reference trajectory, gyro, and windows of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
-"""Lengths of the windows. One length alone lets a circle of just that circumference show nothing."""
+"""Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
 
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
@@ -39,7 +39,7 @@ MOVING_MPS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One log as motion models see it.
+    """One log as input of the motion models.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Recording:
     gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro counts turns the other way, and its sign was turned
+    gyro_reversed : the gyro measures counter-clockwise, and its sign was changed
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Parts of a dropout report: what tables, files and pictures show.
+"""Parts of a dropout report, for tables, files and figures.
 
 No kernel is here: a process that only draws them need not load numba.
 """
@@ -65,7 +65,7 @@ class Outage:
     ----------
     begin_s, end_s : seconds since the first recorded state
     distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: miss at re-acquisition (both the same)
+    end_error_m, max_error_m : forced: distance to the undisturbed estimate; real: error at re-acquisition (both equal)
     north_m, east_m : (m,) the path without GNSS, for a picture
     """
 
@@ -102,7 +102,7 @@ class BudgetDistance(NamedTuple):
     Attributes
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
-    beyond : the budget still held at `distance_m`, the last horizon with trials
+    beyond : the error is within the budget at `distance_m`, the last horizon with trials
     between_m : horizons interpolated between
     """
 
@@ -133,7 +133,7 @@ class Verdict:
     Attributes
     ----------
     value_m : NaN where the log has no trial of that length
-    margin_m : negative when the bound was missed
+    margin_m : negative where the limit was exceeded
     """
 
     gate: Gate
@@ -160,7 +160,7 @@ class TurningSplit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredHeading:
-    """Where the robot pointed by a sensor of its own, at the states of a run.
+    """Heading by a sensor of the robot, at the states of a run.
 
     Attributes
     ----------
