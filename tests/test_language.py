@@ -40,8 +40,8 @@ INSTEAD = re.compile(
 )
 
 
-COLUMNS = re.compile(r"\bblind_(?:icr|no_slip)_10m_p95_m\b|(?:change\{n\}_)?\brise_\{\w+\}_s\b")
-"""Columns of a study's CSV, which are public and keep their names."""
+COLUMNS = re.compile(r"\bblind_(?:icr|no_slip)_10m_p95_m\b|\b(?:change\{n\}_)?rise_\{\w+\}_s\b|(?<=\")way_m(?=\")")
+"""Columns of a study's CSV and a key of a calibration file, which are public and keep their names."""
 
 
 def found_in_text(text: str) -> list[str]:
