@@ -15,8 +15,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("## Words not to use")[2]
 
-DONE: tuple[str, ...] = ("__init__", "figures")
+DONE: tuple[str, ...] = ("__init__", "cli", "config", "errors", "figures", "kernels", "logs", "simulation")
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
+
+PUBLISHED = ("blind_icr_10m_p95_m", "blind_no_slip_10m_p95_m", "change{n}_rise_{icr}_s", "rise_{name}_s", '"way_m"')
+"""Keys of files that users read: they never change."""
 
 PAGES = (
     "CHANGELOG.md",
@@ -40,13 +43,11 @@ INSTEAD = re.compile(
 )
 
 
-COLUMNS = re.compile(r"\bblind_(?:icr|no_slip)_10m_p95_m\b|\b(?:change\{n\}_)?rise_\{\w+\}_s\b|(?<=\")way_m(?=\")")
-"""Columns of a study's CSV and a key of a calibration file, which are public and keep their names."""
-
-
 def found_in_text(text: str) -> list[str]:
     """List the words not to use in a text, each with what to use instead."""
-    text = re.sub(r"\s+", " ", COLUMNS.sub("", text).replace("_", " "))
+    for key in PUBLISHED:
+        text = text.replace(key, "")
+    text = re.sub(r"\s+", " ", text.replace("_", " "))
     rest = INSTEAD.sub(lambda hit: " " * len(hit.group()), text)
     return [f"{hit.group()}: write {WORDS[hit.group().lower()]}" for hit in PATTERN.finditer(rest)]
 

@@ -10,7 +10,7 @@ from icrtool import __version__
 
 _COMMANDS = {
     "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
-    "calibrate": "Estimate antenna, heading offset, delays, wheel scales and ICRs from logs, with standard deviations.",
+    "calibrate": "Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.",
     "export": "Print a run's calibration for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",

@@ -32,7 +32,7 @@ class Request:
     Attributes
     ----------
     horizons_m, outage_s : empty: those of the run's configuration
-    config : configuration by the options; logs are fitted with it
+    config : that of the options; logs are fitted with it
     """
 
     config: Config

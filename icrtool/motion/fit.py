@@ -70,7 +70,7 @@ class WindowResiduals:
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     """
 
     def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
@@ -134,7 +134,7 @@ class Pool:
     Parameters
     ----------
     windows, widths_m : by recording
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     """
 
     def __init__(

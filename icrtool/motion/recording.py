@@ -48,7 +48,7 @@ class Recording:
     gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro measures counter-clockwise, and its sign was changed
+    gyro_reversed : the gyro counts turns the other way, and its sign was turned
     """
 
     name: str

@@ -65,7 +65,8 @@ class Outage:
     ----------
     begin_s, end_s : seconds since the first recorded state
     distance_m : path driven through it
-    end_error_m, max_error_m : forced: distance to the undisturbed estimate; real: error at re-acquisition (both equal)
+    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
+        the same)
     north_m, east_m : (m,) the path without GNSS, for a picture
     """
 

@@ -91,7 +91,7 @@ def draw_icr_change(result: StudyResult) -> Figure:
         draw_bands(row[1], zoom, curves["true_icrs"][:2], np.zeros(1))
         preset, what = name.split(" ", 1)
         row[0].set_title(
-            f"preset {preset}, {'covariance inflated' if what == 'inflated' else 'covariance not inflated'}", loc="left"
+            f"preset {preset}, {'covariance inflated' if what == 'inflated' else 'filter not informed'}", loc="left"
         )
         row[0].set_ylabel("ICRs [m]")
     panels[-1][0].set_xlabel("Time [s]")

@@ -18,7 +18,7 @@ def format_calibration(calibration: Calibration) -> str:
         calibration.name,
         "",
         f"drive       {facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left",
-        f"compared    {calibration.windows} windows of way, {calibration.stretches} independent stretches",
+        f"compared    {calibration.windows} windows of driven distance, {calibration.stretches} independent stretches",
         "",
         f"{'parameter':<36}{'value ± std':<24}verdict",
     ]

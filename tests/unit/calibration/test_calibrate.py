@@ -148,7 +148,7 @@ def test_a_stray_stamp_decades_away_costs_no_memory() -> None:
 
 
 def test_too_short_a_drive_is_refused() -> None:
-    with pytest.raises(DataError, match=r"windows of 1\.0 m of way"):
+    with pytest.raises(DataError, match=r"windows of 1\.0 m"):
         calibrate(simulate(0, seconds=8.0), CONFIG)
 
 
