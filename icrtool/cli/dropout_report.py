@@ -27,7 +27,7 @@ EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is asked of every run.
+    """The options, the same for every run.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ def plan_sources(
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
-    Whatever can be refused at once is refused here, before any work.
+    Everything that can be refused without reading a log is refused here.
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE

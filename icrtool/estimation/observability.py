@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL, displace, move
+from icrtool.kernels.window_errors import NEUTRAL, displace, integrate
 from icrtool.records.run import ICR_COLUMNS, half_width_m
 from icrtool.records.tables import Floats, States
 
@@ -101,7 +101,7 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None) ->
     way = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
     rows = rows_at_steps(way, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
-    motion = move(table.t_s, dt, drive.v_left, drive.v_right, p, table.t_s[rows])
+    motion = integrate(table.t_s, dt, drive.v_left, drive.v_right, p, table.t_s[rows])
     d, d_by, _ = displace(motion, start, end)
     turn_by = motion.theta_by[end] - motion.theta_by[start]
     turned = motion.theta[end] - motion.theta[start]

@@ -1,4 +1,4 @@
-"""What a study needs: many filter runs in one compiled call, and a true motion that obeys the filter's model."""
+"""Kernels of the studies: many filter runs in one compiled call, and a true motion that follows the filter's model."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Batch(NamedTuple):
 
 
 class BatchOutput(NamedTuple):
-    """What the runs leave behind.
+    """Results of the runs.
 
     Attributes
     ----------

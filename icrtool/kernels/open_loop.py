@@ -16,9 +16,9 @@ from icrtool.kernels.kinematics import euler_step
 from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints, OpenLoopPath, TrialCounts
 
 SHORT = -1
-"""No trial: less than the horizon is left of the path."""
+"""No trial: less than the horizon is left of the log's distance."""
 GAP = -2
-"""No trial: the way spans a gap in the wheel data."""
+"""No trial: the trial spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
 STANDING = -4

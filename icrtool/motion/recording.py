@@ -1,4 +1,4 @@
-"""What motion models are fitted to and judged by: wheel speeds, a reference trajectory, a gyro, and windows of it."""
+"""Data to fit and test motion models: wheel speeds, reference trajectory, gyro, and windows of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
-"""Lengths of the windows. One length alone lets a circle of just that circumference show nothing."""
+"""Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
 
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
@@ -40,7 +40,7 @@ MOVING_MPS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One log as motion models see it.
+    """One log as input of the motion models.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Parts of a dropout report: what tables, files and pictures show.
+"""Parts of a dropout report, for tables, files and figures.
 
 No kernel is here: a process that only draws them need not load numba.
 """
@@ -133,7 +133,7 @@ class BudgetDistance(NamedTuple):
     Attributes
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
-    beyond : the budget still held at `distance_m`, the last horizon with trials
+    beyond : the error is within the budget at `distance_m`, the last horizon with trials
     between_m : horizons interpolated between
     """
 
@@ -164,7 +164,7 @@ class Verdict:
     Attributes
     ----------
     value_m : NaN where the log has no trial of that length
-    margin_m : negative when the bound was missed
+    margin_m : negative where the limit was exceeded
     """
 
     gate: Gate
@@ -191,7 +191,7 @@ class TurningSplit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredHeading:
-    """Where the robot pointed by a sensor of its own, at the states of a run.
+    """Heading by a sensor of the robot, at the states of a run.
 
     Attributes
     ----------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from icrtool.simulation.studies import KINDS, Finding, StudyRequest, StudyResult
+from icrtool.simulation.studies import KINDS, StudyNumber, StudyRequest, StudyResult
 
 ERRORS = tuple(
     (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
@@ -73,13 +73,13 @@ def _cell(name: str, found: dict[str, Any], runs: int) -> str:
     return f"{found['p50']:{form}} [{found['p5']:{form}}, {found['p95']:{form}}]{never}"
 
 
-def _finding_lines(findings: tuple[Finding, ...], beside: str) -> list[str]:
+def _finding_lines(findings: tuple[StudyNumber, ...], beside: str) -> list[str]:
     rows = [("", "ours", beside), *((one.what, finding_text(one), one.paper) for one in findings)]
     first, second = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
     return [f"{what:<{first}}  {ours:<{second}}  {paper}" for what, ours, paper in rows]
 
 
-def finding_text(finding: Finding) -> str:
+def finding_text(finding: StudyNumber) -> str:
     """Return our number as ``1.23 s``, or ``0.5-1.23 s``, or median with percentiles."""
     if any(math.isnan(value) for value in finding.ours):
         return "never"
