@@ -24,6 +24,7 @@ from icrtool.kernels.error_statistics import (
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, ModelResult
 from icrtool.records.run import Run, drive_of, straight_drive
 from icrtool.records.tables import Floats
@@ -56,11 +57,19 @@ THREADS = 2
 
 
 class Model(NamedTuple):
-    """A way to predict motion from wheel speeds: ICRs per start, or one triple."""
+    """What predicts motion from wheel speeds: ICRs per start, or one triple."""
 
     name: str
     label: str
     icrs: FrozenIcrs
+
+
+class ConstantModel(NamedTuple):
+    """A model of constant parameters, by the errors (k, h) [m] that it has in trials; NaN where it has none."""
+
+    name: str
+    label: str
+    errors_of: Callable[[Trials], Floats]
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
@@ -75,6 +84,7 @@ def dropout(
     horizons_m: Sequence[float] | None = None,
     *,
     models: Sequence[Model] | None = None,
+    further: Sequence[ConstantModel] = (),
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     watch: ReportWatch | None = None,
@@ -86,6 +96,7 @@ def dropout(
     run : of `icrtool.fit` or `icrtool.open_run`
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
     models : what to predict with; default `models_of` of the run
+    further : models of constant parameters, beside those
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
     watch : called with the report as it grows: before the first model, without any result, and after each
@@ -110,7 +121,7 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else models_of(run)
+    models = (*(models if models is not None else models_of(run)), *further)
     standing = int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1]))
     groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
@@ -143,10 +154,13 @@ def dropout(
             blocks = _blocks(drive, horizons[group], ends, pool)
             counts.append(count)
             for model in models:
-                errors = _errors(drive, model.icrs, ends, pool)
+                errors = _errors(drive, model, ends, pool)
+                tested = blocks
+                if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
+                    tested = _blocks(drive, horizons[group], np.where(np.isfinite(errors.T), ends, -1), pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
-                parts[model.name].append(_summarise(model, errors, blocks, seed, pool))
+                parts[model.name].append(_summarise(model, errors, tested, seed, pool))
                 if watch is not None and group is groups[-1]:
                     watch(done())
     return done()
@@ -228,10 +242,13 @@ def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Execu
     return list(pool.map(cut, range(len(horizons))))
 
 
-def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states = ends.shape[1]
-    errors = np.empty(ends.shape)
+    if isinstance(model, ConstantModel):
+        found = model.errors_of(Trials(np.arange(states), ends.T.astype(np.int64)))
+        return np.ascontiguousarray(found.T).T
+    errors, icrs = np.empty(ends.shape), model.icrs
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_A_CALL, states)
@@ -241,7 +258,9 @@ def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Execu
     return errors.T
 
 
-def _summarise(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
+def _summarise(
+    model: Model | ConstantModel, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor
+) -> ModelResult:
     """Return the errors of one model in numbers, horizon by horizon."""
 
     def summarise(h: int) -> ModelResult:
