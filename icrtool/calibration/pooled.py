@@ -228,6 +228,13 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
     return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
 
 
+def fixed_predictor(recording: Recording, fit: PooledFit) -> ErrorsOf:
+    """Return what gives the errors of a fit to other recordings, with the delay of this recording's own wheels."""
+    own = Pool([cut_windows(recording)], [recording.width_m], fit.model).own_constants(0, fit.parameters)
+    rates = twist_rates(recording, fit.model, fit.parameters)
+    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
+
+
 def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
     """Return what gives the errors of the recommended model, each trial predicted without the blocks that it touches.
 
