@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from icrtool.alignment.corrections import align_streams, start_icrs
 from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
-from icrtool.alignment.heading_alignment import HeadingCheck, check_heading
+from icrtool.alignment.heading_alignment import HeadingCheck
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.stream_delays import StreamDelays, measure_delays
-from icrtool.alignment.wheel_alignment import WheelCheck, check_wheels
+from icrtool.alignment.stream_delays import StreamDelays
+from icrtool.alignment.wheel_alignment import WheelCheck
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
@@ -40,11 +41,9 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
-    check_streams(log)
-    wheels = check_wheels(log, config)
-    heading = check_heading(wheels.log, config, wheels.course)
-    delays = measure_delays(wheels.log, config, heading)
-    quality = judge_fixes(delays.log, config, heading)
+    found = align_streams(log, config)
+    wheels, heading, delays = found.wheels, found.heading, found.delays
+    quality = judge_fixes(found.log, config, heading)
     aligned = sensors_as_sent(quality.log, config)
     sensors = replace(
         aligned,
@@ -62,19 +61,20 @@ def align(log: RobotLog, config: Config) -> Measurements:
         ),
         heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
         losses_ns=quality.losses_ns,
+        icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
     )
     # preset paper believes its wheels
     if config.filter.preset == "field":
         sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
     return Measurements(
         sensors=sensors,
-        findings=_findings(wheels, heading, delays),
+        findings=_findings(wheels, heading, delays) | found.robot_findings(),
         sections={
             "wheels": wheels.summary(),
-            "heading": heading.summary() | delays.heading_summary(),
+            "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
             "gnss": delays.gnss_summary(),
         },
-        streams=log.streams,
+        streams=found.log.streams,
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.reference_delay import busiest_rows, find_delay
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, configured_process_position_mps, set_up_filter
 from icrtool.kernels.ekf import run_filter
@@ -53,23 +52,12 @@ def run_adaptively(
         return setup, output, by_fixes, by_fixes + (float(capped.mean()) if len(capped) else 0.0)
 
     speed = configured_process_position_mps(config)
-    field, delay = config.filter.preset == "field", 0.0
+    field = config.filter.preset == "field"
     setup, output, contradiction, _ = run(sensors, speed)
-    if field and config.frames.reference_delay_s == "auto" and contradiction > TOLERATED_NIS:
-        part = _busiest_part(sensors)
-        delay = find_delay(lambda late: run(part.earlier(late), speed)[3])
-        sensors = sensors.earlier(delay)
-        setup, output, contradiction, _ = run(sensors, speed)
     adapts = field and config.filter.process_position_mps == "auto"
     while adapts and contradiction > TOLERATED_NIS and speed < LARGEST_PROCESS_POSITION_MPS:
         next_setup, next_output, next_one, _ = run(sensors, speed * PROCESS_POSITION_STEP)
         if next_one > WORTHWHILE_SHARE * contradiction:
             break
         speed, setup, output, contradiction = speed * PROCESS_POSITION_STEP, next_setup, next_output, next_one
-    return AdaptedRun(sensors, setup, output, speed, delay)
-
-
-def _busiest_part(sensors: SensorData) -> SensorData:
-    """Return the part of a long log in which the wheels travel most, of a shorter one all of it."""
-    rows = busiest_rows(sensors.wheels)
-    return sensors if rows is None else sensors.part(rows)
+    return AdaptedRun(sensors, setup, output, speed, 0.0)

@@ -90,6 +90,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "antenna_m": sensors.antenna_m,
                 "states": len(table),
                 "warm_start": warm_start_summary(filtered.began_with),
+                "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
             }
             | nis_summary(filtered.gnss, filtered.heading),
             "excitation": excitation.summary(),

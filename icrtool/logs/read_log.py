@@ -20,7 +20,7 @@ from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.gyro import find_gyro
+from icrtool.logs.streams.gyro import find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
@@ -35,6 +35,7 @@ from icrtool.records.tables import (
     HeadingSamples,
     InputFile,
     Ints,
+    OtherReceiver,
     PositionFixes,
     RobotLog,
     Role,
@@ -44,6 +45,8 @@ from icrtool.records.tables import (
 from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
+
+NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,9 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     choice = choose_streams(found, config, survey.path, survey.channels)
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     delays = [
-        s.delay_ns / 1e9 if s.header_ns is not None else None for s in (motion.stamps, position.stamps, source.stamps)
+        s.stamps.delay_ns / 1e9 if s.stamps.header_ns is not None else None
+        for s in (motion, position, source)
+        if s is not None
     ]
     clock = common_clock(delays)
     warnings = list(survey.problems)
@@ -171,38 +176,52 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
             f"{name}: a stream without header stamps stands beside header stamps that are far from log time; "
             "all go by log time"
         )
-    for role, stamps in (("wheels", motion.stamps), ("gnss", position.stamps), ("heading", source.stamps)):
-        if stamps.note and stamps.note != "no header":
-            warnings.append(f"{name}: {role}: {stamps.note}; log time is used")
+    for role, one in (("wheels", motion), ("gnss", position), ("heading", source)):
+        if one is not None and one.stamps.note and one.stamps.note != "no header":
+            warnings.append(f"{name}: {role}: {one.stamps.note}; log time is used")
     gnss, datum, rejected = _fixes(position, config, clock, name)
-    heading, convention = _headings(source, config, clock, name)
+    heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
-    if source.note:
+    if source is not None and source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
     quantity = "position" if samples.from_position else "speed"
-    streams = (
-        _stream(
-            "wheels",
-            motion,
-            samples.stamp_ns,
-            clock,
-            f"{choice.why['wheels']}; {quantity}",
-        ),
+    streams: tuple[StreamChoice, ...] = (
+        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {quantity}"),
         _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
-        _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )
+    if source is not None:
+        streams += (_stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),)
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    gyro = find_gyro(survey.tables, motion.topic, source.topic, clock)
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock)
     return RobotLog(
-        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro
+        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro,
+        find_gyros(survey.tables, clock), _other_receivers(survey.candidates, position, datum, config, clock, name),
+    )  # fmt: skip
+
+
+def _other_receivers(
+    found: Candidates,
+    chosen: PositionSource,
+    datum: Datum | None,
+    config: Config,
+    clock: Literal["header", "log"],
+    name: str,
+) -> tuple[OtherReceiver, ...]:
+    """Return the fixes of the other GNSS receivers, in the local plane of the chosen one."""
+    if datum is None:
+        return ()
+    return tuple(
+        OtherReceiver(source.topic, _fixes(source, config, clock, name, datum)[0])
+        for source in found.gnss
+        if source is not chosen and source.geodetic is not None and source.usable.any() and not source.problem
     )
 
 
@@ -289,9 +308,9 @@ def _stream(
 
 
 def _fixes(
-    source: PositionSource, config: Config, clock: Literal["header", "log"], name: str
+    source: PositionSource, config: Config, clock: Literal["header", "log"], name: str, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
-    """Bring positions to the local plane about the datum."""
+    """Bring positions to the local plane about the datum: `given`, else configured, else the first fix."""
     if not source.usable.any():
         raise DataError(
             name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
@@ -304,7 +323,9 @@ def _fixes(
         from pymap3d import geodetic2ned
 
         latitude, longitude, height = source.geodetic[rows].T
-        if config.frames.datum is not None:
+        if given is not None:
+            datum = given
+        elif config.frames.datum is not None:
             datum = Datum(*config.frames.datum, float(height[0]))
         else:
             datum = Datum(float(latitude[0]), float(longitude[0]), float(height[0]))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import Fixes, SensorData
+from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.tables import GyroSamples, HeadingSamples, Ints, States, WheelSamples
 
@@ -45,6 +45,7 @@ class FilterInputs(NamedTuple):
     antenna_m: tuple[float, float]
     losses_ns: Ints
     events: tuple[SlipEvent, ...]
+    icr_start: IcrStart | None
 
 
 def write_measurements(run: Run, path: Path) -> None:
@@ -100,6 +101,7 @@ def read_measurements(
             antenna_m=inputs.antenna_m,
             losses_ns=inputs.losses_ns,
             events=inputs.events,
+            icr_start=inputs.icr_start,
         )
         outcomes = [
             _outcome(columns, group, stamps_ns, table)

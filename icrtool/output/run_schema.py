@@ -178,6 +178,13 @@ class WarmStartDocument(TypedDict):
     covariance_m2: Matrix
 
 
+class IcrStartDocument(TypedDict):
+    """ICRs that the filter started from, and their standard deviations."""
+
+    icrs_m: Triple
+    std_m: Triple
+
+
 class FilterDocument(TypedDict):
     """What the filter was run with."""
 
@@ -187,6 +194,7 @@ class FilterDocument(TypedDict):
     heading_from_position: bool
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
+    icr_start: IcrStartDocument | None
 
 
 class VerdictsByIcr(TypedDict):

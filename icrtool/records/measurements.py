@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,6 +59,13 @@ class Fixes:
         return Fixes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
+class IcrStart(NamedTuple):
+    """ICRs to start the filter from, right, left, x, and their standard deviations (3,) [m]."""
+
+    icrs_m: tuple[float, float, float]
+    std_m: tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class SensorData:
     """The streams of one log as the filter uses them: all it needs of the log.
@@ -72,6 +80,7 @@ class SensorData:
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : spans in which the robot did not do what its wheels did, in order of time
+    icr_start : ICRs that the alignment found, or that such robots have; None: the preset's start
     """
 
     name: str
@@ -84,6 +93,7 @@ class SensorData:
     antenna_m: tuple[float, float]
     losses_ns: Ints
     events: tuple[SlipEvent, ...] = ()
+    icr_start: IcrStart | None = None
 
     def earlier(self, delay_s: float) -> SensorData:
         """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""

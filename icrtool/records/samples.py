@@ -143,6 +143,33 @@ class GyroSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class GyroAxes:
+    """Turn rates about the three axes of an inertial unit, as sent.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rates_radps : float64 (n, 3), about x, y, z of the sensor
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rates_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rates_radps)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherReceiver:
+    """Positions of a further receiver, in the same local plane."""
+
+    topic: str
+    fixes: PositionFixes
+
+
+@dataclass(frozen=True, slots=True)
 class Datum:
     """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
 

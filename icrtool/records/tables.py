@@ -18,10 +18,12 @@ from icrtool.records.samples import (
     Complexes,
     Datum,
     Floats,
+    GyroAxes,
     GyroSamples,
     HeadingSamples,
     InputFile,
     Ints,
+    OtherReceiver,
     PositionFixes,
     Role,
     StreamChoice,
@@ -45,10 +47,12 @@ __all__ = [
     "Complexes",
     "Datum",
     "Floats",
+    "GyroAxes",
     "GyroSamples",
     "HeadingSamples",
     "InputFile",
     "Ints",
+    "OtherReceiver",
     "PositionFixes",
     "RobotLog",
     "Role",
@@ -71,6 +75,9 @@ class RobotLog:
     warnings : sentences for the user, in the order they were found
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
     gyro : turn rates of an inertial unit, None without one; the filter does not use them
+    heading : without a row where no topic states one
+    gyros : all inertial units with turn rates, all axes
+    other_receivers : further GNSS receivers
     """
 
     name: str
@@ -84,6 +91,8 @@ class RobotLog:
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] | None = None
     gyro: GyroSamples | None = None
+    gyros: tuple[GyroAxes, ...] = ()
+    other_receivers: tuple[OtherReceiver, ...] = ()
 
     @classmethod
     def from_frames(

@@ -55,11 +55,11 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The source of each role, and in words why it was chosen."""
+    """The source of each role, and in words why it was chosen; `heading` is None where no topic states one."""
 
     wheels: WheelMotion
     gnss: PositionSource
-    heading: HeadingSource
+    heading: HeadingSource | None
     why: dict[Role, str]
 
 
@@ -233,7 +233,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     _check_configured("gnss", found.gnss, topics.gnss, found.unread, log, channels)
     _check_configured("heading", found.heading, topics.heading, found.unread, log, channels)
     gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
-    if wheels is None or gnss is None or heading is None:
+    if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
@@ -245,7 +245,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
         {
             "wheels": _reason(wheels, found.wheels, topics.wheels or _pair_name(topics)),
             "gnss": _reason(gnss, found.gnss, topics.gnss),
-            "heading": _reason(heading, found.heading, topics.heading),
+            "heading": "" if heading is None else _reason(heading, found.heading, topics.heading),
         },
     )
 
