@@ -151,7 +151,8 @@ def compare_calibrations(
                 predictors = [fixed_predictor(one, fit) for one, fit in zip(tested, without, strict=True)]
             else:
                 predictors = [predictor(calibration, one) for one in tested]
-            errors, path = [], []
+            errors: list[Floats] = []
+            path: list[Floats] = []
             for one, errors_of in zip(tested, predictors, strict=True):
                 trials = cut_trials(one, HORIZONS_M)
                 errors.append(errors_of(trials))

@@ -121,12 +121,12 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = (*(models if models is not None else models_of(run)), *further)
+    predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing = int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1]))
     groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
-    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
-    if len(parts) < len(models):
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in predictors}
+    if len(parts) < len(predictors):
         raise ValueError("two models have the same name")
 
     none = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
@@ -153,7 +153,7 @@ def dropout(
             ends, count = _ends(drive, horizons[group], pool)
             blocks = _blocks(drive, horizons[group], ends, pool)
             counts.append(count)
-            for model in models:
+            for model in predictors:
                 errors = _errors(drive, model, ends, pool)
                 tested = blocks
                 if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):

@@ -19,6 +19,10 @@ FILE_NAME = "calibration.json"
 def open_calibration(file: Path | str) -> Calibration:
     """Read a calibration file.
 
+    Parameters
+    ----------
+    file : what ``icrtool calibrate -o`` or `Calibration.write` wrote
+
     Raises
     ------
     RunError

@@ -129,7 +129,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
     robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
     origin = (
         f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {numbers.way_m:.0f} m{robot}, "
-        f"fitted {numbers.created}"
+        f"fitted {numbers.created[:10]}"
     )
     icrs = (
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
