@@ -11,7 +11,8 @@ from icrtool import __version__
 _COMMANDS = {
     "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
     "calibrate": "Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.",
-    "export": "Print a run's calibration for a robot's controller or filter.",
+    "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
+    "export": "Print the calibration of a run or of a file for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",

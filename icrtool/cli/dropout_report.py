@@ -15,6 +15,7 @@ from icrtool.cli.fit import RUNS, plot_formats, run_directories
 from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.output.exports.acceptance import Outcome
@@ -40,6 +41,7 @@ class Request:
     outage_s: tuple[float, ...]
     outage_at_s: tuple[float, ...]
     budgets_m: tuple[float, ...]
+    calibrations: tuple[Calibration, ...]
     gates: tuple[Gate, ...]
     starts: Literal["moving", "all"]
     trials: bool
@@ -62,6 +64,8 @@ class Request:
 @click.option(
     "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
 )
+@click.option("--calibration", "calibrations", metavar="CAL.json", type=click.Path(path_type=Path), multiple=True,
+              help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
 @click.option("--outage", "outages", metavar="SECONDS", type=POSITIVE, multiple=True,
               help="Force outages of this length on the filter; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
@@ -83,7 +87,7 @@ class Request:
 @options.verbosity
 def command(
     sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
-    gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
+    gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
     junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -97,16 +101,19 @@ def command(
     Example:
       icrtool dropout-report
       icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
+      icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.output.calibration_file import open_calibration
     from icrtool.records.dropout import DEFAULT_SEED
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
+        calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
         smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
@@ -279,6 +286,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             horizons_m=horizons,
             budgets_m=request.budgets_m,
             gates=request.gates,
+            calibrations=request.calibrations,
             outage_s=outages,
             outage_at_s=request.outage_at_s,
             starts=request.starts,

@@ -23,6 +23,7 @@ from icrtool.records.dropout import (
     Outage,
     ReferenceErrors,
     TurningSplit,
+    UsedCalibration,
     Verdict,
 )
 from icrtool.records.late_output import call_output
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from icrtool.calibration.model_comparison import Ladder
+    from icrtool.calibration.record import Calibration
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -62,6 +64,8 @@ class DropoutReport:
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
     comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
+    calibrations : those with a row of their own
+    expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
 
     name: str
@@ -87,6 +91,13 @@ class DropoutReport:
     by_turning: tuple[TurningSplit, ...] = ()
     comparison: Ladder | None = None
     no_comparison: str = ""
+    calibrations: tuple[UsedCalibration, ...] = ()
+    expected: tuple[str, ...] = ()
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration of this run alone, which `recommended` stands for; None where it was left out."""
+        return self.comparison.calibration if self.comparison is not None else None
 
     @property
     def passed(self) -> bool:

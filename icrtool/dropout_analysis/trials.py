@@ -27,6 +27,7 @@ from icrtool.kernels.error_statistics import (
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.run import Run, drive_of, straight_drive
 from icrtool.records.tables import Bools, Floats
@@ -63,6 +64,14 @@ class Model(NamedTuple):
     icrs: FrozenIcrs
 
 
+class ConstantModel(NamedTuple):
+    """A model of constant parameters, by the errors (k, h) [m] that it has in trials; NaN where it has none."""
+
+    name: str
+    label: str
+    errors_of: Callable[[Trials], Floats]
+
+
 ErrorSink = Callable[[str, Floats, Floats], None]
 """Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
 
@@ -76,6 +85,7 @@ def dropout(
     *,
     starts: Starts = "moving",
     models: Sequence[Model] | None = None,
+    further: Sequence[ConstantModel] = (),
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     watch: ReportWatch | None = None,
@@ -88,6 +98,7 @@ def dropout(
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
+    further : models of constant parameters, beside those
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
     watch : called with the report as it grows: before the first model, without any result, and after each
@@ -113,7 +124,7 @@ def dropout(
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else models_of(run)
+    predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)
     groups = _groups(len(horizons), len(run.table))
@@ -121,8 +132,8 @@ def dropout(
     reference: list[ReferenceErrors] = []
     before: list[Summary] = []
     after: list[Summary] = []
-    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
-    if len(parts) < len(models):
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in predictors}
+    if len(parts) < len(predictors):
         raise ValueError("two models have the same name")
 
     none = TrialCounts(*np.zeros((5, len(horizons)), np.int64))
@@ -153,11 +164,14 @@ def dropout(
             blocks = _blocks(drive, horizons[group], ends, pool)
             counts.append(count)
             reference.append(reference_error(run, drive, ends, seed))
-            for model in models:
-                errors = _errors(drive, model.icrs, ends, pool)
+            for model in predictors:
+                errors = _errors(drive, model, ends, pool)
+                tested = blocks
+                if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
+                    tested = _blocks(drive, horizons[group], np.where(np.isfinite(errors.T), ends, -1), pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
-                parts[model.name].append(_summarise(model, errors, blocks, seed, pool))
+                parts[model.name].append(_summarise(model, errors, tested, seed, pool))
                 if model.name == "icr":
                     before.append(summarise(errors[:learned]))
                     after.append(summarise(errors[learned:] if learned is not None else errors[:0]))
@@ -259,10 +273,13 @@ def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Execu
     return list(pool.map(cut, range(len(horizons))))
 
 
-def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states = ends.shape[1]
-    errors = np.empty(ends.shape)
+    if isinstance(model, ConstantModel):
+        found = model.errors_of(Trials(np.arange(states), ends.T.astype(np.int64)))
+        return np.ascontiguousarray(found.T).T
+    errors, icrs = np.empty(ends.shape), model.icrs
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_A_CALL, states)
@@ -272,7 +289,9 @@ def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Execu
     return errors.T
 
 
-def _summarise(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
+def _summarise(
+    model: Model | ConstantModel, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor
+) -> ModelResult:
     """Return the errors of one model in numbers, horizon by horizon."""
 
     def summarise(h: int) -> ModelResult:

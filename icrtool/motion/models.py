@@ -250,6 +250,24 @@ def track_geometry(
     )
 
 
+CONTROLLER = MotionModel(
+    "controller", "separation and radii alone", ("vx_v", "vx_w", "omega_w", "omega_v"),
+    "diff_drive_controller of ros2_controllers",
+)  # fmt: skip
+"""What a differential-drive controller can express; it follows from another model's geometry and is never fitted."""
+
+
+def controller_parameters(geometry: TrackGeometry) -> Floats:
+    """Return the parameters of `CONTROLLER` (4,) with the multiplier and radius factors of a geometry.
+
+    Notes
+    -----
+    v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b) with V_l = v + w b / 2, V_r = v - w b / 2.
+    """
+    left, right, m = geometry.radius_left, geometry.radius_right, geometry.multiplier
+    return np.array([(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m])
+
+
 def find_model(name: str) -> MotionModel:
     """Return a model by name, ``_gyro`` behind it for the one with a gyro.
 

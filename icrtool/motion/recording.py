@@ -50,6 +50,7 @@ class Recording:
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns the other way, and its sign was turned
+    begin_ns : stamp of the first state; 0 where it is not known
     """
 
     name: str
@@ -60,6 +61,7 @@ class Recording:
     path: str = ""
     sha256: str = ""
     gyro_reversed: bool = False
+    begin_ns: int = 0
 
     @property
     def held_s(self) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,10 @@ FILE_NAME = "calibration.json"
 def open_calibration(file: Path | str) -> Calibration:
     """Read a calibration file.
 
+    Parameters
+    ----------
+    file : what ``icrtool calibrate -o`` or `Calibration.write` wrote
+
     Raises
     ------
     RunError
@@ -25,7 +30,7 @@ def open_calibration(file: Path | str) -> Calibration:
     """
     path = Path(file)
     try:
-        return calibration_of(json.loads(path.read_bytes()))
+        return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:

@@ -38,6 +38,7 @@ KNOWS = {
     "icr": "the distance up to each start",
     "no_slip": "the track width",
     "icr_final": "all of the drive (in sample)",
+    "recommended": "the blocks of the drive that the trial does not touch",
 }
 """What the ICRs of a model were learned from."""
 
@@ -148,6 +149,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "trials": _count_documents(report),
         "reference_error": _reference_documents(report),
         "by_learning": _learned_document(report),
+        "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
+        "recommended": report.calibration.summary() if report.calibration is not None else None,
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
         "ladder": ladder_document(report.comparison)
@@ -201,7 +204,9 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
     shared = [name for name in columns if name != "model"]
     rows = [{name: columns[name][row] for name in shared} for row in mine]
-    return {"name": result.name, "label": result.label, "knows": KNOWS.get(result.name), "by_horizon": rows}
+    used = next((one for one in report.calibrations if one.name == result.name), None)
+    knows = used.fitted_text if used is not None else KNOWS.get(result.name)
+    return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows}
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:

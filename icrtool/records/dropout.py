@@ -127,6 +127,30 @@ class LearnedSplit(NamedTuple):
     after: Summary
 
 
+class UsedCalibration(NamedTuple):
+    """A calibration that a report has a row of.
+
+    Attributes
+    ----------
+    name, label : of its row
+    model : of the calibration
+    logs : how many it was fitted to; fitted_to_this : this log is among them
+    created : date and time, UTC
+    """
+
+    name: str
+    label: str
+    model: str
+    logs: int
+    fitted_to_this: bool
+    created: str
+
+    @property
+    def fitted_text(self) -> str:
+        """Whether this log was among those it was fitted to, in words."""
+        return "fitted to this log" if self.fitted_to_this else "not fitted to this log"
+
+
 class BudgetDistance(NamedTuple):
     """How far a model's 95th percentile stays within a budget.
 
@@ -135,6 +159,7 @@ class BudgetDistance(NamedTuple):
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : the error is within the budget at `distance_m`, the last horizon with trials
     between_m : horizons interpolated between
+    low_m, high_m : distances at which the interval of p95 leaves the budget; NaN where there is no interval
     """
 
     model: str
@@ -143,6 +168,8 @@ class BudgetDistance(NamedTuple):
     distance_m: float
     beyond: bool
     between_m: tuple[float, float]
+    low_m: float = math.nan
+    high_m: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,8 +38,10 @@ def format_dropout(report: DropoutReport) -> str:
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
     lines = [run_title(report.run_summary), f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}", ""]
+    if sentences := headline(report):
+        lines += [*wrap(" ".join(sentences), TABLE_WIDTH), ""]
     lines += _error_lines(report)
-    lines += [*_reference_lines(report), *_learned_lines(report)]
+    lines += [*_calibration_lines(report), *_reference_lines(report), *_learned_lines(report)]
     lines += ["", *_count_lines(report)]
     lines += [_turning_line(one) for one in report.by_turning]
     lines += [
@@ -76,6 +78,32 @@ def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> flo
     return value if np.isfinite(value) else None
 
 
+def headline(report: DropoutReport) -> list[str]:
+    """Return what is recommended: the model, how far it goes without GNSS, what a controller is given."""
+    calibration, reached = report.calibration, {one.model: one for one in reversed(report.budgets)}
+    if calibration is None or (best := reached.get("recommended")) is None:
+        return []
+    count, numbers = len(calibration.fitted.parameters), calibration.controller_numbers()
+    interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
+    without = f"; without slip model: {_reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    radii = f"left/right wheel radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
+    parameters = "one parameter" if count == 1 else f"{count} parameters"
+    model = f"{calibration.fitted.model.label} ({parameters}, model {calibration.recommended})"
+    return [
+        f"Recommended: {model}, tested on distance it was not fitted to.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {_reach_text(best)}{interval}{without}.",
+        f"Controller: wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}, {radii}.",
+    ]
+
+
+def _calibration_lines(report: DropoutReport) -> list[str]:
+    return [
+        f"{one.label}: {one.model} from {one.logs} {'log' if one.logs == 1 else 'logs'}, {one.created[:10]}, "
+        f"{one.fitted_text}"
+        for one in report.calibrations
+    ]
+
+
 def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     """Return a sentence a budget: how far each model stays within it."""
     if not budgets:
@@ -84,7 +112,7 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
         more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)}{more}")
+        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)} ({first.label}){more}")
     return lines
 
 
@@ -117,10 +145,13 @@ def _reach_text(one: BudgetDistance) -> str:
 def _error_lines(report: DropoutReport) -> list[str]:
     shown = shown_horizons(report)
     lines = [_row("distance without GNSS", [f"{report.horizons_m[h]:g} m" for h in shown])]
-    for result in report.results:
+    # what is recommended first; the paper's models follow
+    for result in sorted(report.results, key=lambda one: one.name != "recommended"):
         summary, intervals = result.summary, result.intervals
         lines.append(
-            _row(f"{result.label:<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown])
+            _row(
+                f"{_short(result.label):<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown]
+            )
         )
         spans = [_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown]
         lines.append(_row(f"{'':<{MODEL}}  interval", spans))
@@ -255,6 +286,11 @@ def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]
             f"{metres_text(usual) if usual is not None else '-':>18}"
         )
     return lines
+
+
+def _short(label: str) -> str:
+    """Return a label that fits into its column."""
+    return label if len(label) <= MODEL else f"{label[: MODEL - 1]}…"
 
 
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:

@@ -126,7 +126,16 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
     assert document["gates"][2]["value_m"] is None
     assert document["passed"] is False
     assert {outage["kind"] for outage in document["outages"]} == {"forced", "real"}
-    assert document["budgets"][0].keys() == {"model", "label", "budget_m", "distance_m", "beyond", "between_m"}
+    assert document["budgets"][0].keys() == {
+        "model",
+        "label",
+        "budget_m",
+        "distance_m",
+        "beyond",
+        "between_m",
+        "low_m",
+        "high_m",
+    }
 
 
 def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutReport) -> None:

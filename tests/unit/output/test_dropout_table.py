@@ -123,8 +123,8 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
         BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True, between_m=(20.0, 20.0)),
     ]
     assert budget_lines(budgets) == [
-        "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m (interpolated between 1 and 20 m)",
-        "stays within 9 m (95 %) for more than 20 m",
+        "stays within 0.5 m (95 %) for 7.3 m (ICR, momentary); no slip: 2.1 m (interpolated between 1 and 20 m)",
+        "stays within 9 m (95 %) for more than 20 m (ICR, momentary)",
     ]
 
 
