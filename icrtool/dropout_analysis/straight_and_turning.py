@@ -54,7 +54,9 @@ def split_by_turning(
 def heading_range(drive: Drive, horizon_m: float) -> Floats:
     """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
     size = horizon_m / CELLS
-    cell = ((drive.distance - drive.distance[0]) / size).astype(np.int64)
+    # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
+    steps = np.diff(np.floor((drive.distance - drive.distance[0]) / size), prepend=0.0)
+    cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
     first = np.flatnonzero(np.diff(cell, prepend=-1))
     cells = np.arange(cell[-1] + CELLS + 1)
     # In a cell without a state the heading lies between those around it.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Complexes, Floats, Ints
@@ -118,12 +119,11 @@ def cut_windows(
         There are fewer than `FEWEST_WINDOWS`.
     """
     drive = recording.drive
-    total = float(drive.distance[-1])
     place = drive.north + 1j * drive.east
     together = pooled or (recording,)
     pooled_m = sum(float(one.drive.distance[-1]) for one in together)
     every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
-    begins = np.unique(np.searchsorted(drive.distance, np.arange(0.0, total, every)))
+    begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
     ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
     row, column = np.nonzero(ends.T >= 0)[::-1]

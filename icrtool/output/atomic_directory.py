@@ -98,7 +98,8 @@ def atomic_directory(
     partial: Path | None = None
     try:
         place = _resolved(directory)
-        made = _make_parents(place)
+        made = [parent for parent in place.parents if not parent.exists()][::-1]
+        _make_parents(place, made)
         for left in _hidden(place):
             _clean(left, place, names)
         partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
@@ -240,13 +241,11 @@ def _check_parent(directory: Path) -> None:
             return
 
 
-def _make_parents(place: Path) -> list[Path]:
-    """Make the missing parents of `place`; return those made, outermost first."""
-    missing = [parent for parent in place.parents if not parent.exists()]
+def _make_parents(place: Path, missing: Collection[Path]) -> None:
+    """Make the missing parents of `place`."""
     place.parent.mkdir(parents=True, exist_ok=True)
     for parent in missing:
         disk.sync(parent.parent)
-    return missing[::-1]
 
 
 def _listed(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:

@@ -119,6 +119,7 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
         "ladder.csv",
         "worst.csv",
         "report.json",
+        ".icrtool-files",
     }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])
