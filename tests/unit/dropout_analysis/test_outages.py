@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from icrtool.config import load_config
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
-from icrtool.kernels.filter_records import GATED, RECOVERED
+from icrtool.kernels.filter_records import GATED, RECOVERED, USED
+from icrtool.logs import read_log
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, drive_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate
 from support.matrix_filter import step_state
@@ -202,3 +205,20 @@ def test_an_outage_lasts_until_a_fix_is_used_again_and_its_error_is_that_of_the_
     first, fix = np.searchsorted(moved.table.stamp_ns, end), np.searchsorted(stamps, end)
     assert not drive.in_outage[first]
     assert abs(drive.north[first] - moved.sensors.fixes.north_m[fix]) < 0.1
+
+
+def test_the_end_error_of_a_real_outage_is_near_the_truth(shared_logs: Path) -> None:
+    log = shared_logs / "simulated" / "tracked_trouble"
+    config = load_config(robot="jackal")
+    run = fit(read_log(log, config), config)
+    outage = max(real_outages(run), key=lambda one: one.end_s - one.begin_s)
+    truth = np.load(log.with_name(f"{log.name}.truth.npz"))
+    # Fixes and truth have the same axes; the datum is where they differ.
+    fixes, seconds = run.sensors.fixes, (run.sensors.fixes.stamp_ns - run.table.stamp_ns[0]) / 1e9
+    before = (run.gnss.code == USED) & (seconds < outage.begin_s)
+    off = []
+    for name, measured, path in (("z_north", fixes.north_m, outage.north_m), ("z_east", fixes.east_m, outage.east_m)):
+        datum = np.median(measured[before] - np.interp(seconds[before], truth["t"], truth[name]))
+        off.append(path[-1] - datum - np.interp(outage.end_s, truth["t"], truth[name]))
+    assert np.hypot(*off) > 0.5
+    assert outage.end_error_m == pytest.approx(np.hypot(*off), rel=0.05)
