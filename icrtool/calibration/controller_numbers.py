@@ -181,7 +181,8 @@ def _scales(run: Run, fit: WindowFit) -> tuple[tuple[float, float], tuple[float,
 
 def _doubts(run: Run, fit: WindowFit, width: float) -> tuple[str, ...]:
     """Return what to know before pasting."""
-    doubts = list(find_excitation(run.table, drive_of(run), run.track_width_m).sentences)
+    doubts = [] if run.usable else [f"not usable: {run.summary['unusable_because']}"]
+    doubts += find_excitation(run.table, drive_of(run), run.track_width_m).sentences
     multiplier = float(fit.terms[0]) / width
     if multiplier < 1.0:
         doubts.append(

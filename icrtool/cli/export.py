@@ -18,7 +18,8 @@ TARGETS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json")
 @click.command("export")
 @click.argument("run", metavar="[RUN]", required=False, type=click.Path(path_type=Path))
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the text is for.")
-def command(run: Path | None, target: str) -> None:
+@click.option("--force", is_flag=True, help="Also of a run whose ICRs are not usable; the text then says so.")
+def command(run: Path | None, target: str, force: bool) -> None:
     """Print a run's calibration, ready to paste into a robot's controller or filter.
 
     RUN is a directory that `icrtool fit` wrote; without it, the newest below icrtool-runs/. The multipliers are fitted
@@ -30,8 +31,12 @@ def command(run: Path | None, target: str) -> None:
       icrtool export --for json > calibration.json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.controller_numbers import export_numbers
+    from icrtool.errors import DataError
     from icrtool.output.exports.controllers import format_export
     from icrtool.output.stored_run import newest_run, open_run
 
-    numbers = export_numbers(open_run(run if run is not None else newest_run(RUNS)))
-    click.echo(format_export(numbers, cast("Target", target)))
+    opened = open_run(run if run is not None else newest_run(RUNS))
+    if not (opened.usable or force):
+        why = f"its ICRs are not usable: {opened.summary['unusable_because']}"
+        raise DataError(opened.name, why, "drive again, with turns to both sides; --force exports it all the same")
+    click.echo(format_export(export_numbers(opened), cast("Target", target)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.tables.model_comparison import format_ladder
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title
+from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title, unusable_lines
 from icrtool.records.dropout import BudgetDistance, ModelResult, Outage, TurningSplit
 
 LABEL = 26
@@ -32,6 +32,7 @@ def format_dropout(report: DropoutReport) -> str:
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     lines = [
+        *unusable_lines(report.run_summary),
         run_title(report.run_summary),
         f"without GNSS, wheel speeds only, from each of {report.states:,} states; {driven}{reference}",
         "",
