@@ -13,7 +13,6 @@ from icrtool.estimation.filter_setup import (
     FilterSetup,
     ProcessNoise,
     check_start,
-    configured_noise,
     set_up_filter,
     wheel_gap_s,
 )

@@ -59,14 +59,13 @@ def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
 
 
 def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path) -> None:
-    import json
-    import shutil
+    from dataclasses import replace
 
-    place = runs / "unusable"
-    shutil.copytree(runs / "icrtool-runs" / "mower", place)
-    document = json.loads((place / "run.json").read_text())
-    document |= {"usable": False, "unusable_because": "42 % of the headings rejected"}
-    (place / "run.json").write_text(json.dumps(document))
+    from icrtool.output.stored_run import open_run
+
+    run = open_run(runs / "icrtool-runs" / "mower")
+    spoilt = {"usable": False, "unusable_because": "42 % of the headings rejected"}
+    replace(run, summary=run.summary | spoilt).write(runs / "unusable", plots=())
     status, out, err = icrtool("export", "--for", "clearpath", "unusable")
     assert (status, out) == (1, "")
     assert "42 % of the headings rejected" in err
