@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import stat
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -14,11 +15,23 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from icrtool.errors import ConfigError
+from icrtool.records.text import LONGEST_NAME, shortened
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+LARGEST_FILE_BYTES = 1 << 20
+MOST_LISTED = 1000
+"""Horizons, or outages."""
+
+Horizon = Annotated[float, msgspec.Meta(ge=0.001, le=1e5)]
+Duration = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+Std = Annotated[float, msgspec.Meta(gt=0, le=1e4)]
+Noise = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+Place = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+Delay = Annotated[float, msgspec.Meta(ge=-100, le=100)]
+Degrees = Annotated[float, msgspec.Meta(ge=-720, le=720)]
+Scale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Width = Annotated[float, msgspec.Meta(gt=0, le=20)]
 Radius = Annotated[float, msgspec.Meta(gt=0, le=5)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
 Longitude = Annotated[float, msgspec.Meta(ge=-180, le=360)]
@@ -65,8 +78,8 @@ class WheelsConfig:
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
     twist_width_m: Width | None = None
-    left_scale: Literal["auto"] | float = "auto"
-    right_scale: Literal["auto"] | float = "auto"
+    left_scale: Literal["auto"] | Scale = "auto"
+    right_scale: Literal["auto"] | Scale = "auto"
 
     def __post_init__(self) -> None:
         for key in ("left_scale", "right_scale"):
@@ -84,11 +97,11 @@ class FramesConfig:
     """
 
     heading: Literal["auto", "enu", "ned"] = "auto"
-    heading_offset_deg: Literal["auto"] | float = "auto"
-    reference_delay_s: Literal["auto"] | float = "auto"
-    heading_delay_s: Literal["auto"] | float = "auto"
-    antenna_forward_m: Literal["auto"] | float = "auto"
-    antenna_right_m: Literal["auto"] | float = "auto"
+    heading_offset_deg: Literal["auto"] | Degrees = "auto"
+    reference_delay_s: Literal["auto"] | Delay = "auto"
+    heading_delay_s: Literal["auto"] | Delay = "auto"
+    antenna_forward_m: Literal["auto"] | Place = "auto"
+    antenna_right_m: Literal["auto"] | Place = "auto"
     datum: tuple[Latitude, Longitude] | None = None
 
 
@@ -106,31 +119,34 @@ class FilterConfig:
     """
 
     preset: Literal["field", "paper"] = "field"
-    initial_y_icr_right_m: float | None = None
-    initial_y_icr_left_m: float | None = None
-    initial_x_icr_m: float | None = None
-    initial_icr_std_m: Positive | None = None
-    process_position_mps: Literal["auto"] | NotNegative = "auto"
-    process_heading_degps: NotNegative | None = None
-    process_icr_mps: NotNegative = 0.01
-    terrain_icr_std_m: Positive | None = None
-    gnss_std_m: Positive = 0.01
-    gnss_std_floor_m: Positive = 0.01
-    heading_std_deg: Positive = 1.0
-    heading_std_floor_deg: Positive = 0.5
-    heading_correlation_s: NotNegative = 0.5
+    initial_y_icr_right_m: Place | None = None
+    initial_y_icr_left_m: Place | None = None
+    initial_x_icr_m: Place | None = None
+    initial_icr_std_m: Std | None = None
+    process_position_mps: Literal["auto"] | Noise = "auto"
+    process_heading_degps: Noise | None = None
+    process_icr_mps: Noise = 0.01
+    terrain_icr_std_m: Std | None = None
+    gnss_std_m: Std = 0.01
+    gnss_std_floor_m: Std = 0.01
+    heading_std_deg: Std = 1.0
+    heading_std_floor_deg: Std = 0.5
+    heading_correlation_s: Noise = 0.5
     gate_probability: Probability = 0.9999
-    wheel_gap_s: Positive = 0.5
+    wheel_gap_s: Duration = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class DropoutConfig:
     """The analysis of Section 6.4."""
 
-    horizons_m: tuple[Positive, ...] = tuple(float(d) for d in range(1, 21))
-    forced_outage_s: tuple[Positive, ...] = ()
+    horizons_m: tuple[Horizon, ...] = tuple(float(d) for d in range(1, 21))
+    forced_outage_s: tuple[Duration, ...] = ()
 
     def __post_init__(self) -> None:
+        for key in ("horizons_m", "forced_outage_s"):
+            if (count := len(getattr(self, key))) > MOST_LISTED:
+                raise ValueError(f"{key}: {count} numbers; at most {MOST_LISTED} are analysed")
         if not self.horizons_m:
             raise ValueError("horizons_m: is empty; give one distance or more")
         if len(set(self.horizons_m)) != len(self.horizons_m):
@@ -186,13 +202,13 @@ def parse_config(document: Mapping[str, Any]) -> Config:
         if name not in SECTIONS:
             raise ConfigError(name, "unknown configuration key", f"the sections are {', '.join(SECTIONS)}")
         if not isinstance(values, Mapping):
-            raise ConfigError(name, "this is a section of the configuration", f"found {_as_toml(values)}")
+            raise ConfigError(name, "this is a section of the configuration", _found(values))
         known = [key.name for key in fields(SECTIONS[name])]
         for key, value in values.items():
             if key not in known:
                 raise ConfigError(f"{name}.{key}", "unknown configuration key", f"[{name}] knows {', '.join(known)}")
             if flaw := _flaw(value):
-                raise ConfigError(f"{name}.{key}", flaw, f"found {_as_toml(value)}")
+                raise ConfigError(f"{name}.{key}", flaw, _found(value))
         sections[name] = _parse_section(name, values)
         given += [f"{name}.{key}" for key in values]
     return Config(**sections, given=frozenset(given))
@@ -246,7 +262,15 @@ def _builtin_robot(name: str) -> dict[str, Any]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            # A pipe would be waited for, and a device may have no end.
+            raise ConfigError(path, "not a file", "a configuration is a TOML file")
+        if status.st_size > LARGEST_FILE_BYTES:
+            raise ConfigError(path, f"{status.st_size} bytes long", f"a configuration has at most {LARGEST_FILE_BYTES}")
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except RecursionError as err:
+        raise ConfigError(path, "not a configuration", "its values are nested too deeply") from err
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:  # no UTF-8, no TOML, or an integer longer than Python reads
@@ -264,13 +288,22 @@ def _parse_set(text: str) -> dict[str, Any]:
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
+    except RecursionError as err:
+        raise ConfigError(key.strip(), "its value is nested too deeply") from err
     except ValueError:
         parsed = value.strip()
     return {section: {name: parsed}}
 
 
+def _found(value: object) -> str:
+    """Return a value for a message: as it was written, and not too long."""
+    return f"found {shortened(_as_toml(value), LONGEST_NAME)}"
+
+
 def _as_toml(value: object) -> str:
     """Return a value nearly as it was written: with TOML's words for true and false."""
+    if isinstance(value, list | tuple) and len(value) > LONGEST_NAME:
+        return f"{len(value)} values"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_as_toml, value))}]"
     return str(value).lower() if isinstance(value, bool) else repr(value)
@@ -301,7 +334,7 @@ def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
             why, _, advice = message.partition("; ")
             raise ConfigError(f"{name}.{key}", why, advice) from err
         expected = _described(get_type_hints(SECTIONS[name], include_extras=True)[key])
-        raise ConfigError(f"{name}.{key}", f"expected {expected}", f"found {_as_toml(values[key])}") from err
+        raise ConfigError(f"{name}.{key}", f"expected {expected}", _found(values[key])) from err
 
 
 def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it

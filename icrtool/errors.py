@@ -1,12 +1,15 @@
 """Every error raised on purpose. One root; each leaf builds its one line from its fields.
 
-The line reads ``<what>: <what is wrong>; <what was found, or what to do>``.
+The line reads ``<what>: <what is wrong>; <what was found, or what to do>``. It is escaped and bounded in length,
+because its parts may come from a log.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
 
 
 class IcrToolError(Exception):
@@ -17,8 +20,7 @@ class IcrToolError(Exception):
         self.why = why
         self.advice = advice
         text = f"{what}: {why}; {advice}" if advice else f"{what}: {why}"
-        # Names come from logs: whatever they hold, an error is one line that a terminal can show.
-        super().__init__("".join(letter if letter.isprintable() else "?" for letter in text))
+        super().__init__(shortened(escaped(text), LONGEST_MESSAGE))
 
 
 class ConfigError(IcrToolError):

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "icrtool"
 
 LAYERS = (
     ("cli",),
+    ("fleet",),
     ("output",),
     ("dropout_analysis", "simulation"),
     ("calibration",),

@@ -7,14 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from icrtool.alignment.corrections import align_streams, start_icrs
 from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
-from icrtool.alignment.heading_alignment import HeadingCheck, check_heading
+from icrtool.alignment.heading_alignment import HeadingCheck
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
+from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.stream_delays import StreamDelays, measure_delays
-from icrtool.alignment.wheel_alignment import WheelCheck, check_wheels
+from icrtool.alignment.stream_delays import StreamDelays
+from icrtool.alignment.wheel_alignment import WheelCheck
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
+from icrtool.records.run import half_width_m
 from icrtool.records.tables import PositionFixes, RobotLog
 
 
@@ -36,36 +40,41 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
-    check_streams(log)
-    wheels = check_wheels(log, config)
-    heading = check_heading(wheels.log, config, wheels.course)
-    delays = measure_delays(wheels.log, config, heading)
-    quality = judge_fixes(delays.log, config, heading)
+    log = with_wheel_speeds(log, config)
+    found = align_streams(log, config)
+    wheels, heading, delays = found.wheels, found.heading, found.delays
+    quality = judge_fixes(found.log, config, heading)
     aligned = sensors_as_sent(quality.log, config)
-    return Measurements(
-        sensors=replace(
-            aligned,
-            fixes=replace(
-                aligned.fixes,
-                fix_class=quality.fix_class,
-                misreported=quality.sold,
-                down_weighted=quality.down_weighted,
-            ),
-            headings=replace(
-                aligned.headings,
-                heading_rad=(-1.0 if heading.applied_mirror else 1.0) * aligned.headings.heading_rad
-                - heading.applied_offset_rad,
-                var_rad2=heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
-            ),
-            heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
-            losses_ns=quality.losses_ns,
+    sensors = replace(
+        aligned,
+        fixes=replace(
+            aligned.fixes,
+            fix_class=quality.fix_class,
+            misreported=quality.sold,
+            down_weighted=quality.down_weighted,
         ),
-        findings=_findings(wheels, heading, delays),
+        headings=replace(
+            aligned.headings,
+            heading_rad=(-1.0 if heading.applied_mirror else 1.0) * aligned.headings.heading_rad
+            - heading.applied_offset_rad,
+            var_rad2=heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
+        ),
+        heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
+        losses_ns=quality.losses_ns,
+        icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
+    )
+    # preset paper believes its wheels
+    if config.filter.preset == "field":
+        sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
+    return Measurements(
+        sensors=sensors,
+        findings=_findings(wheels, heading, delays) | found.robot_findings(),
         sections={
             "wheels": wheels.summary(),
-            "heading": heading.summary() | delays.heading_summary(),
+            "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
             "gnss": delays.gnss_summary(),
         },
+        streams=found.log.streams,
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",

@@ -135,29 +135,6 @@ def _windows(travelled: Floats, stamps: Ints, length: float) -> tuple[Ints, Ints
     return begin[quick], end[quick]
 
 
-def offset_at_no_curvature(angle: Floats, curvature: Floats) -> tuple[float, float, float]:
-    """Fit angle = offset + slope * curvature, robustly; return offset, its standard deviation, and the scatter [rad].
-
-    Notes
-    -----
-    Iteratively reweighted least squares with Huber's weights (Huber 1964) about the circular mean.
-    """
-    centre = float(np.angle(np.exp(1j * angle).mean()))
-    residual = np.angle(np.exp(1j * (angle - centre)))
-    design = np.column_stack([np.ones(len(residual)), curvature])
-    weight, scatter, information, solution = np.ones(len(residual)), 0.0, np.eye(2), np.zeros(2)
-    for _ in range(20):
-        weighted = design * weight[:, None]
-        # A circle has one curvature only: the ridge then leaves the slope at zero, and its doubt in the offset.
-        information = design.T @ weighted + np.diag([0.0, 1e-6])
-        solution = np.linalg.solve(information, weighted.T @ residual)
-        left = residual - design @ solution
-        scatter = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        weight = np.minimum(1.0, 1.5 * scatter / np.maximum(np.abs(left), 1e-12))
-    sigma = scatter * math.sqrt(float(np.linalg.inv(information)[0, 0]))
-    return math.remainder(centre + float(solution[0]), 2 * math.pi), sigma, scatter
-
-
 def known_intervals(wheels: WheelSamples) -> Floats:
     """Return the seconds between wheel samples (n - 1,), none through a gap."""
     return unbroken(np.diff(wheels.stamp_ns) / 1e9)

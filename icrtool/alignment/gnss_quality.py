@@ -18,7 +18,7 @@ from icrtool.config import Config
 from icrtool.records.tables import (
     FIXED_FIX,
     FLOAT_FIX,
-    NOT_TOLD,
+    NOT_STATED,
     OTHER_FIX,
     RTK_FIX,
     Bools,
@@ -125,18 +125,18 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none
-    told = _told(gnss.told_class, stated)
-    said = none if gnss.told_class is None else gnss.told_class == FIXED_FIX
+    told = _told(gnss.stated_class, stated)
+    said = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
     sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
     return np.where(sold, FLOAT_FIX, told).astype(np.uint8), sold
 
 
 def _told(told: Bytes | None, stated: Floats) -> Bytes:
     """Return the class of each fix by what its message says: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
-    told = np.full(len(stated), NOT_TOLD, np.uint8) if told is None else told
+    told = np.full(len(stated), NOT_STATED, np.uint8) if told is None else told
     rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
     silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
-    kinds: Bytes = np.select([told == RTK_FIX, told == NOT_TOLD], [rtk, silent], told).astype(np.uint8)
+    kinds: Bytes = np.select([told == RTK_FIX, told == NOT_STATED], [rtk, silent], told).astype(np.uint8)
     return kinds
 
 

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.held_out_fits import clear_of
-from icrtool.calibration.model_comparison import count_blocks
+from icrtool.calibration.held_out import Fold, mask_windows, plan_folds
+from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.record import FittedModel
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.observability import find_excitation
-from icrtool.kernels.window_errors import displace, move
-from icrtool.motion.window_fit import WindowFit, Windows, cut_windows, fit_windows
-from icrtool.motion.window_models import EXTENDED, WindowModel
+from icrtool.motion.fit import Pool, PooledFit
+from icrtool.motion.models import MODELS, MotionModel, TypicalDrive
+from icrtool.motion.recording import Recording, cut_windows
+from icrtool.motion.trials import twist_rates
 from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
 
-CONTROLLER = WindowModel("controller", "what a controller can be told", ("separation", "scale", "scale_difference"))
+CONTROLLER = MotionModel(
+    "controller", "what a controller knows", ("vx_v", "omega_w", "omega_v"), "diff_drive_controller of ros2_controllers"
+)
 """Such a controller knows one separation and a radius a side; ICRs ahead of the axle and off centre it does not."""
 
-SCALED = EXTENDED[0]
-"""ICRs and scales: what the controller cannot be told is told beside."""
+SCALED = MODELS["five"]
+"""ICRs and scales: what the controller does not know stands beside."""
+
+FEWEST_RESIDUALS = 20
 
 POSE_AFTER_M = 10.0
 TWIST_OVER_M = 1.0
@@ -58,8 +64,8 @@ class ExportNumbers:
     left_radius_multiplier_std: float
     right_radius_multiplier: float
     right_radius_multiplier_std: float
-    icrs_m: tuple[float, float, float]
-    icr_std_m: tuple[float, float, float]
+    icrs_m: tuple[float, ...]
+    icr_std_m: tuple[float, ...]
     pose_variance: tuple[float, float, float]
     twist_variance: tuple[float, float, float]
     turn_noise: tuple[float, float]
@@ -87,12 +93,18 @@ def export_numbers(run: Run) -> ExportNumbers:
         raise ConfigError(
             "robot.track_width_m", f"not known to run {run.name}", "fit the log again with it: a multiplier is of it"
         )
-    long, short = cut_windows(run, (POSE_AFTER_M,)), cut_windows(run, (TWIST_OVER_M,))
-    fitted = cut_windows(run)
-    controller, plain = fit_windows(fitted, CONTROLLER), fit_windows(fitted, SCALED)
-    held_out = _held_out_fits(run, fitted)
-    far, near = _misses(run, long, held_out), _misses(run, short, held_out)
-    multiplier_std = float(np.sqrt(controller.covariance[0, 0])) / width
+    recording = recording_of(run)
+    windows, folds = cut_windows(recording), plan_folds([recording])
+    pool = Pool([windows], [width], CONTROLLER)
+    fitted = pool.fit()
+    controller, plain = _geometry(fitted, width), _geometry(Pool([windows], [width], SCALED).fit(), width)
+    held_out = []
+    for fold, kept in zip(folds, mask_windows([windows], folds)[0], strict=True):
+        if np.count_nonzero(kept) < FEWEST_RESIDUALS:
+            why = f"{run.table.distance_m[-1]:.1f} m of driven distance"
+            raise DataError(run.name, why, "too short to fit on one part and test on another")
+        held_out.append((fold, pool.fit(kept)))
+    far, near = (_misses(recording, length, held_out) for length in (POSE_AFTER_M, TWIST_OVER_M))
     scales, scale_stds = _scales(run, controller)
     config = run.summary["config"]["robot"]
     return ExportNumbers(
@@ -102,52 +114,52 @@ def export_numbers(run: Run) -> ExportNumbers:
         robot=config["name"],
         track_width_m=width,
         wheel_radius_m=config["wheel_radius_m"],
-        separation_multiplier=float(controller.terms[0]) / width,
-        separation_multiplier_std=multiplier_std,
+        separation_multiplier=controller.value[3],
+        separation_multiplier_std=controller.std[3],
         left_radius_multiplier=scales[0],
         left_radius_multiplier_std=scale_stds[0],
         right_radius_multiplier=scales[1],
         right_radius_multiplier_std=scale_stds[1],
-        icrs_m=plain.icrs_m,
-        icr_std_m=plain.icr_std_m,
+        icrs_m=plain.value[:3],
+        icr_std_m=plain.std[:3],
         pose_variance=_variances(far[:, :3]),
         twist_variance=_variances(near[:, :3] / near[:, 3:4]),
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
         p95_m=float(np.percentile(np.hypot(far[:, 0], far[:, 1]), 95)),
-        doubts=_doubts(run, controller, width),
+        doubts=_doubts(run, controller.value[3]),
     )
 
 
-def _held_out_fits(run: Run, windows: Windows) -> list[tuple[float, float, WindowFit]]:
-    """Return, for each block of way, its borders [m] and the controller's fit without it."""
-    total = float(run.table.distance_m[-1])
-    edges = np.linspace(0.0, total, count_blocks(total) + 1)
-    fits = []
-    for block in range(len(edges) - 1):
-        kept = clear_of(windows, edges[1:-1], block)
-        if np.count_nonzero(kept) < 10:
-            raise DataError(run.name, f"{total:.1f} m of way", "too short to fit on one part and judge on another")
-        last = edges[block + 1] if block < len(edges) - 2 else math.inf
-        fits.append((float(edges[block]), float(last), fit_windows(windows.keep(kept), CONTROLLER)))
-    return fits
+class _Geometry(NamedTuple):
+    """ICRs, multipliers and radius factors, in the order of `TrackGeometry`, and one standard deviation of each."""
+
+    value: tuple[float, ...]
+    std: tuple[float, ...]
 
 
-def _misses(run: Run, windows: Windows, fits: list[tuple[float, float, WindowFit]]) -> Floats:
-    """Return (m, 6): miss along, across [m] and in heading [rad], duration [s], turn [rad], way [m] of each window."""
-    rows = []
-    heading = np.interp(windows.knot_t, run.table.t_s, run.table.heading_rad)
-    for begin, last, fit in fits:
-        mine = windows.keep((windows.start_m >= begin) & (windows.end_m <= last))
-        motion = move(mine.t, mine.dt, mine.v_left, mine.v_right, fit.parameters[:7], mine.knot_t)
-        d, _, _ = displace(motion, mine.start, mine.end)
-        miss, turn = d - mine.reference, heading[mine.end] - heading[mine.start]
-        turned = motion.theta[mine.end] - motion.theta[mine.start] - turn
-        duration = mine.knot_t[mine.end] - mine.knot_t[mine.start]
-        rows.append(np.column_stack([miss.real, miss.imag, turned, duration, turn, mine.length_m]))
+def _geometry(fit: PooledFit, width_m: float) -> _Geometry:
+    found, covariance = FittedModel(fit.model, fit.parameters, fit.covariance).geometry(width_m, TypicalDrive())
+    return _Geometry(tuple(found), tuple(np.sqrt(np.diag(covariance)).tolist()))
+
+
+def _misses(recording: Recording, length_m: float, fits: Sequence[tuple[Fold, PooledFit]]) -> Floats:
+    """Return (m, 6): miss along, across [m] and in heading [rad], duration [s], turn [rad], distance [m] of windows."""
+    windows, t, held = cut_windows(recording, (length_m,)), recording.t_s, recording.held_s
+    row, rows = np.searchsorted(t, windows.knot_t), []
+    for fold, fit in fits:
+        mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
+        s, e = row[windows.start[mine]], row[windows.end[mine]]
+        v_x, v_y, omega = twist_rates(recording, fit.model, fit.parameters)
+        theta = np.concatenate([[0.0], np.cumsum(held * omega)[:-1]])
+        place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * theta))[:-1]])
+        miss = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
+        turn = recording.drive.heading[e] - recording.drive.heading[s]
+        turned = theta[e] - theta[s] - turn
+        rows.append(np.column_stack([miss.real, miss.imag, turned, t[e] - t[s], turn, np.full(len(s), length_m)]))
     found = np.concatenate(rows)
     if len(found) < 10:
-        raise DataError(run.name, f"{len(found)} windows held out", "error growth needs a longer drive")
+        raise DataError(recording.name, f"{len(found)} windows held out", "error growth needs a longer drive")
     return found
 
 
@@ -165,25 +177,20 @@ def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     return max(float(shares[0]), SMALLEST_VARIANCE), max(float(shares[1]), SMALLEST_VARIANCE)
 
 
-def _scales(run: Run, fit: WindowFit) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return radius multipliers of left and right, what the run had applied included, and their deviations."""
+def _scales(run: Run, controller: _Geometry) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return radius multipliers of left and right, configured scales included, and their deviations."""
     config: dict[str, Any] = run.summary["config"]["wheels"]
-    applied = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
-    factors = [
-        applied * (1.0 if config[key] == "auto" else float(config[key])) for key in ("left_scale", "right_scale")
-    ]
-    deviations = np.sqrt(np.diag(fit.parameter_covariance)[3:5])
+    left, right = (1.0 if config[key] == "auto" else float(config[key]) for key in ("left_scale", "right_scale"))
     return (
-        (factors[0] * float(fit.parameters[3]), factors[1] * float(fit.parameters[4])),
-        (factors[0] * float(deviations[0]), factors[1] * float(deviations[1])),
+        (left * controller.value[5], right * controller.value[6]),
+        (left * controller.std[5], right * controller.std[6]),
     )
 
 
-def _doubts(run: Run, fit: WindowFit, width: float) -> tuple[str, ...]:
+def _doubts(run: Run, multiplier: float) -> tuple[str, ...]:
     """Return what to know before pasting."""
     doubts = [] if run.usable else [f"not usable: {run.summary['unusable_because']}"]
     doubts += find_excitation(run.table, drive_of(run), run.track_width_m).sentences
-    multiplier = float(fit.terms[0]) / width
     if multiplier < 1.0:
         doubts.append(
             f"a multiplier of {multiplier:.2f} is below 1: a skid-steer robot turns less than its wheels, not more"

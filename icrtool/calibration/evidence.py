@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.heading_alignment import check_heading
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import wheel_gap_s
@@ -37,7 +36,7 @@ class Evidence(NamedTuple):
     Attributes
     ----------
     wheel_t, wheel_dt, v_left, v_right : (n,) wheel samples, `wheel_dt` 0 over gaps
-    heading_t, heading : (h,) smoothed, unwrapped [rad], turned over where it was mirrored
+    heading_t, heading : (h,) smoothed, unwrapped [rad]
     fix_t, fix : (m,) [s], complex north + j east [m]
     begin, end : (w,) rows of the fixes; long : (w,) 1 for long windows
     way_m : (w,) way of the faster measure up to the window's start
@@ -112,8 +111,7 @@ def gather(log: RobotLog, config: Config) -> Evidence:
             f"only {np.count_nonzero(kinds == 0)} windows of {length:.1f} m of way",
             "drive longer to calibrate",
         )
-    mirrored = -1.0 if check_heading(log, config).applied_mirror else 1.0
-    heading = _smoothed(np.unwrap(mirrored * log.heading.heading_rad), heading_t)
+    heading = _smoothed(np.unwrap(log.heading.heading_rad), heading_t)
     return Evidence(
         wheel_t, dt, log.wheels.v_left_mps, log.wheels.v_right_mps, heading_t, heading,
         fix_t, log.gnss.north_m + 1j * log.gnss.east_m, begin, end, kinds, at_fix[begin],

@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.wheel_alignment import check_wheels
+from icrtool.alignment.corrections import align_streams
 from icrtool.calibration.calibrate import NAMES, PRIOR_STD, Estimate, WindowMisses, estimate
 from icrtool.calibration.evidence import DriveFacts
 from icrtool.config import Config
@@ -162,9 +161,9 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
         Too little way, or streams that cannot be used together.
     """
     config = config if config is not None else Config()
-    check_streams(log)
-    checked = check_wheels(log, config)
-    found = estimate(checked.log, config)
+    aligned = align_streams(log, config)
+    checked = aligned.wheels
+    found = estimate(aligned.as_named, config)
     found = replace(found, values=found.values * np.where(np.isin(NAMES, SCALES), checked.applied_scale, 1.0))
     direct = tuple(_judge(found, name) for name in NAMES)
     derived = _derive(found, direct, _known_antenna(log, config), x_icr_m)

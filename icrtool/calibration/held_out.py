@@ -20,7 +20,7 @@ from icrtool.kernels.trials import Summary
 from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import MODELS, MotionModel
 from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.motion.trials import Trials, cut_trials, trial_errors, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Bools, Floats
 
@@ -30,8 +30,14 @@ SHORTEST_BLOCK_M, MOST_BLOCKS = 25.0, 5
 
 FEWEST_RESIDUALS = 20
 
+LONGEST_DELAY_S = 1.0
+"""States kept beside a block, for wheels that are read later or earlier."""
+
 FEWEST_TO_CHOOSE = 3
 """With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
+
+UNCHOSEN = "icr"
+"""The paper's model stands where there are too few folds to choose."""
 
 BASELINE = "multiplier"
 """What is worse than this one is never recommended."""
@@ -180,19 +186,16 @@ class _Tester:
     """What all models are fitted to and tested by."""
 
     def __init__(self, recordings: Sequence[Recording], folds: Sequence[Fold], horizons_m: Sequence[float]) -> None:
-        self._recordings, self._folds = recordings, folds
-        self._windows = [cut_windows(one) for one in recordings]
+        self._folds = folds
+        self._windows = [cut_windows(one, pooled=recordings) for one in recordings]
         self._widths = [one.width_m for one in recordings]
-        self._clear, self._inside = _masks(self._windows, folds)
+        self._clear, self._inside = mask_windows(self._windows, folds)
         for fold, kept in zip(folds, self._clear, strict=True):
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
         trials = [cut_trials(one, horizons_m) for one in recordings]
-        self._trials = [
-            trials[fold.recording].within(recordings[fold.recording].drive.distance, fold.begin_m, fold.end_m)
-            for fold in folds
-        ]
+        self._tested = [_within(recordings[fold.recording], trials[fold.recording], fold) for fold in folds]
 
     def test(self, model: MotionModel, wheels: _Tested | None = None) -> _Tested:
         """Fit and test a model; one with a gyro weighs the turn rates of the same fits for wheels alone."""
@@ -205,12 +208,27 @@ class _Tester:
             fit = pool.fit(self._clear[f], pool.without(whole, ~self._clear[f]))
             fits.append(fit)
             errors.append(self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f]))
-            inner[f, f] = _window_error(fit.residuals[self._inside[f]])
+            inner[f, f] = self._window_error(fit, f, fit.solution.x)
             for g in range(count):
                 if g != f and count >= FEWEST_TO_CHOOSE:
-                    x, rows = pool.without(fit, ~self._clear[g]), self._inside[g]
-                    inner[f, g] = _window_error(fit.residuals[rows] + fit.jacobian[rows] @ (x - fit.solution.x))
+                    inner[f, g] = self._window_error(fit, g, pool.without(fit, ~self._clear[g]))
         return _Tested(model, whole, fits, errors, inner)
+
+    def _window_error(self, fit: PooledFit, f: int, x: Floats) -> float:
+        """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit.
+
+        Notes
+        -----
+        Without the recording's heading offset: trials start with the heading of the reference as it is.
+        """
+        rows, offset = self._inside[f], len(fit.model.terms) + 3 * self._folds[f].recording
+        away = x - fit.solution.x
+        away[offset] = -fit.solution.x[offset]
+        residuals = fit.residuals[rows] + fit.jacobian[rows] @ away
+        half = len(residuals) // 2
+        if not half:
+            return float("nan")
+        return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
     def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> Floats:
         """Return the errors of a fold's trials.
@@ -224,8 +242,29 @@ class _Tester:
         whole_recording = self._folds[f].begin_m == -np.inf and self._folds[f].end_m == np.inf
         own = pool.own_constants(i, fit.parameters) if whole_recording else fit.constants[i]
         turn = None if wheels is None else wheels.turning
-        rates = twist_rates(self._recordings[i], fit.model, fit.parameters, turn, float(own[2]))
-        return trial_errors(self._recordings[i], self._trials[f], rates, float(own[1]))
+        recording, trials = self._tested[f]
+        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]))
+        return trial_errors(recording, trials, rates, float(own[1]))
+
+
+def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequence[float]) -> Trials:
+    """Return the trials of a recording that lie within one of its blocks."""
+    trials = cut_trials(recording, horizons_m)
+    parts = [trials.within(recording.drive.distance, fold.begin_m, fold.end_m) for fold in folds]
+    return Trials(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _within(recording: Recording, trials: Trials, fold: Fold) -> tuple[Recording, Trials]:
+    """Return the part of a recording that a fold's trials need, delays included, and the trials in it."""
+    mine = trials.within(recording.drive.distance, fold.begin_m, fold.end_m)
+    if not len(mine.starts):
+        return recording, mine
+    last = max(int(mine.ends.max()), int(mine.starts[-1]))
+    t = recording.t_s
+    first = int(np.searchsorted(t, t[mine.starts[0]] - LONGEST_DELAY_S))
+    stop = min(int(np.searchsorted(t, t[last] + LONGEST_DELAY_S)) + 1, len(t))
+    shifted = Trials(mine.starts - first, np.where(mine.ends >= 0, mine.ends - first, -1))
+    return recording.part(first, stop), shifted
 
 
 class _Choice(NamedTuple):
@@ -242,7 +281,9 @@ def _nested_choice(tested: Sequence[_Tested], folds: Sequence[Fold]) -> _Choice:
     sizes = {name: len(one.model.terms) for name, one in by_name.items()}
     baseline = BASELINE if BASELINE in by_name else next(iter(by_name))
     recommended, why = choose({name: np.diag(one.inner) for name, one in by_name.items()}, sizes, baseline)
-    chosen = [baseline] * len(folds)
+    chosen = [UNCHOSEN if UNCHOSEN in by_name else baseline] * len(folds)
+    if len(folds) < FEWEST_TO_CHOOSE and folds[0].recording == folds[-1].recording:
+        return _Choice(chosen[0], f"{len(folds)} blocks are too few to choose a model", tuple(chosen))
     if len(folds) >= FEWEST_TO_CHOOSE:
         for f in range(len(folds)):
             others = [g for g in range(len(folds)) if g != f]
@@ -293,7 +334,7 @@ def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> t
     return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
 
 
-def _masks(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
+def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
     """Return, by fold, the residuals that share no distance with it, and those of 10 m that lie within it."""
     clear, inside = [], []
     for fold in folds:
@@ -306,14 +347,6 @@ def _masks(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bool
         clear.append(np.concatenate(apart))
         inside.append(np.concatenate(within))
     return clear, inside
-
-
-def _window_error(residuals: Floats) -> float:
-    """Return the expected error [m] of windows of `CHOICE_HORIZON_M` from their residuals, forward then right."""
-    half = len(residuals) // 2
-    if not half:
-        return float("nan")
-    return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
 
 def _scores(name: str, label: str, errors: Sequence[Floats]) -> ModelScores:

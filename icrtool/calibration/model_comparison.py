@@ -1,39 +1,35 @@
-"""The ladder of models, each judged on way it was not fitted to, all on the same trials.
+"""The models of one run, each tested on distance it was not fitted to, all in the same trials.
 
 A run is cut by path length into contiguous blocks. What is fitted is fitted on windows that keep clear of the block
-held out, and judged on the trials that lie entirely within it; extended models are also *chosen* without it.
+left out, and tested in the trials that lie within it (`icrtool.calibration.held_out`); the filter's own ICRs, momentary
+and final, stand beside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from icrtool.calibration.held_out_fits import BlockFits, clear_of, fit_blocks
-from icrtool.calibration.model_trials import Along, Trials, calibrate_gyro, cut_trials, predict
-from icrtool.errors import DataError
+from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
+from icrtool.calibration.pooled import recording_of, scaled_gyro
+from icrtool.calibration.record import FittedModel
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs
-from icrtool.kernels.window_errors import NEUTRAL
-from icrtool.motion.window_fit import WindowFit, Windows, cut_windows, window_spacing_m
-from icrtool.records.dropout import CHOICE_HORIZON_M, MeasuredHeading, Rung
-from icrtool.records.run import Run
-from icrtool.records.tables import Bools, Floats
+from icrtool.motion.recording import Recording
+from icrtool.motion.trials import Trials
+from icrtool.records.dropout import MeasuredHeading, Rung
+from icrtool.records.run import Run, half_width_m
+from icrtool.records.tables import Floats
 
-HORIZONS_M = (5.0, 10.0, 20.0)
-SHORTEST_BLOCK_M = 25.0
-MOST_BLOCKS = 5
-
-FEWEST_WINDOWS = 10
-
-JUDGED_AT_ONCE = 2
+FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
+"""Names of the table's rows (public) and of the models of the family that they are."""
 
 MODELS = ("no_slip", "multiplier", "icr", "icr_final", "window", "extended")
-"""In the order of the table. Each may come again with a measured heading, ``_gyro`` or ``_heading`` behind its name."""
+"""In the order of the table. Each but the multiplier may come again with a measured heading, ``_gyro`` or ``_heading``
+behind its name."""
 
 LABELS = {
     "no_slip": "no slip", "multiplier": "best multiplier", "icr": "ICR, momentary", "icr_final": "ICR, final",
@@ -51,14 +47,14 @@ class Ladder:
 
     Attributes
     ----------
-    blocks : held out one after the other
-    starts : trials are judged from so many states
-    chosen : name of the extended model chosen for each block
-    fits : of all windows, by model name: what to paste, not what was judged
-    best : the model cross-validation prefers for the whole log
-    held_out : by model name, the parameters (blocks, 8) fitted without each block
+    blocks : left out one after the other
+    starts : trials start from so many states
+    chosen : name of the model of the family chosen for each block, without it
+    fits : of all windows, by name in the family: what to use, not what was tested
+    best : the model recommended for the whole log
+    width_m : track width b, or what stands for it
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
-    notes : what was left out of the table and why, and what was put right
+    notes : what was left out of the table and why, and what was corrected
     """
 
     horizons_m: tuple[float, ...]
@@ -66,9 +62,9 @@ class Ladder:
     starts: int
     rungs: tuple[Rung, ...]
     chosen: tuple[str, ...]
-    fits: dict[str, WindowFit]
+    fits: dict[str, FittedModel]
     best: str
-    held_out: dict[str, Floats]
+    width_m: float
     heading: str
     notes: tuple[str, ...]
 
@@ -77,15 +73,10 @@ class Ladder:
         return next(rung for rung in self.rungs if rung.name == name)
 
 
-def count_blocks(distance_m: float) -> int:
-    """Return into how many blocks a drive of this length is cut."""
-    return int(np.clip(distance_m // SHORTEST_BLOCK_M, 2, MOST_BLOCKS))
-
-
 def judge_ladder(
     run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
 ) -> Ladder:
-    """Judge every model on way it was not fitted to.
+    """Test every model on distance it was not fitted to.
 
     Parameters
     ----------
@@ -100,94 +91,101 @@ def judge_ladder(
 
     Notes
     -----
-    Stone (1974), cross-validation, here over contiguous blocks since neighbouring trials share their way. Nothing of
-    a block reaches the parameters it is judged with, nor the choice of its extended model. The filter's momentary ICRs
-    know the way up to the start, its final ones all.
+    Stone (1974), cross-validation, here over contiguous blocks since neighbouring trials share their distance. The
+    filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
-    total = float(run.table.distance_m[-1])
-    if total < 2.0 * CHOICE_HORIZON_M:
-        raise DataError(run.name, f"{total:.1f} m of way", "too short to fit on one part and judge on another")
-    windows, blocks = cut_windows(run, every_m=window_spacing_m(run)), count_blocks(total)
-    edges = np.linspace(0.0, total, blocks + 1)[1:-1]
-    clear = [clear_of(windows, edges, block) for block in range(blocks)]
-    if (fewest := min(np.count_nonzero(kept) for kept in clear)) < FEWEST_WINDOWS:
-        raise DataError(run.name, f"{fewest} windows beside a block", "too few to fit on one part and judge on another")
-    trials = cut_trials(run, edges, horizons_m)
-    fits = fit_blocks(windows, edges)
-    with ThreadPoolExecutor(JUDGED_AT_ONCE) as pool:
-        jobs = [pool.submit(_judge_plain, run, trials, fits, name) for name in MODELS]
-        heading, notes = _usable_heading(headings, trials, windows, clear)
-        more = tuple(_judge_along(run, trials, fits, heading)) if heading is not None else ()
-        rungs = (*(rung for job in jobs if (rung := job.result()) is not None), *more)
+    recording, heading, notes = _with_heading(run, headings)
+    wheels, turned = hold_out([recording], horizons_m=horizons_m)
+    trials = block_trials(recording, plan_folds([recording]), horizons_m)
+    rungs = list(_wheels_rungs(run, recording, trials, wheels))
+    if turned is not None:
+        rungs += _turned_rungs(run, recording, trials, turned, heading)
     return Ladder(
         horizons_m=tuple(horizons_m),
-        blocks=blocks,
-        starts=len(trials.starts),
-        rungs=rungs,
-        chosen=fits.chosen,
-        fits=fits.whole,
-        best=fits.best,
-        held_out=fits.held_out,
-        heading=heading.kind if heading is not None else "",
+        blocks=len(wheels.folds),
+        starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
+        rungs=tuple(rungs),
+        chosen=wheels.chosen,
+        fits={name: FittedModel(fit.model, fit.parameters, fit.covariance) for name, fit in wheels.fits.items()},
+        best=wheels.recommended,
+        width_m=recording.width_m,
+        heading=heading,
         notes=notes,
     )
 
 
-def _icrs_of(run: Run, name: str) -> FrozenIcrs | None:
-    """Return the ICRs of a model that is not fitted here; None for no slip where b is not known."""
-    table, width = run.table, run.track_width_m
-    if name == "no_slip":
-        return FrozenIcrs.constant(width / 2, -width / 2, 0.0) if width is not None else None
-    if name == "icr":
-        return FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    return FrozenIcrs(table.y_icr_right_m[-1:], table.y_icr_left_m[-1:], table.x_icr_m[-1:])
-
-
-def _judge_plain(run: Run, trials: Trials, fits: BlockFits, name: str) -> Rung | None:
-    if name in fits.held_out:
-        errors = predict(trials, fits.held_out[name])
-    elif (icrs := _icrs_of(run, name)) is not None:
-        errors = open_loop_errors(trials.drive, icrs, trials.ends)
-    else:
-        return None
-    return Rung(name, LABELS[name], FITTED_TO[name], False, summarise(errors[trials.starts]))
-
-
-def _judge_along(run: Run, trials: Trials, fits: BlockFits, heading: MeasuredHeading) -> Iterator[Rung]:
-    """Judge the models along a measured heading; a multiplier says nothing of the way along one."""
-    along = Along(trials, heading.angle_rad, from_reference=heading.kind == "gyro")
-    neutral = np.tile([*NEUTRAL, 0.0], (len(fits.chosen), 1))
-    plain = along.place(neutral)
-    for name in MODELS:
-        if name == "multiplier":
-            continue
-        if name in fits.held_out:
-            p = fits.held_out[name]
-            place = plain if np.array_equal(p[:, 3:], neutral[:, 3:]) else along.place(p)
-            icrs: FrozenIcrs | None = FrozenIcrs(*np.ascontiguousarray(p[trials.block, :3].T))
-        else:
-            place, icrs = plain, _icrs_of(run, name)
-        if icrs is not None:
-            summary = summarise(along.errors(place, icrs)[trials.starts])
-            yield Rung(f"{name}_{heading.kind}", f"{LABELS[name]} + {heading.kind}", FITTED_TO[name], True, summary)
-
-
-def _usable_heading(
-    headings: Sequence[MeasuredHeading], trials: Trials, windows: Windows, clear: Sequence[Bools]
-) -> tuple[MeasuredHeading | None, tuple[str, ...]]:
-    """Return the first heading that can be used, a gyro with scale and bias from outside each block; and notes."""
-    notes: list[str] = []
-    for heading in headings:
-        if heading.kind == "heading":
-            return heading, tuple(notes)
-        found = calibrate_gyro(heading.angle_rad, trials.drive, trials.t, windows, clear)
-        if found is not None:
-            if found[0, 0] < 0.0:
-                notes.append("the gyro counts turns the other way: its sign was turned")
-            scale, bias = found[trials.block].T
-            # turns within a block are all that counts: the angle may jump where blocks meet
-            return MeasuredHeading("gyro", scale * heading.angle_rad + bias * trials.t), tuple(notes)
-        notes.append("the gyro does not turn with the robot: rows with it are left out")
+def _with_heading(run: Run, headings: Sequence[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
+    """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
+    notes = []
+    plain = recording_of(run, width_m=2.0 * half_width_m(run.track_width_m))
+    for one in headings:
+        found = recording_of(run, one, width_m=plain.width_m)
+        if found.gyro_radps is not None:
+            if found.gyro_reversed:
+                notes.append(f"the {one.kind} counts turns the other way: its sign was turned")
+            return found, one.kind, tuple(notes)
+        notes.append(f"the {one.kind} does not turn with the robot: rows with it are left out")
     if not headings:
         notes.append("the run holds no heading measured apart from the position: no rows with one")
-    return None, tuple(notes)
+    return plain, "", tuple(notes)
+
+
+def _icrs_of(run: Run, name: str) -> FrozenIcrs:
+    """Return the filter's ICRs, momentary or final."""
+    columns = (run.table.y_icr_right_m, run.table.y_icr_left_m, run.table.x_icr_m)
+    return FrozenIcrs(*columns) if name == "icr" else FrozenIcrs(*(column[-1:] for column in columns))
+
+
+def _wheels_rungs(run: Run, recording: Recording, trials: Trials, table: HeldOut) -> Iterator[Rung]:
+    for name in MODELS:
+        if name in FAMILY:
+            if name == "no_slip" and run.track_width_m is None:
+                continue
+            summary = table.score(FAMILY[name]).together
+        else:
+            # the filter's ICRs are those of the speeds that it saw
+            drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
+            ends = np.full((len(drive.distance), trials.ends.shape[1]), -1, np.int64)
+            ends[trials.starts] = trials.ends
+            summary = summarise(open_loop_errors(drive, _icrs_of(run, name), ends)[trials.starts])
+        yield Rung(name, LABELS[name], FITTED_TO[name], False, summary)
+
+
+def _turned_rungs(
+    run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
+) -> Iterator[Rung]:  # fmt: skip
+    """Yield the models that turn by wheels and a measured heading; a multiplier alone says nothing of the path."""
+    for name in MODELS:
+        if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
+            continue
+        if name in FAMILY:
+            of = FAMILY[name]
+            summary = table.score(of if of == "recommended" else f"{of}_gyro").together
+        else:
+            summary = summarise(_errors_along(run, recording, trials, _icrs_of(run, name)))
+        yield Rung(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
+
+
+def _errors_along(run: Run, recording: Recording, trials: Trials, icrs: FrozenIcrs) -> Floats:
+    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the measured turn rate.
+
+    Notes
+    -----
+    With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
+    ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
+    """
+    held, drive = recording.held_s, recording.drive
+    psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
+    mean = (run.table.v_left_mps + run.table.v_right_mps) / 2.0
+    middle = np.exp(0.5j * (psi + np.append(psi[1:], psi[-1])))
+    place = np.concatenate([[0.0], np.cumsum(held * mean * middle)[:-1]])
+    lever, turn = -1j * np.exp(1j * psi), np.exp(1j * (drive.heading - psi))
+    arm = (icrs.y_icr_right + icrs.y_icr_left) / 2.0 - 1j * icrs.x_icr
+    reference = drive.north + 1j * drive.east
+    errors: Floats = np.full(trials.ends.shape, np.nan)
+    for h in range(trials.ends.shape[1]):
+        some = trials.ends[:, h] >= 0
+        s, e = trials.starts[some], trials.ends[some, h]
+        moved = place[e] - place[s] + (arm if len(arm) == 1 else arm[s]) * (lever[e] - lever[s])
+        errors[some, h] = np.abs(turn[s] * moved - (reference[e] - reference[s]))
+    return errors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -13,14 +13,22 @@ from icrtool.calibration.held_out import HeldOut, hold_out
 from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import GYRO_TERMS, typical_drive, wheel_motion
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, trial_errors, twist_rates
+from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
 
-GYRO_SCALE_RANGE = 0.2
+GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
+"""Turns over this time are compared, at least so many."""
+
+GYRO_PRIOR_STD = np.array([10.0, 0.02])
+"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this tells one from the other."""
+
+GYRO_SCALE_RANGE = 0.1
 """A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
 
 
@@ -34,49 +42,71 @@ class CalibrationResult:
     notes: tuple[str, ...]
 
 
-def recording_of(run: Run) -> Recording:
+def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
     """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
 
-    A gyro is used where it turns as the reference does.
+    Parameters
+    ----------
+    heading : a measured heading of the run, such as its gyro's; its turn rate is used where it turns as the reference
+        does
+    width_m : track width b to use; default the run's
 
     Raises
     ------
     ConfigError
         The robot's track width is not known.
     """
-    if run.track_width_m is None:
+    width = width_m if width_m is not None else run.track_width_m
+    if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
     drive, inputs = drive_of(run), run.summary.get("inputs", [])
     scale = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
-    gyro = next((one.angle_rad for one in measured_headings(run) if one.kind == "gyro"), None)
-    return Recording(
+    plain = Recording(
         name=run.name,
         t_s=run.table.t_s,
         drive=drive._replace(v_left=drive.v_left / scale, v_right=drive.v_right / scale),
-        gyro_radps=None if gyro is None else _turn_rate(gyro, drive.dt_s, drive.heading, run.table.t_s),
-        width_m=run.track_width_m,
+        gyro_radps=None,
+        width_m=width,
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
     )
+    if heading is None or not np.isfinite(heading.angle_rad).all():
+        return plain
+    step = np.append(np.diff(heading.angle_rad), 0.0)
+    rate = np.divide(step, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
+    slope, _ = _gyro_line(plain, rate)
+    if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
+        return plain
+    return replace(plain, gyro_radps=np.sign(slope) * rate, gyro_reversed=slope < 0.0)
 
 
-def _turn_rate(angle: Floats, dt: Floats, heading: Floats, t: Floats) -> Floats | None:
-    """Return the rate [rad/s] of an integrated gyro over each interval, clockwise; None where it measures another axis.
+def gyro_recording_of(run: Run) -> Recording:
+    """Return a run as `recording_of`, with its gyro where it has one."""
+    return recording_of(run, next((one for one in measured_headings(run) if one.kind == "gyro"), None))
 
-    Its sign is that with which it turns as the reference does.
-    """
-    if not np.isfinite(angle).all():
-        return None
-    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], 1.0)))
-    turned, told, took = np.diff(heading[every]), np.diff(angle[every]), np.diff(t[every])
-    if len(every) < 10:
-        return None
-    slope = float(np.linalg.lstsq(np.column_stack([told, took]), turned, rcond=None)[0][0])
-    if abs(abs(slope) - 1.0) > GYRO_SCALE_RANGE:
-        return None
-    step = np.append(np.diff(angle), 0.0)
-    rate: Floats = np.sign(slope) * np.divide(step, dt, out=np.zeros(len(dt)), where=dt > 0.0)
+
+def scaled_gyro(recording: Recording) -> Floats:
+    """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
+    if recording.gyro_radps is None:
+        return np.zeros(len(recording.t_s))
+    slope, bias = _gyro_line(recording, recording.gyro_radps)
+    rate: Floats = slope * recording.gyro_radps + bias
     return rate
+
+
+def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
+    """Return scale and bias [rad/s] with which a turn rate (n,) makes the turns of the reference over seconds."""
+    t, held = recording.t_s, recording.held_s
+    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], GYRO_STEP_S)))
+    if len(every) < FEWEST_GYRO_STEPS:
+        return float("nan"), float("nan")
+    sums = np.concatenate([[0.0], np.cumsum(held * rate)[:-1]])
+    turned = np.diff(recording.drive.heading[every])
+    columns = np.column_stack([np.diff(sums[every]), np.diff(t[every])])
+    found = robust_least_squares(
+        lambda x: (columns @ x - turned, columns), np.zeros(2), np.zeros(2), GYRO_PRIOR_STD, overlap=10.0
+    )
+    return float(found.x[0]), float(found.x[1])
 
 
 def calibrate(

@@ -98,19 +98,28 @@ class _Source(NamedTuple):
 def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> CalibrationResult:
     """Fit and test the motion models on all sources."""
     from icrtool.calibration.pooled import calibrate
+    from icrtool.errors import ConfigError
+    from icrtool.output.run_directory import is_run_directory
 
+    if config.given_sections and all(is_run_directory(source) for source in sources):
+        section = min(config.given_sections)
+        advice = "name the logs instead"
+        raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
     with options.progress_bar("reading", quiet=quiet) as progress:
         found = []
         for i, source in enumerate(sources):
             found.append(_source(source, config))
             if progress is not None:
                 progress((i + 1) / len(sources))
+    if len(radii := {one.wheel_radius_m for one in found}) > 1:
+        why = f"{' and '.join(sorted(map(str, radii)))} in the logs given"
+        raise ConfigError("robot.wheel_radius_m", why, "fit them with one radius: parameters refer to it")
     return calibrate([one.recording for one in found], found[0].robot, found[0].wheel_radius_m)
 
 
 def _source(source: Path, config: Config) -> _Source:
     """Read a run, or fit a log."""
-    from icrtool.calibration.pooled import recording_of
+    from icrtool.calibration.pooled import gyro_recording_of
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
@@ -123,7 +132,7 @@ def _source(source: Path, config: Config) -> _Source:
 
         run = fit(read_log(source, config), config)
     robot = run.config.robot
-    return _Source(recording_of(run), robot.name, robot.wheel_radius_m)
+    return _Source(gyro_recording_of(run), robot.name, robot.wheel_radius_m)
 
 
 def _findings(source: Path, config: Config, x_icr: float | None, *, quiet: bool, verbose: bool) -> Findings:

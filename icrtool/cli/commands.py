@@ -9,6 +9,7 @@ import click
 from icrtool import __version__
 
 _COMMANDS = {
+    "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
     "calibrate": "Estimate antenna, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.",
     "export": "Print a run's calibration for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import click
 
 from icrtool.cli import options
+from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -31,6 +32,8 @@ class FitRequest(NamedTuple):
     smooths: bool
     quiet: bool
     verbose: bool
+    start: str | None = None
+    end: str | None = None
 
 
 @click.command("fit")
@@ -56,11 +59,12 @@ class FitRequest(NamedTuple):
     help="Inflate the ICR covariance T seconds after the start; auto: where the ICRs are found to change. Repeatable.",
 )
 @click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
+@options.cut
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[str, ...], smooths: bool,
+    warm_start: Path | None, changes: tuple[str, ...], smooths: bool, start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -78,7 +82,7 @@ def command(
     config = options.load(config_file, robot, sets)
     request = FitRequest(
         config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
-        change_times(changes), AUTO in changes, smooths, quiet, verbose,
+        change_times(changes), AUTO in changes, smooths, quiet, verbose, start, end,
     )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
@@ -168,11 +172,11 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     check_target(directory)
     before = log_of_run(directory)
     start = open_run(request.warm_start).ended_with if request.warm_start is not None else None
-    with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
+    with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
         options.load_ahead("pymap3d", "icrtool.estimation.fit")
-        measured = read_log(log, request.config, progress)
+        measured = read_log(log, request.config, progress, start=request.start, end=request.end)
     from icrtool.estimation.fit import fit
 
     run = fit(
@@ -183,15 +187,16 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         find_changes=request.finds_changes,
         smooth=request.smooths,
     )
-    write_run(run, directory, states=request.states, drawer=drawer)
+    notes: list[str] = []
+    write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
     replaced = before is not None and before != run.summary["inputs"][0]["path"]
     note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
-    options.warn((*run.warnings, *_other_robot(request, start), *note), quiet=request.quiet)
+    options.warn((*run.warnings, *_other_robot(request, start), *note, *notes), quiet=request.quiet)
     if not request.quiet:
         from icrtool.output.tables.run import format_run
 
         click.echo(format_run(run))
-        click.echo(f"\nwritten to {directory}{_beside(request)}")
+        click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
     for stream in measured.streams:
         if request.verbose or ("chosen over" in stream.why and not request.quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -43,6 +43,13 @@ def configuration(command: Command) -> Command:
     return command
 
 
+def cut(command: Command) -> Command:
+    """Add --from and --to, as `start` and `end`."""
+    what = "seconds since the log's first message, or a time in ISO 8601 (UTC without a zone)"
+    command = click.option("--to", "end", metavar="TIME", help="Read the log up to here.")(command)
+    return click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}.")(command)
+
+
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
     command = click.option("-v", "--verbose", is_flag=True, help="Say more.")(command)

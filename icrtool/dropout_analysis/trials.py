@@ -24,7 +24,6 @@ from icrtool.kernels.error_statistics import (
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.kernels.window_errors import NEUTRAL, move, window_misses
 from icrtool.records.dropout import DEFAULT_SEED, ModelResult
 from icrtool.records.run import Run, drive_of, straight_drive
 from icrtool.records.tables import Floats
@@ -185,10 +184,6 @@ def load_kernels() -> None:
     errors = open_loop_errors(drive, icrs, ends)
     bootstrap_intervals(errors, [cut_blocks(path < path[-1], path, 0.5)], DEFAULT_SEED)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
-    motion = move(
-        path, np.ones_like(path), np.ones_like(path), np.ones_like(path), np.array([1.0, -1.0, *NEUTRAL[2:]]), path
-    )
-    window_misses(motion, np.array([0]), np.array([1]), np.ones(1, np.complex128), np.ones(1))
 
 
 def models_of(run: Run) -> tuple[Model, ...]:

@@ -12,9 +12,10 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.filter_records import FilterParameters, Measurements
-from icrtool.records.measurements import SensorData
+from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
-from icrtool.records.tables import Floats, Ints
+from icrtool.records.tables import Bools, Floats, Ints
 
 
 class ProcessNoise(NamedTuple):
@@ -44,6 +45,9 @@ GAP_IN_INTERVALS = 2.5
 
 LEAST_ICR_IN_HALF_WIDTHS = 0.2
 """The ICRs lie outside the tracks (Pentzer 2014, Section 2); an antenna that is off centre may move them in by this."""
+
+EVENT_MARGIN_S = 0.2
+"""A slip event is taken to begin and end by so much earlier and later: where it does is known no better."""
 
 RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
@@ -138,6 +142,7 @@ def set_up_filter(
         heading_z=headings.heading_rad[heading_index],
         heading_r=headings.var_rad2[heading_index],
         change_t=np.empty(0),
+        slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
     )
     t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
@@ -145,7 +150,7 @@ def set_up_filter(
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), sensors.heading_correlation_s)
     parameters = _parameters(config, data, sensors.antenna_m, noise or configured_noise(config), alike)
-    x0, P0 = _start_state(data, t0, config, parameters, warm_start)
+    x0, P0 = _start_state(data, t0, _initial_icrs(config, sensors.icr_start), parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
 
@@ -167,6 +172,22 @@ def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
     return np.flatnonzero(kept)
 
 
+def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[tuple[int, int], ...]) -> Bools:
+    """Return the intervals after wheel samples (n,) that lie in an event.
+
+    None in an outage that is made: what a run does there must not know what only the fixes showed.
+    """
+    slipping = np.zeros(len(stamps_ns), np.bool_)
+    ends = np.append(stamps_ns[1:], stamps_ns[-1])
+    margin = round(EVENT_MARGIN_S * 1e9)
+    for event in events:
+        first, last = np.searchsorted(ends, event.begin_ns - margin), np.searchsorted(stamps_ns, event.end_ns + margin)
+        slipping[first:last] = True
+    for begin, end in outages_ns:
+        slipping[(ends > begin) & (stamps_ns < end)] = False
+    return slipping
+
+
 def _start_time(name: str, data: Measurements) -> float:
     """Return the first stamp by which wheel, GNSS and heading have each been seen."""
     if not (len(data.gnss_t) and len(data.heading_t)):
@@ -178,7 +199,11 @@ def _start_time(name: str, data: Measurements) -> float:
 
 
 def _start_state(
-    data: Measurements, t0: float, config: Config, parameters: FilterParameters, warm_start: WarmStart | None
+    data: Measurements,
+    t0: float,
+    icrs: tuple[Floats, Floats],
+    parameters: FilterParameters,
+    warm_start: WarmStart | None,
 ) -> tuple[Floats, Floats]:
     fix = int(np.searchsorted(data.gnss_t, t0, side="right")) - 1
     sample = int(np.searchsorted(data.heading_t, t0, side="right")) - 1
@@ -186,30 +211,32 @@ def _start_state(
     forward, right = parameters.antenna_forward, parameters.antenna_right
     north = data.gnss_z[fix, 0] - (forward * math.cos(psi) - right * math.sin(psi))
     east = data.gnss_z[fix, 1] - (forward * math.sin(psi) + right * math.cos(psi))
-    icrs, icr_std = _initial_icrs(config)
-    x0 = np.array([north, east, psi, *icrs])
-    P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], icr_std**2, icr_std**2, icr_std**2])
+    x0 = np.array([north, east, psi, *icrs[0]])
+    P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], *(icrs[1] ** 2)])
     if warm_start is not None:
         x0[3:], P0[3:, 3:] = warm_start.icrs_m, warm_start.covariance_m2
     return x0, P0
 
 
-def _initial_icrs(config: Config) -> tuple[tuple[float, float, float], float]:
-    """Return the ICRs at the start and their standard deviation [m].
+def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Floats]:
+    """Return the ICRs at the start (3,) and their standard deviations (3,) [m]: configured, else found, else preset.
 
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
     settings, half = config.filter, half_width_m(config.robot.track_width_m)
     paper = settings.preset == "paper"
-    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
+    std = settings.initial_icr_std_m
+    if found is not None and not paper and given == (None, None, None):
+        return np.array(found.icrs_m), np.array(found.std_m) if std is None else np.full(3, std)
+    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
     right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
     if not paper:
         right, left = max(right, half), min(left, -half)
     away = max(abs(right - half), abs(left + half), abs(x))
     default_std = PAPER_INITIAL_ICR_STD_M if paper else max(half, away)
-    return (right, left, x), settings.initial_icr_std_m if settings.initial_icr_std_m is not None else default_std
+    return np.array([right, left, x]), np.full(3, std if std is not None else default_std)
 
 
 def _terrain_icr_std_m(config: Config) -> float:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.reference_delay import busiest_rows, find_delay
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.ekf import run_filter
@@ -31,6 +30,9 @@ FLAT = 0.1
 
 MOST_ROUNDS = 3
 
+MOST_SAMPLES = 60_000
+"""Wheel samples the search looks at: ten minutes at 100 Hz."""
+
 
 class AdaptedRun(NamedTuple):
     """A filter run; `sensors` has the position reference `reference_delay_s` earlier, where such a delay was found."""
@@ -45,40 +47,41 @@ class AdaptedRun(NamedTuple):
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
 ) -> AdaptedRun:
-    """Run the filter; where fixes or headings contradict the wheels, look for a delay, then for the process noise.
+    """Run the filter; where fixes or headings contradict the wheels, with the process noise that they show.
 
-    A contradiction that falls when the reference is shifted comes from the clocks. One that remains comes from the
-    wheels (held samples, slip): `find_noise` finds the noise, on at most ten minutes of driving. A log without
-    contradiction takes one pass. Preset ``field`` only; what is configured is not searched for.
+    The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
+    ``field`` only; what is configured is not searched for.
     """
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
         return setup, run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
 
-    noise, delay, settings = configured_noise(config), 0.0, config.filter
+    noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)
-    by_fixes, by_headings = _capped_nis(setup, output)
-    if settings.preset != "field" or max(by_fixes, by_headings) <= TOLERATED_NIS:
-        return AdaptedRun(sensors, setup, output, noise, delay)
-    rows = busiest_rows(sensors.wheels)
-    part = sensors if rows is None else sensors.part(rows)
-    if config.frames.reference_delay_s == "auto" and by_fixes > TOLERATED_NIS:
-        # two degrees of freedom in a fix, one in a heading
-        delay = find_delay(lambda late: float(np.dot(_capped_nis(*run(part.earlier(late), noise)), (2.0, 1.0))))
-        sensors, part = sensors.earlier(delay), part.earlier(delay)
-        setup, output = run(sensors, noise) if delay else (setup, output)
-    if max(_capped_nis(setup, output)) > TOLERATED_NIS:
-        best = find_noise(
-            lambda tried: innovation_cost(run(part, tried)[1]),
-            noise,
-            positions=settings.process_position_mps == "auto",
-            headings=settings.process_heading_degps is None,
-        )
-        if best != noise:
-            noise = best
-            setup, output = run(sensors, noise)
-    return AdaptedRun(sensors, setup, output, noise, delay)
+    if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
+        return AdaptedRun(sensors, setup, output, noise, 0.0)
+    part = _busiest_part(sensors)
+    best = find_noise(
+        lambda tried: innovation_cost(run(part, tried)[1]),
+        noise,
+        positions=settings.process_position_mps == "auto",
+        headings=settings.process_heading_degps is None,
+    )
+    if best != noise:
+        noise = best
+        setup, output = run(sensors, noise)
+    return AdaptedRun(sensors, setup, output, noise, 0.0)
+
+
+def _busiest_part(sensors: SensorData) -> SensorData:
+    """Return the `MOST_SAMPLES` wheel samples in which the wheels travel most, all where there are no more."""
+    wheels = sensors.wheels
+    if len(wheels.stamp_ns) <= MOST_SAMPLES:
+        return sensors
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))])
+    first = int(np.argmax(travel[MOST_SAMPLES:] - travel[:-MOST_SAMPLES]))
+    return sensors.part(slice(first, first + MOST_SAMPLES))
 
 
 def find_noise(

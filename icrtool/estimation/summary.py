@@ -18,6 +18,7 @@ from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
@@ -64,7 +65,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "log": log.name,
             "inputs": [asdict(file) for file in log.inputs],
             "config": config.effective(),
-            "streams": [asdict(stream) for stream in log.streams],
+            "streams": [asdict(stream) for stream in measurements.streams],
             "warnings": warnings,
             "alignment": {name: asdict(finding) for name, finding in measurements.findings.items()},
             "drive": drive_summary(table),
@@ -84,6 +85,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss, filtered.reference_delay_s),
             "heading": measurements.sections["heading"] | counts(filtered.heading),
             "wheels": measurements.sections["wheels"],
+            "events": event_summary(sensors.events, int(table.stamp_ns[0])),
             "outages_ns": filtered.outages_ns,
             "rtk_losses_ns": sensors.losses_ns,
             "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
@@ -97,6 +99,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "antenna_m": sensors.antenna_m,
                 "states": len(table),
                 "warm_start": warm_start_summary(filtered.began_with),
+                "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
             }
             | nis_summary(filtered.gnss, filtered.heading),
             "excitation": excitation.summary(),
@@ -138,6 +141,15 @@ def without_unlearned(document: dict[str, Any]) -> dict[str, Any]:
     if "y_icr_right_m" in hidden or "y_icr_left_m" in hidden:
         icr |= {"separation_multiplier": None, "separation_multiplier_std": None}
     return document | {"icr": icr}
+
+
+def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
+    """Return the slip events with the columns of events.csv; `start_ns` is the stamp of the first recorded state."""
+    rows = [
+        event._asdict() | {"begin_s": (event.begin_ns - start_ns) / 1e9, "end_s": (event.end_ns - start_ns) / 1e9}
+        for event in events
+    ]
+    return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
 def odometry_summary(found: Odometry) -> dict[str, Any]:

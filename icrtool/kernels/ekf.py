@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, measured_column, predict, wrap
+from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, keep_sides, measured_column, predict, wrap
 from icrtool.kernels.filter_records import (
     GATED,
     RECOVERED,
@@ -24,7 +24,7 @@ from icrtool.kernels.filter_records import (
     Measurements,
     Nodes,
 )
-from icrtool.kernels.kinematics import Floats
+from icrtool.kernels.kinematics import Floats, body_velocity
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
@@ -50,22 +50,6 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
     run[2] = nu_n
     run[3] = nu_e
     return bool(run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s)
-
-
-@njit
-def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
-    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
-
-    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
-    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
-    """
-    for _ in range(2):
-        for place, bound in ((3, least), (4, -least)):
-            beyond = bound - x[place]
-            if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
-                variance = measured_column(P, place, 0.0, PH)
-                for i in range(6):
-                    x[i] += PH[i] / variance * beyond
 
 
 @njit
@@ -144,14 +128,19 @@ def take_heading(
 
 @njit
 def advance(
-    dt: float, in_gap: bool, v_left: float, v_right: float, x: Floats, P: Floats, parameters: FilterParameters
-) -> float:
-    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length [m].
+    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, x: Floats, P: Floats,
+    parameters: FilterParameters,
+) -> float:  # fmt: skip
+    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
 
-    Through a gap in the wheel data nothing is dead-reckoned: the pose only grows uncertain.
+    Through a gap in the wheel data and through slip nothing is dead-reckoned: the pose only grows uncertain, and what
+    is measured next does not change the ICRs.
     """
     travelled = 0.0
-    if in_gap:
+    if in_gap or slips:
+        if slips:
+            v_x, v_y, _ = body_velocity(v_left, v_right, x[3], x[4], x[5])
+            travelled = 0.0 if in_gap else dt * math.sqrt(v_x * v_x + v_y * v_y)
         P[0] += parameters.gap_speed_variance * dt
         P[6] += parameters.gap_speed_variance * dt
         P[11] += parameters.gap_turn_variance * dt
@@ -189,6 +178,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
         held = max(k - 1, 0)
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
+        slips = held < len(data.slipping) and data.slipping[held]
         while True:
             t_next = t_wheel
             if j < n_gnss:
@@ -199,14 +189,14 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 t_next = min(t_next, data.change_t[c])
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
-                travelled += advance(dt, in_gap, data.v_left[held], data.v_right[held], x, P, parameters)
+                travelled += advance(dt, in_gap, slips, data.v_left[held], data.v_right[held], x, P, parameters)
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
                     P[DIAGONAL[i]] = max(P[DIAGONAL[i]], parameters.icr_inflation_m2)
                 c += 1
             if nodes is not None:
-                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap else 0.0
+                nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap or slips else 0.0
                 nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
                 out.gnss_code[j], out.gnss_nis[j], out.gnss_det[j], nu_n, nu_e = take_fix(

@@ -111,3 +111,19 @@ def correct(x: Floats, P: Floats, PH: Floats, S: float, nu: float) -> None:
         for k in range(i, 6):
             P[place] -= K * PH[k]
             place += 1
+
+
+@njit
+def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
+    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
+
+    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
+    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
+    """
+    for _ in range(2):
+        for place, bound in ((3, least), (4, -least)):
+            beyond = bound - x[place]
+            if (place == 3 and beyond > 0.0) or (place == 4 and beyond < 0.0):
+                variance = measured_column(P, place, 0.0, PH)
+                for i in range(6):
+                    x[i] += PH[i] / variance * beyond

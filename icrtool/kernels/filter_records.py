@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from icrtool.kernels.kinematics import GUARDED, Floats
 
 Codes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
@@ -63,6 +64,7 @@ class Measurements(NamedTuple):
     gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
     heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
     change_t : (c,) times of terrain changes
+    slipping : (n,) intervals [k, k+1) in which the robot does not do what its wheels do; empty for none
     """
 
     wheel_t: Floats
@@ -75,6 +77,7 @@ class Measurements(NamedTuple):
     heading_z: Floats
     heading_r: Floats
     change_t: Floats
+    slipping: Flags = np.zeros(0, np.bool_)
 
 
 class FilterOutput(NamedTuple):
@@ -135,7 +138,7 @@ class Nodes(NamedTuple):
     Attributes
     ----------
     x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
-    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap of the wheel data
+    step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap or in slip
     row : int64 (m,), row of the state recorded here, -1 where none is
     """
 

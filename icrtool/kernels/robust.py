@@ -195,10 +195,10 @@ def sandwich_covariance(
     z, slopes = residuals / scale, jacobian / scale[:, None]
     influence = soft_l1_weights(z) / overlap
     information: Floats = (slopes * influence[:, None]).T @ slopes + np.diag(pull)
-    order = np.unique(group, return_inverse=True)[1]
-    count = int(order.max()) + 1 if len(order) else 0
-    gradients = np.zeros((count, slopes.shape[1]))
-    np.add.at(gradients, order, slopes * (influence * z)[:, None])
+    order = np.argsort(group, kind="stable")
+    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
+    gradients = np.add.reduceat((slopes * (influence * z)[:, None])[order], first)
+    count = len(first)
     meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
     inverse = np.linalg.solve(information, np.eye(len(pull)))
     sandwich = inverse @ meat @ inverse

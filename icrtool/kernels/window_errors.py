@@ -155,48 +155,6 @@ def move(
     return out
 
 
-@njit
-def fill_misses(
-    theta: Floats, place: Complexes, theta_by: Floats, place_by: Complexes, theta_rate: Floats, place_rate: Complexes,
-    start: Ints, end: Ints, reference: Complexes, weight: Floats, misses: Floats, slopes: Floats,
-) -> None:  # fmt: skip
-    """Fill misses (2 w,), forward then right, and slopes (2 w, 8), by `PARAMETERS` and a shift of both times."""
-    count = len(start)
-    for i in range(count):
-        s, e, scale = start[i], end[i], weight[i]
-        back = complex(math.cos(theta[s]), -math.sin(theta[s]))
-        way = place[e] - place[s]
-        miss = scale * (back * way - reference[i])
-        misses[i], misses[count + i] = miss.real, miss.imag
-        for k in range(7):
-            by = scale * (back * (place_by[e, k] - place_by[s, k] - 1j * theta_by[s, k] * way))
-            slopes[i, k], slopes[count + i, k] = by.real, by.imag
-        late = scale * (back * (place_rate[e] - place_rate[s] - 1j * theta_rate[s] * way))
-        slopes[i, 7], slopes[count + i, 7] = late.real, late.imag
-
-
-def window_misses(
-    motion: Motion, start: Ints, end: Ints, reference: Complexes, weight: Floats
-) -> tuple[Floats, Floats]:
-    """Return the weighted misses of windows and their derivatives: `displace` less the reference, in one call.
-
-    Parameters
-    ----------
-    start, end : (w,) rows of `motion`
-    reference : complex (w,) [m]; weight : (w,)
-
-    Returns
-    -------
-    misses : (2 w,), forward then right
-    slopes : (2 w, 8), by `PARAMETERS` and by a common shift of both times
-    """
-    misses, slopes = np.empty(2 * len(start)), np.empty((2 * len(start), 8))
-    first, last = (np.require(rows, np.int64, ["C", "A", "W"]) for rows in (start, end))
-    place = np.require(reference, np.complex128, ["C", "A", "W"])
-    fill_misses(*motion, first, last, place, np.require(weight, np.float64, ["C", "A", "W"]), misses, slopes)
-    return misses, slopes
-
-
 def displace(motion: Motion, start: Ints, end: Ints) -> tuple[Complexes, Complexes, Complexes]:
     """Return the open-loop displacement of windows in the body frame of their start, and its derivatives.
 

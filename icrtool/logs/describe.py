@@ -9,9 +9,8 @@ import numpy as np
 from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
 from icrtool.logs.streams.position_sources import PositionSource
-from icrtool.logs.streams.stamps import rate_and_jitter
 from icrtool.logs.streams.wheel_sources import WheelMotion
-from icrtool.records.tables import Ints, RobotLog
+from icrtool.records.tables import Ints, RobotLog, rate_and_jitter
 
 GAP_IN_INTERVALS = 5.0
 
@@ -50,6 +49,15 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
         spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
         overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
         lines.append(f"\nall three overlap for {max(overlap, 0):.1f} s")
+    return "\n".join(lines)
+
+
+def describe_log(log: RobotLog) -> str:
+    """Return the text of ``icrtool info`` for a log that is a table."""
+    lines = [f"{log.name}: table"]
+    for stream in log.streams:
+        samples = f"{stream.count} samples at {stream.rate_hz:.4g} Hz, jitter {stream.jitter_ms:.3g} ms"
+        lines.append(f"  {stream.role}: {stream.topic}: {samples}; {stream.why}")
     return "\n".join(lines)
 
 

@@ -3,40 +3,58 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
-from icrtool.logs.containers.channel import Block, Channel, Container
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.gyro import find_gyro
+from icrtool.logs.streams.gyro import find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
-from icrtool.logs.streams.stamps import increasing, rate_and_jitter
+from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
-from icrtool.records.tables import Datum, HeadingSamples, InputFile, Ints, PositionFixes, RobotLog, Role, StreamChoice
+from icrtool.logs.table_file import is_table, read_table
+from icrtool.records.tables import (
+    Datum,
+    HeadingSamples,
+    InputFile,
+    Ints,
+    OtherReceiver,
+    PositionFixes,
+    RobotLog,
+    Role,
+    StreamChoice,
+    rate_and_jitter,
+)
+from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
+
+NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
     """A log after one pass: its channels, all candidates, what was lost, its files."""
 
-    name: str
-    path: str
+    name: LogText
+    path: LogText
     channels: tuple[Channel, ...]
     tables: tuple[TopicTable, ...]
     candidates: Candidates
@@ -44,13 +62,21 @@ class Survey:
     inputs: tuple[InputFile, ...]
 
 
-def survey_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> Survey:
+def survey_log(
+    path: str | Path,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    *,
+    start: Moment | None = None,
+    end: Moment | None = None,
+) -> Survey:
     """Read all candidate topics of a log.
 
     Parameters
     ----------
     path : a log as `open_log` knows them
     progress : called with the share of the log read so far, 0 to 1
+    start, end : as `read_log` takes them
 
     Raises
     ------
@@ -59,19 +85,27 @@ def survey_log(path: str | Path, config: Config | None = None, progress: Progres
     """
     config = config if config is not None else Config()
     path = Path(path)
+    begin, stop = moment(start, "start"), moment(end, "end")
     container = open_log(path)
+    ended = Event()
     try:
         with ThreadPoolExecutor(2) as pool:
-            hashes = [pool.submit(_fingerprint, file) for file in container.files]
-            tables, unread = _collect(container, config, pool, progress)
-            problems = tuple(container.problems)
-            inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+            try:
+                hashes = [pool.submit(_fingerprint, file, ended) for file in container.files]
+                cut = cut_of(container, begin, stop, path)
+                tables, unread = _collect(container, config, pool, progress, cut)
+                problems = tuple(container.problems)
+                inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+            except BaseException:
+                # The pool waits for its threads before Ctrl-C, or an error, goes on.
+                ended.set()
+                raise
         channels = tuple(container.channels)
     finally:
         container.close()
     return Survey(
-        name=log_name(path),
-        path=str(path),
+        name=LogText(log_name(path)),
+        path=LogText(str(path)),
         channels=channels,
         tables=tuple(tables),
         candidates=find_candidates(tables, config, unread),
@@ -80,14 +114,23 @@ def survey_log(path: str | Path, config: Config | None = None, progress: Progres
     )
 
 
-def read_log(path: str | Path, config: Config | None = None, progress: Progress | None = None) -> RobotLog:
+def read_log(
+    path: str | Path,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    *,
+    start: Moment | None = None,
+    end: Moment | None = None,
+) -> RobotLog:
     """Read wheels, position and heading of a log into tables.
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
-    progress : called with the share of the bytes that are read
+    progress : called with the share of the bytes that are read, 0 to 1
+    start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
+        a `datetime` or ISO 8601 text, in UTC where it has no zone. Static transforms are read from all of the log.
 
     Raises
     ------
@@ -101,13 +144,19 @@ def read_log(path: str | Path, config: Config | None = None, progress: Progress 
         Streams without usable samples.
     """
     config = config if config is not None else Config()
-    return assemble(survey_log(path, config, progress), config)
+    if is_table(Path(path)):
+        return read_table(Path(path), start, end)
+    return assemble(survey_log(path, config, progress, start=start, end=end), config)
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: that of the file without its suffix, or of the directory."""
-    resolved = path.absolute()
-    return resolved.name if resolved.is_dir() else resolved.stem
+    """Return a log's name: that of the file without its suffix, or of the directory; ``log`` where that is only dots.
+
+    Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
+    """
+    named = Path(os.path.normpath(path.absolute()))
+    name = named.name if named.is_dir() else named.stem
+    return name if name.strip(".") else "log"
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
@@ -116,7 +165,9 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     choice = choose_streams(found, config, survey.path, survey.channels)
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     delays = [
-        s.delay_ns / 1e9 if s.header_ns is not None else None for s in (motion.stamps, position.stamps, source.stamps)
+        s.stamps.delay_ns / 1e9 if s.stamps.header_ns is not None else None
+        for s in (motion, position, source)
+        if s is not None
     ]
     clock = common_clock(delays)
     warnings = list(survey.problems)
@@ -125,31 +176,52 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
             f"{name}: a stream without header stamps stands beside header stamps that are far from log time; "
             "all go by log time"
         )
-    for role, stamps in (("wheels", motion.stamps), ("gnss", position.stamps), ("heading", source.stamps)):
-        if stamps.note and stamps.note != "no header":
-            warnings.append(f"{name}: {role}: {stamps.note}; log time is used")
+    for role, one in (("wheels", motion), ("gnss", position), ("heading", source)):
+        if one is not None and one.stamps.note and one.stamps.note != "no header":
+            warnings.append(f"{name}: {role}: {one.stamps.note}; log time is used")
     gnss, datum, rejected = _fixes(position, config, clock, name)
-    heading, convention = _headings(source, config, clock, name)
-    samples, how, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, gnss, name)
+    heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
+    samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
-    if source.note:
+    if source is not None and source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
-    streams = (
-        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {how}"),
+    quantity = "position" if samples.from_position else "speed"
+    streams: tuple[StreamChoice, ...] = (
+        _stream("wheels", motion, samples.stamp_ns, clock, f"{choice.why['wheels']}; {quantity}"),
         _stream("gnss", position, gnss.stamp_ns, clock, f"{choice.why['gnss']}{_place_in_words(antenna)}"),
-        _stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),
     )
-    unreadable = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
+    if source is not None:
+        streams += (_stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),)
+    unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    gyro = find_gyro(survey.tables, motion.topic, source.topic, clock)
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock)
     return RobotLog(
-        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro
+        name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro,
+        find_gyros(survey.tables, clock), _other_receivers(survey.candidates, position, datum, config, clock, name),
+    )  # fmt: skip
+
+
+def _other_receivers(
+    found: Candidates,
+    chosen: PositionSource,
+    datum: Datum | None,
+    config: Config,
+    clock: Literal["header", "log"],
+    name: str,
+) -> tuple[OtherReceiver, ...]:
+    """Return the fixes of the other GNSS receivers, in the local plane of the chosen one."""
+    if datum is None:
+        return ()
+    return tuple(
+        OtherReceiver(source.topic, _fixes(source, config, clock, name, datum)[0])
+        for source in found.gnss
+        if source is not chosen and source.geodetic is not None and source.usable.any() and not source.problem
     )
 
 
@@ -160,27 +232,45 @@ def _place_in_words(antenna: tuple[float, float] | None) -> str:
 
 
 def _collect(
-    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None
+    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Take the columns of all channels that some role may need, in one pass over the log."""
     unread: dict[str, str] = {}
-    collectors: dict[int, Collector] = {}
+    collectors: dict[int, Collector | None] = {}
     by_id = {channel.id: channel for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
-    wanted |= {channel.id: FIELDS for channel in container.channels if is_static(channel)}
-    for number, paths in wanted.items():
-        try:
-            collectors[number] = collector_for(by_id[number], paths)
-        except DefinitionError as err:
-            unread[by_id[number].topic] = str(err)
-    for block in _ahead(container.blocks(frozenset(collectors)), pool):
-        for number, collector in collectors.items():
-            chosen = block.channel == number
-            if chosen.any():
-                collector.feed(block, chosen)
+    static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
+    wanted |= static
+    cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
+    for whole in _ahead(container.blocks(frozenset(wanted), cut), pool):
+        block = cut.of(whole)
+        for number in np.unique(block.channel).tolist():
+            if number not in wanted:
+                continue
+            if number not in collectors:
+                # A definition is compiled when its first message comes: a log may declare any number of topics.
+                collectors[number] = _collector(by_id[number], wanted[number], unread)
+            if (collector := collectors[number]) is not None:
+                collector.feed(block, block.channel == number)
         if progress is not None:
             progress(container.share_read())
-    return merge_tables([collector.table() for collector in collectors.values()]), unread
+    tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
+    silent = [by_id[number] for number in wanted if number not in collectors]
+    tables += [_empty_table(channel) for channel in silent]
+    return merge_tables(tables), unread
+
+
+def _collector(channel: Channel, paths: tuple[str, ...], unread: dict[str, str]) -> Collector | None:
+    """Return what gathers a channel's columns; None, with the reason in `unread`, where its definition is refused."""
+    try:
+        return collector_for(channel, paths)
+    except DefinitionError as err:
+        unread[channel.topic] = str(err)
+        return None
+
+
+def _empty_table(channel: Channel) -> TopicTable:
+    return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0, "")
 
 
 def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]:
@@ -191,9 +281,13 @@ def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]
         yield block
 
 
-def _fingerprint(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+def _fingerprint(file: Path, ended: Event) -> str:
+    """Return the SHA-256 of a file, or of its beginning once `ended` is set."""
+    digest, piece = hashlib.sha256(), bytearray(1 << 20)
+    with file.open("rb", buffering=0) as stream:
+        while not ended.is_set() and (count := stream.readinto(piece)):
+            digest.update(memoryview(piece)[:count])
+    return digest.hexdigest()
 
 
 def _input_of(file: Path, pending: Future[str]) -> InputFile:
@@ -214,9 +308,9 @@ def _stream(
 
 
 def _fixes(
-    source: PositionSource, config: Config, clock: Literal["header", "log"], name: str
+    source: PositionSource, config: Config, clock: Literal["header", "log"], name: str, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
-    """Bring positions to the local plane about the datum."""
+    """Bring positions to the local plane about the datum: `given`, else configured, else the first fix."""
     if not source.usable.any():
         raise DataError(
             name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
@@ -229,7 +323,9 @@ def _fixes(
         from pymap3d import geodetic2ned
 
         latitude, longitude, height = source.geodetic[rows].T
-        if config.frames.datum is not None:
+        if given is not None:
+            datum = given
+        elif config.frames.datum is not None:
             datum = Datum(*config.frames.datum, float(height[0]))
         else:
             datum = Datum(float(latitude[0]), float(longitude[0]), float(height[0]))
@@ -246,7 +342,7 @@ def _fixes(
         var_north,
         var_east,
         covariance,
-        told_class=None if source.told_class is None else source.told_class[rows],
+        stated_class=None if source.stated_class is None else source.stated_class[rows],
     )
     return fixes, datum, dict(source.rejected)
 

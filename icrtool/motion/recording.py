@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ WINDOWS_M = (5.0, 10.0)
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
 
-MOST_STARTS = 1000
-"""Windows of a long drive start further apart: about so many of a length."""
+MOST_STARTS, LEAST_OFTEN_M = 1500, 2.5
+"""Windows of long drives start further apart: about so many of a length in all logs, but at least every half window."""
 
 STEP_S = 0.1
 """Wheel samples are joined to steps of this length."""
@@ -48,6 +48,7 @@ class Recording:
     gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
+    gyro_reversed : the gyro counts turns the other way, and its sign was turned
     """
 
     name: str
@@ -57,6 +58,7 @@ class Recording:
     width_m: float
     path: str = ""
     sha256: str = ""
+    gyro_reversed: bool = False
 
     @property
     def held_s(self) -> Floats:
@@ -64,6 +66,12 @@ class Recording:
         held: Floats = np.where(self.drive.gap, 0.0, self.drive.dt_s)
         held[-1] = 0.0
         return held
+
+    def part(self, first: int, stop: int) -> Recording:
+        """Return the states [first, stop) as a recording."""
+        rows = slice(first, stop)
+        gyro = None if self.gyro_radps is None else self.gyro_radps[rows]
+        return replace(self, t_s=self.t_s[rows], drive=Drive._make(c[rows] for c in self.drive), gyro_radps=gyro)
 
 
 class Windows(NamedTuple):
@@ -95,8 +103,14 @@ class Windows(NamedTuple):
     reference: Complexes
 
 
-def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M) -> Windows:
+def cut_windows(
+    recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Sequence[Recording] = ()
+) -> Windows:
     """Cut a recording into windows of driven distance; those across a gap or with an end in an outage are left out.
+
+    Parameters
+    ----------
+    pooled : all recordings that are fitted together; the more there are, the coarser windows and steps
 
     Raises
     ------
@@ -106,7 +120,9 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M) ->
     drive = recording.drive
     total = float(drive.distance[-1])
     place = drive.north + 1j * drive.east
-    every = max(EVERY_M, total / MOST_STARTS)
+    together = pooled or (recording,)
+    pooled_m = sum(float(one.drive.distance[-1]) for one in together)
+    every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
     begins = np.unique(np.searchsorted(drive.distance, np.arange(0.0, total, every)))
     begins = begins[~drive.in_outage[begins]]
     ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
@@ -117,7 +133,7 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M) ->
     start, end = begins[row], ends[row, column]
     knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
     return Windows(
-        *_joined_steps(recording),
+        *_joined_steps(recording, sum(float(one.held_s.sum()) for one in together)),
         knot_t=recording.t_s[knots],
         start=rows[: len(start)],
         end=rows[len(start) :],
@@ -128,8 +144,8 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M) ->
     )
 
 
-def samples_a_step(held_s: Floats, v_left: Floats, v_right: Floats) -> int:
-    """Return how many wheel samples make a step of the fits.
+def samples_a_step(held_s: Floats, v_left: Floats, v_right: Floats, pooled_s: float | None = None) -> int:
+    """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
     A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
     metre.
@@ -139,14 +155,16 @@ def samples_a_step(held_s: Floats, v_left: Floats, v_right: Floats) -> int:
         return 1
     total_s = float(held_s.sum())
     speed_mps = float((held_s * (np.abs(v_left) + np.abs(v_right))).sum()) / 2.0 / total_s
-    step_s = min(total_s / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S)
+    step_s = min(
+        (total_s if pooled_s is None else pooled_s) / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S
+    )
     return max(int(max(step_s, STEP_S) / float(np.median(held_s[lasting]))), 1)
 
 
-def _joined_steps(recording: Recording) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+def _joined_steps(recording: Recording, pooled_s: float) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Return t, held, v_left, v_right, gyro, into of steps with the mean speeds over their time."""
     drive, held = recording.drive, recording.held_s
-    joined = samples_a_step(held, drive.v_left, drive.v_right)
+    joined = samples_a_step(held, drive.v_left, drive.v_right, pooled_s)
     first = np.arange(0, len(held), joined)
     lasting = np.add.reduceat(held, first)
     gyro = recording.gyro_radps if recording.gyro_radps is not None else np.zeros(len(held))

@@ -64,8 +64,8 @@ def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_rea
     path, turned and shifted: one pass serves all.
     """
     drive, held, t = recording.drive, recording.held_s, recording.t_s
-    errors = np.full(trials.ends.shape, np.nan)
-    v_x, v_y, omega = rates[0], rates[1], rates[2]
+    errors: Floats = np.full(trials.ends.shape, np.nan)
+    v_x, v_y, omega = rates
     heading = np.concatenate([[0.0], np.cumsum(held * omega)])[:-1]
     place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * heading))])[:-1]
     if wheels_read_later_s:

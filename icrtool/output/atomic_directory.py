@@ -1,21 +1,34 @@
-"""A directory that appears whole or not at all."""
+"""A directory that appears whole or not at all, and is replaced in one step.
+
+The new directory is written and synced under a hidden name beside its place. Then both exchange their names
+(``renameat2`` of Linux, ``renamex_np`` of macOS). Where platform or file system cannot, the old one is renamed aside
+first; a process that is killed between the two renames leaves it there, and the next one renames it back.
+"""
 
 from __future__ import annotations
 
+import os
 import secrets
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from hashlib import blake2b
+from pathlib import Path, PurePosixPath
 
 from icrtool.errors import OutputError
+from icrtool.output import disk
+from icrtool.output.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
 
 Judge = Callable[[Path], bool]
 """Says whether a directory is one that we wrote and may replace."""
 
+LONGEST_NAME_BYTES = 200
+"""A hidden name is that of the place and some letters; a longer one is shortened to its hash."""
+
+NAMES_SHOWN = 5
+
 
 def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
-    """Refuse a place where a directory of ours cannot be put.
+    """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
 
     Parameters
     ----------
@@ -26,28 +39,49 @@ def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
     Raises
     ------
     OutputError
-        A file or a foreign directory is there, or nothing can be known about the place.
+        A file or a foreign directory is there; the place is inside a directory of this kind, holds one, or is a mount
+        point; or nothing can be known about the place.
     """
     try:
-        if not directory.exists():
-            _check_parent(directory)
-        elif not directory.is_dir():
+        place = _resolved(directory)
+        outer = next((parent for parent in place.parents if ours(parent)), None)
+        if outer is not None:
+            raise OutputError(directory, f"lies inside the {kind} {outer}", "name a place outside it")
+        restore(place, ours)
+        if not place.exists():
+            _check_parent(place)
+        elif not place.is_dir():
             raise OutputError(directory, "a file is there", f"name another place for the {kind}")
-        elif not ours(directory) and any(directory.iterdir()):
+        elif not _is_ours(place, ours, kind) and any(place.iterdir()):
             raise OutputError(
                 directory, f"holds something that is not a {kind}", "it is left alone; name another place"
             )
+        elif (inner := _inner(place, ours)) is not None:
+            raise OutputError(directory, f"holds another {kind} ({inner})", "it is left alone; name another place")
+        elif place.is_mount():
+            raise OutputError(directory, "is a mount point, which cannot be replaced", "name a directory in it")
     except OSError as err:
         raise OutputError(directory, "cannot be written", err.strerror or str(err)) from err
 
 
 @contextmanager
-def whole_directory(directory: Path, ours: Judge, *, kind: str) -> Iterator[Path]:
+def whole_directory(
+    directory: Path,
+    ours: Judge,
+    *,
+    kind: str,
+    names: Collection[str] = (),
+    note: Callable[[str], None] | None = None,
+) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
+
+    Files in the old directory that icrtool did not write are kept in the new one.
 
     Parameters
     ----------
     directory, ours, kind : as in `check_place`
+    names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
+    note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
 
     Yields
     ------
@@ -63,27 +97,143 @@ def whole_directory(directory: Path, ours: Judge, *, kind: str) -> Iterator[Path
     made: list[Path] = []
     partial: Path | None = None
     try:
-        place = directory.resolve()
+        place = _resolved(directory)
         made = _make_parents(place)
-        partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+        for left in _hidden(place):
+            _clean(left, place, names)
+        partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
         partial.mkdir()
-        yield partial
-        check_place(place, ours, kind=kind)
-        _put(partial, place)
+        with disk.locked(partial):
+            yield partial
+            check_place(place, ours, kind=kind)
+            done = _put(partial, place, kind, names)
         made = []
+        if note is not None and done:
+            note(f"{directory}: {done}")
     except OSError as err:
         raise OutputError(directory, "cannot be written", err.strerror or str(err)) from err
     finally:
         if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
+            _discard(partial, _resolved(directory), names)
         for parent in reversed(made):
             with suppress(OSError):
                 parent.rmdir()
 
 
+def restore(directory: Path, ours: Judge) -> None:
+    """Rename an old directory back to its place, where a killed process left it aside and put nothing there.
+
+    Raises
+    ------
+    OSError
+        It cannot be renamed.
+    """
+    place = _resolved(directory)
+    if os.path.lexists(place):
+        return
+    aside = [path for path in _hidden(place) if path.suffix == ".old" and (ours(path) or kind_of(path) is not None)]
+    if aside:
+        disk.rename(max(aside, key=lambda path: path.stat().st_mtime_ns), place)
+
+
+def _put(partial: Path, place: Path, kind: str, names: Collection[str]) -> str:
+    """Move `partial` to `place`; return a line about what the replacement removed and kept, empty where nothing."""
+    new = set(files_in(partial))
+    write_own_files(partial, kind)
+    removed: list[PurePosixPath] = []
+    kept: list[PurePosixPath] = []
+    replaces = place.exists()
+    if replaces:
+        own, foreign = files_by_owner(place, names)
+        removed = [path for path in own if path not in new and path.name != OWN_FILES]
+        kept = carry(place, partial, foreign)
+        if lost := [path for path in foreign if path not in kept and path not in new]:
+            raise OutputError(
+                place, f"holds {_listed(lost, set())}, which icrtool did not write", "move it elsewhere first"
+            )
+    disk.sync_tree(partial)
+    old = _exchange(partial, place) if replaces else None
+    if old is None:
+        disk.rename(partial, place)
+    disk.sync(place.parent)
+    if old is not None:
+        # Whoever put a file into the old directory in the meantime keeps it too.
+        kept += carry(old, place, files_by_owner(old, names)[1])
+        disk.remove(old)
+    tops = {path.parts[0] for path in new}
+    parts = [f"removed {_listed(removed, tops)}"] if removed else []
+    parts += [f"kept {_listed(kept, tops)}, not written by icrtool"] if kept else []
+    return f"replaced: {'; '.join(parts)}" if parts else ""
+
+
+def _exchange(partial: Path, place: Path) -> Path:
+    """Put `partial` into the place of a directory; return where that one is now."""
+    if disk.exchange(partial, place):
+        return partial
+    old = partial.with_suffix(".old")
+    try:
+        disk.rename(place, old)
+        disk.rename(partial, place)
+    except BaseException:
+        if old.exists() and not os.path.lexists(place):
+            disk.rename(old, place)
+        raise
+    return old
+
+
+def _clean(left: Path, place: Path, names: Collection[str]) -> None:
+    """Remove what a killed process left beside the place."""
+    # What was renamed aside is needed as long as nothing is in its place.
+    if disk.is_abandoned(left) and (left.suffix == ".partial" or place.exists()):
+        _discard(left, place, names)
+
+
+def _discard(left: Path, place: Path, names: Collection[str]) -> None:
+    """Remove a hidden directory; where it was in place once, foreign files that only it holds are kept."""
+    with suppress(OSError):
+        if kind_of(left) is not None and place.is_dir():
+            carry(left, place, files_by_owner(left, names)[1])
+        disk.remove(left)
+
+
+def _hidden(place: Path) -> list[Path]:
+    """Return the hidden directories beside a place that were or shall be that place."""
+    prefix = _prefix(place)
+    try:
+        beside = list(place.parent.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [path for path in beside if path.name.startswith(prefix) and path.suffix in (".partial", ".old")]
+
+
+def _prefix(place: Path) -> str:
+    name = os.fsencode(place.name)
+    if len(name) > LONGEST_NAME_BYTES:
+        return f".{blake2b(name, digest_size=16).hexdigest()}."
+    return f".{place.name}."
+
+
+def _is_ours(place: Path, ours: Judge, kind: str) -> bool:
+    return ours(place) or kind_of(place) == kind
+
+
+def _inner(place: Path, ours: Judge) -> Path | None:
+    """Return a directory of the same kind below a place."""
+    for folder, folders, _ in os.walk(place):
+        for name in folders:
+            if ours(inner := Path(folder, name)):
+                return inner.relative_to(place)
+    return None
+
+
+def _resolved(directory: Path) -> Path:
+    # Unlike Path.resolve it takes a link that leads to itself as it is.
+    return Path(os.path.realpath(directory))
+
+
 def _check_parent(directory: Path) -> None:
     """Refuse a place below a file."""
-    for parent in directory.absolute().parents:
+    for parent in directory.parents:
         if parent.exists():
             if not parent.is_dir():
                 raise OutputError(directory, f"{parent} is a file", "name another place")
@@ -94,20 +244,18 @@ def _make_parents(place: Path) -> list[Path]:
     """Make the missing parents of `place`; return those made, outermost first."""
     missing = [parent for parent in place.parents if not parent.exists()]
     place.parent.mkdir(parents=True, exist_ok=True)
+    for parent in missing:
+        disk.sync(parent.parent)
     return missing[::-1]
 
 
-def _put(partial: Path, place: Path) -> None:
-    """Move `partial` to `place`, an old directory there out of the way first and back again if that fails."""
-    if not place.exists():
-        partial.rename(place)
-        return
-    old = partial.with_suffix(".old")
-    place.rename(old)
-    try:
-        partial.rename(place)
-    except BaseException:
-        old.rename(place)
-        raise
-    # The new one stands; what cannot be removed of the old one is hidden and hurts nobody.
-    shutil.rmtree(old, ignore_errors=True)
+def _listed(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:
+    """Return names in a line; a directory at the top stands for its files unless it is one of `tops`."""
+    names = list(
+        dict.fromkeys(
+            f"{path.parts[0]}/" if len(path.parts) > 1 and path.parts[0] not in tops else str(path) for path in paths
+        )
+    )
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    text = ", ".join(names[:NAMES_SHOWN]) + more
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from icrtool.errors import OutputError
+from icrtool.output import disk
 
 
 @contextmanager
 def whole_file(file: Path) -> Iterator[Path]:
-    """Give a path beside a file to write to; at the end of the block it is moved to its place.
+    """Give a path beside a file to write to; at the end of the block it is synced and moved to its place.
+
+    A link stays a link: what it leads to is replaced.
 
     Raises
     ------
     OutputError
-        For every OSError of the block (disk full, no permission); what was there before still is.
+        As `check_place`, and for every OSError of the block (disk full, no permission); what was there before still is.
     """
-    partial = file.with_name(f".{file.stem}.{secrets.token_hex(4)}.partial{file.suffix.lower()}")
+    partial: Path | None = None
     try:
-        yield partial
-        partial.replace(file)
+        place = Path(os.path.realpath(file))
+        _check_kind(file, place)
+        prefix, suffix = f".{place.stem[:100]}.", f".partial{place.suffix.lower()}"
+        for left in place.parent.glob(f"{_literal(prefix)}????????{_literal(suffix)}"):
+            if disk.is_abandoned(left):
+                disk.remove(left)
+        partial = place.with_name(f"{prefix}{secrets.token_hex(4)}{suffix}")
+        partial.touch(exist_ok=False)
+        with disk.locked(partial):
+            yield partial
+            disk.sync(partial)
+            _check_kind(file, place)
+            disk.replace(partial, place)
+        disk.sync(place.parent)
     except OSError as err:
         raise OutputError(file, "cannot be written", err.strerror or str(err)) from err
     finally:
-        # Where nothing can be written nothing can be removed either, and why has been told.
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+        if partial is not None:
+            disk.remove(partial)
 
 
 def check_place(path: Path) -> None:
@@ -37,9 +52,24 @@ def check_place(path: Path) -> None:
     Raises
     ------
     OutputError
-        The directory is missing, or `path` is one itself.
+        The directory is missing; `path` is one itself, or a device or pipe.
     """
-    if not path.absolute().parent.is_dir():
-        raise OutputError(path, "its directory does not exist", "make it first, or name another file")
-    if path.is_dir():
+    try:
+        place = Path(os.path.realpath(path))
+        if not place.parent.is_dir():
+            raise OutputError(path, "its directory does not exist", "make it first, or name another file")
+        _check_kind(path, place)
+    except OSError as err:
+        raise OutputError(path, "cannot be written", err.strerror or str(err)) from err
+
+
+def _check_kind(path: Path, place: Path) -> None:
+    if place.is_dir():
         raise OutputError(path, "is a directory", "name a file")
+    if place.exists() and not place.is_file():
+        raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
+
+
+def _literal(text: str) -> str:
+    """Return a text as `Path.glob` finds it: letter by letter."""
+    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in text)

@@ -13,7 +13,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.records.measurements import Fixes, SensorData
+from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.tables import GyroSamples, HeadingSamples, Ints, States, WheelSamples
 
@@ -31,6 +32,10 @@ KINDS = {
 """Types of the columns that are not float64."""
 
 
+WHEEL_COLUMNS = ("stamp_ns", "v_left_mps", "v_right_mps")
+"""Stored for the samples before the first state; the states hold the others."""
+
+
 class FilterInputs(NamedTuple):
     """What run.json holds of the sensors: numbers that are no column."""
 
@@ -39,6 +44,8 @@ class FilterInputs(NamedTuple):
     heading_correlation_s: float
     antenna_m: tuple[float, float]
     losses_ns: Ints
+    events: tuple[SlipEvent, ...]
+    icr_start: IcrStart | None
 
 
 def write_measurements(run: Run, path: Path) -> None:
@@ -51,10 +58,10 @@ def write_measurements(run: Run, path: Path) -> None:
     """
     sensors, before = run.sensors, len(run.sensors.wheels.stamp_ns) - len(run.table)
     columns: dict[str, NDArray[Any]] = {}
-    for group, record in (("wheels", sensors.wheels), ("fixes", sensors.fixes), ("headings", sensors.headings)):
-        for field in fields(record):
-            column = getattr(record, field.name)
-            columns[f"{group}_{field.name}"] = column[:before] if group == "wheels" else column
+    for name in WHEEL_COLUMNS:
+        columns[f"wheels_{name}"] = getattr(sensors.wheels, name)[:before]
+    for group, record in (("fixes", sensors.fixes), ("headings", sensors.headings)):
+        columns |= {f"{group}_{name}": getattr(record, name) for name in _names(type(record))}
     for group, outcome in (("fixes", run.gnss), ("headings", run.heading)):
         columns |= {f"{group}_{name}": getattr(outcome, name) for name in OUTCOME_COLUMNS}
     if sensors.gyro is not None:
@@ -79,14 +86,13 @@ def read_measurements(
     try:
         with np.load(path) as stored:
             columns = {name: stored[name] for name in stored.files}
-        wheels = [_columns(columns, "wheels", WheelSamples)[field.name] for field in fields(WheelSamples)]
-        later = [getattr(table, field.name) for field in fields(WheelSamples)]
-        joined = [np.concatenate(pair) if len(pair[0]) else pair[1] for pair in zip(wheels, later, strict=True)]
-        fixes = Fixes(**_columns(columns, "fixes", Fixes))
-        headings = HeadingSamples(**_columns(columns, "headings", HeadingSamples))
+        before = _columns(columns, "wheels", WHEEL_COLUMNS)
+        stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
+        fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
+        headings = HeadingSamples(**_columns(columns, "headings", _names(HeadingSamples)))
         sensors = SensorData(
             name=inputs.name,
-            wheels=WheelSamples(*joined),
+            wheels=WheelSamples(stamps, left, right),
             fixes=fixes,
             headings=headings,
             gyro=_gyro(columns) if "gyro_topic" in columns else None,
@@ -94,19 +100,25 @@ def read_measurements(
             heading_correlation_s=inputs.heading_correlation_s,
             antenna_m=inputs.antenna_m,
             losses_ns=inputs.losses_ns,
+            events=inputs.events,
+            icr_start=inputs.icr_start,
         )
         outcomes = [
-            _outcome(columns, group, stamps, table)
-            for group, stamps in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
+            _outcome(columns, group, stamps_ns, table)
+            for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
         ]
     except (BadZipFile, KeyError, EOFError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     return sensors, outcomes[0], outcomes[1]
 
 
-def _columns(columns: dict[str, NDArray[Any]], group: str, record: type) -> dict[str, NDArray[Any]]:
-    """Return the columns of a record, all of one length and of their types."""
-    found = {field.name: _checked(columns, f"{group}_{field.name}", field.name) for field in fields(record)}
+def _names(record: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(record))
+
+
+def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a group, all of one length and of their types."""
+    found = {name: _checked(columns, f"{group}_{name}", name) for name in names}
     if len({len(column) for column in found.values()}) > 1:
         raise ValueError(f"the columns of the {group} differ in length")
     return found

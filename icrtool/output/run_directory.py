@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,12 @@ from icrtool.output.atomic_directory import check_place, whole_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.records.events import EVENT_COLUMNS
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 
 RUN_FILE = "run.json"
+EVENTS_FILE = "events.csv"
 CHECKSUM_FILE = "B2SUMS"
 """Sums of all files but the pictures, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
 
@@ -26,6 +28,10 @@ SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parq
 PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
+
+LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, "events.csv", "report.html",
+               "plots", "dropout")  # fmt: skip
+"""What a run directory may hold that is icrtool's, though the list of its files does not name it."""
 
 
 def check_target(directory: Path) -> None:
@@ -46,6 +52,7 @@ def write_run(
     states: StatesFormat = "csv",
     plots: tuple[str, ...] = ("png",),
     drawer: Drawer | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -56,6 +63,7 @@ def write_run(
     states : format of the states
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
+    note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
     ------
@@ -65,7 +73,7 @@ def write_run(
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
     with (
-        whole_directory(directory, is_run_directory, kind="run directory") as partial,
+        whole_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
         (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
@@ -77,7 +85,8 @@ def write_run(
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
         write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE)}
+        (partial / EVENTS_FILE).write_text(events_csv(run.summary["events"]), encoding="utf-8")
+        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE)}
         sums[states_name] = states_sum.result()
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
 
@@ -97,6 +106,12 @@ def is_run_directory(directory: Path) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+
+
+def events_csv(events: list[dict[str, Any]]) -> str:
+    """Return the text of events.csv: a row an event, numbers in full precision."""
+    rows = [EVENT_COLUMNS, *(tuple(str(event[column]) for column in EVENT_COLUMNS) for event in events)]
+    return "".join(f"{','.join(row)}\n" for row in rows)
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

@@ -111,6 +111,21 @@ class SegmentDocument(TypedDict):
     std: MaybeByIcr
 
 
+class EventDocument(TypedDict):
+    """A slip event."""
+
+    kind: Literal["immobilised", "slip", "skid", "spin"]
+    begin_s: float
+    end_s: float
+    begin_ns: int
+    end_ns: int
+    north_m: float
+    east_m: float
+    distance_m: float
+    severity: float
+    confidence: float
+
+
 class ClassDocument(TypedDict):
     """The fixes of one class."""
 
@@ -158,6 +173,13 @@ class WarmStartDocument(TypedDict):
     covariance_m2: Matrix
 
 
+class IcrStartDocument(TypedDict):
+    """ICRs that the filter started from, and their standard deviations."""
+
+    icrs_m: Triple
+    std_m: Triple
+
+
 class FilterDocument(TypedDict):
     """What the filter was run with."""
 
@@ -168,6 +190,7 @@ class FilterDocument(TypedDict):
     heading_from_position: bool
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
+    icr_start: IcrStartDocument | None
 
 
 class VerdictsByIcr(TypedDict):
@@ -206,6 +229,7 @@ class RunDocument(TypedDict):
     segments: list[SegmentDocument]
     gnss: GnssDocument
     heading: HeadingDocument
+    events: list[EventDocument]
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans

@@ -23,6 +23,8 @@ from icrtool.output.run_directory import (
 )
 from icrtool.output.run_schema import check_run_document
 from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
+from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.tables import Ints, States
 
@@ -57,9 +59,12 @@ def open_run(path: str | Path) -> Run:
         losses = _spans(document["rtk_losses_ns"])
         facts = document["filter"]
         forward, right = facts["antenna_m"]
+        start = facts["icr_start"]
         inputs = FilterInputs(
-            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses
-        )
+            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses,
+            tuple(SlipEvent(**{name: event[name] for name in SlipEvent._fields}) for event in document["events"]),
+            None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
+        )  # fmt: skip
         _check_sum(directory, MEASUREMENTS_FILE, sums)
         sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, WheelSamples
+from icrtool.records.events import SlipEvent
+from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
@@ -57,6 +59,13 @@ class Fixes:
         return Fixes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
+class IcrStart(NamedTuple):
+    """ICRs to start the filter from, right, left, x, and their standard deviations (3,) [m]."""
+
+    icrs_m: tuple[float, float, float]
+    std_m: tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class SensorData:
     """The streams of one log as the filter uses them: all it needs of the log.
@@ -70,6 +79,8 @@ class SensorData:
     heading_correlation_s : headings closer together than this err alike
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
+    events : spans in which the robot did not do what its wheels did, in order of time
+    icr_start : ICRs that the alignment found, or that such robots have; None: the preset's start
     """
 
     name: str
@@ -81,6 +92,8 @@ class SensorData:
     heading_correlation_s: float
     antenna_m: tuple[float, float]
     losses_ns: Ints
+    events: tuple[SlipEvent, ...] = ()
+    icr_start: IcrStart | None = None
 
     def earlier(self, delay_s: float) -> SensorData:
         """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""
@@ -95,7 +108,7 @@ class SensorData:
 
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""
-        wheels = WheelSamples(*(getattr(self.wheels, field.name)[rows] for field in fields(self.wheels)))
+        wheels = self.wheels.cut(rows)
         span = wheels.stamp_ns[[0, -1]]
         fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
         samples = slice(*np.searchsorted(self.headings.stamp_ns, span))
@@ -127,6 +140,7 @@ class Measurements:
     Attributes
     ----------
     findings : by name with unit; run.json has them as ``alignment``
+    streams : the log's chosen topics; ``why`` also names the unit of the wheels
     sections : more numbers for run.json, by section (``wheels``, ``heading``, ``gnss``)
     position_delay_s : correction of the position's clock that `sensors` holds
     antenna_is_known : its place was configured, or in the log
@@ -136,6 +150,7 @@ class Measurements:
     sensors: SensorData
     findings: dict[str, Finding]
     sections: dict[str, dict[str, Scalar]]
+    streams: tuple[StreamChoice, ...]
     fix_statistics: FixStatistics
     position_delay_s: float
     antenna_is_known: bool

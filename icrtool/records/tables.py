@@ -1,162 +1,67 @@
-"""The typed tables that packages exchange: what was measured, and what the filter made of it."""
+"""The tables that packages hand to one another: a robot's log, and the states of a run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from html import escape
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+from icrtool.records.frames import parts_from_frames
+from icrtool.records.samples import (
+    FIXED_FIX,
+    FLOAT_FIX,
+    NOT_STATED,
+    OTHER_FIX,
+    RTK_FIX,
+    Bools,
+    Bytes,
+    Complexes,
+    Datum,
+    Floats,
+    GyroAxes,
+    GyroSamples,
+    HeadingSamples,
+    InputFile,
+    Ints,
+    OtherReceiver,
+    PositionFixes,
+    Role,
+    StreamChoice,
+    WheelSamples,
+    WheelUnit,
+    rate_and_jitter,
+)
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Complexes = NDArray[np.complex128]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
-Role = Literal["wheels", "gnss", "heading"]
-
-
-NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
-"""What a message says of how its position was solved: nothing, without carrier phase (or unknown), RTK float, RTK
-fixed, RTK without saying which."""
-
-
-def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
-    lengths = [len(column) for column in columns]
-    if any(length != len(stamp_ns) for length in lengths):
-        raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
-
-
-@dataclass(frozen=True, slots=True)
-class WheelSamples:
-    """Speeds of the left and the right side.
-
-    Attributes
-    ----------
-    stamp_ns : int64 (n,), strictly increasing
-    v_left_mps, v_right_mps : float64 (n,), forward positive, each held over [k, k+1)
-    """
-
-    stamp_ns: Ints
-    v_left_mps: Floats
-    v_right_mps: Floats
-
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.v_left_mps, self.v_right_mps)
-
-
-@dataclass(frozen=True, slots=True)
-class PositionFixes:
-    """Positions of the antenna (or of the tracked reference point) in the local plane.
-
-    Attributes
-    ----------
-    stamp_ns : int64 (n,), non-decreasing
-    north_m, east_m : float64 (n,)
-    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
-    told_class : uint8 (n,), NOT_TOLD, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
-    """
-
-    stamp_ns: Ints
-    north_m: Floats
-    east_m: Floats
-    var_north_m2: Floats
-    var_east_m2: Floats
-    cov_north_east_m2: Floats
-    told_class: Bytes | None = None
-
-    def __post_init__(self) -> None:
-        told = () if self.told_class is None else (self.told_class,)
-        _check_lengths(
-            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2, *told
-        )
-
-    def cut(self, rows: slice) -> PositionFixes:
-        """Return the fixes of some rows."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
-
-
-@dataclass(frozen=True, slots=True)
-class HeadingSamples:
-    """Headings, clockwise from north.
-
-    Attributes
-    ----------
-    stamp_ns : int64 (n,), non-decreasing
-    heading_rad : float64 (n,), in (-pi, pi]
-    var_rad2 : float64 (n,), NaN where the log does not say
-    """
-
-    stamp_ns: Ints
-    heading_rad: Floats
-    var_rad2: Floats
-
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.heading_rad, self.var_rad2)
-
-
-@dataclass(frozen=True, slots=True)
-class GyroSamples:
-    """Turn rates, clockwise positive.
-
-    Attributes
-    ----------
-    topic : where they were read
-    stamp_ns : int64 (n,), strictly increasing
-    rate_radps : float64 (n,)
-    """
-
-    topic: str
-    stamp_ns: Ints
-    rate_radps: Floats
-
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.rate_radps)
-
-
-@dataclass(frozen=True, slots=True)
-class Datum:
-    """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class StreamChoice:
-    """Which topic feeds a role, and why.
-
-    Attributes
-    ----------
-    topic : topic name; a left/right pair reads ``/left + /right``
-    rate_hz : 1 / median interval
-    clock : ``header`` or ``log``: which stamps are used
-    jitter_ms : standard deviation of the interval between samples
-    """
-
-    role: Role
-    topic: str
-    message_type: str
-    count: int
-    rate_hz: float
-    clock: Literal["header", "log"]
-    jitter_ms: float
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
-class InputFile:
-    """A file that was read: path as given, size, SHA-256 (hex)."""
-
-    path: str
-    bytes: int
-    sha256: str
+__all__ = [
+    "FIXED_FIX",
+    "FLOAT_FIX",
+    "NOT_STATED",
+    "OTHER_FIX",
+    "RTK_FIX",
+    "Bools",
+    "Bytes",
+    "Complexes",
+    "Datum",
+    "Floats",
+    "GyroAxes",
+    "GyroSamples",
+    "HeadingSamples",
+    "InputFile",
+    "Ints",
+    "OtherReceiver",
+    "PositionFixes",
+    "RobotLog",
+    "Role",
+    "States",
+    "StreamChoice",
+    "WheelSamples",
+    "WheelUnit",
+    "rate_and_jitter",
+]
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -170,6 +75,9 @@ class RobotLog:
     warnings : sentences for the user, in the order they were found
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
     gyro : turn rates of an inertial unit, None without one; the filter does not use them
+    heading : without a row where no topic states one
+    gyros : all inertial units with turn rates, all axes
+    other_receivers : further GNSS receivers
     """
 
     name: str
@@ -183,6 +91,23 @@ class RobotLog:
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] | None = None
     gyro: GyroSamples | None = None
+    gyros: tuple[GyroAxes, ...] = ()
+    other_receivers: tuple[OtherReceiver, ...] = ()
+
+    @classmethod
+    def from_frames(
+        cls, wheels: pd.DataFrame, position: pd.DataFrame, heading: pd.DataFrame, gyro: pd.DataFrame | None = None,
+        name: str = "table",
+    ) -> RobotLog:  # fmt: skip
+        """Return a log from data frames; `icrtool.records.frames` lists the columns.
+
+        Raises
+        ------
+        DataError
+            A column is missing, holds what is no number, or has fewer than two samples; the column is named.
+        """
+        samples, fixes, datum, headings, rates, streams = parts_from_frames(wheels, position, heading, gyro, name)
+        return cls(LogText(name), samples, fixes, headings, datum, streams, (), {}, (), gyro=rates)
 
     def __repr__(self) -> str:
         spans = [samples.stamp_ns[[0, -1]] for samples in self._by_role().values() if len(samples.stamp_ns)]

@@ -108,3 +108,26 @@ def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> 
     assert status == 0
     assert "y right not shown, y left not shown" in out
     assert "add two spins each way" in err
+
+
+def test_several_runs_are_pooled_and_each_is_left_out(icrtool, tmp_path: Path) -> None:
+    from icrtool.output.calibration_file import open_calibration
+
+    for seed in (1, 2, 3):
+        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q")
+        icrtool("simulate", "-o", f"{seed}.mcap", *drive, *ROBOT)
+    icrtool("fit", "2.mcap", *ROBOT, "-o", "run", "--plots", "none", "-q")
+    status, out, err = icrtool("calibrate", "1.mcap", "3.mcap", *ROBOT, "-o", "cal.json", "-q")
+    assert (status, out, err) == (0, "", "")
+    status, out, _ = icrtool("calibrate", "1.mcap", "3.mcap", "run", *ROBOT)
+    assert (status, "each log left out in turn (3)" in out) == (0, True)
+    status, _, err = icrtool("calibrate", "run", "run", *ROBOT)
+    assert (status, "keeps the configuration" in err) == (1, True)
+    status, out, err = icrtool("calibrate", "1.mcap", "1.mcap", *ROBOT)
+    assert (status, out) == (1, "")
+    assert "given twice" in err
+    calibration = open_calibration(tmp_path / "cal.json")
+    assert [Path(log.path).name for log in calibration.logs] == ["1.mcap", "3.mcap"]
+    assert all(len(log.sha256) == 64 for log in calibration.logs)
+    assert {score.log for score in calibration.held_out} == {"1", "3"}
+    assert icrtool("calibrate", "1.mcap", "3.mcap", *ROBOT, "--plot", "misses.png")[0] == 2

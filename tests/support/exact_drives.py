@@ -19,7 +19,7 @@ CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 def simulate(
     seed: int = 0, *, path: str = "varied", seconds: float = 240.0, lever: tuple[float, float] = (0.3, -0.15),
     offset_deg: float = 5.0, scales: tuple[float, float] = (1.03, 0.98), gnss_delay: float = 0.0,
-    heading_delay: float = 0.0,
+    heading_delay: float = 0.0, heading_std_deg: float = 1.0,
 ) -> RobotLog:  # fmt: skip
     """Drive with stops, spins and bends (``varied``), on a circle, or straight; sensors as in the paper."""
     rng = np.random.default_rng(seed)
@@ -41,7 +41,7 @@ def simulate(
     there, psi = at(fix_t - gnss_delay), at(heading_t - heading_delay)[:, 2]
     c, s = np.cos(there[:, 2]), np.sin(there[:, 2])
     m, var = len(fix_t), np.full(len(fix_t), 1e-4)
-    heading = psi + math.radians(offset_deg) + rng.normal(0, math.radians(1), len(psi))
+    heading = psi + math.radians(offset_deg) + rng.normal(0, math.radians(heading_std_deg), len(psi))
     stamps, fix_ns, heading_ns = (EPOCH_NS + np.round(x * 1e9).astype(np.int64) for x in (t, fix_t, heading_t))
     return RobotLog(
         "made",

@@ -73,9 +73,13 @@ def run_filter_plain(
             break
         dt = time - t
         in_gap = held + 1 < len(data.wheel_t) and data.wheel_t[held + 1] - data.wheel_t[held] > parameters.wheel_gap_s
+        slips = held < len(data.slipping) and data.slipping[held]
         if dt > 0:
             Q = np.diag(parameters.process_variance) * (REFERENCE_STEP_S * dt if parameters.rate_invariant else dt**2)
-            if in_gap:
+            if in_gap or slips:
+                if slips and not in_gap:
+                    speeds = (data.v_left[held], data.v_right[held])
+                    travelled += math.hypot(*(step_state(x, *speeds, dt, parameters.step_heading)[:2] - x[:2]))
                 speed, turn = parameters.gap_speed_variance, parameters.gap_turn_variance
                 P = P + dt * np.diag([speed, speed, turn, 0.0, 0.0, 0.0]) + Q
             else:

@@ -11,16 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import Block, Channel, Container, Problems
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.records.tables import Ints
 
-_LARGEST_METADATA_BYTES = 1 << 24
-_LARGEST_RATIO = 1000
-"""A file that decompresses to more than so many times its size is no recording."""
+_LARGEST_METADATA_BYTES, _MOST_FILES, _DEEPEST = 1 << 18, 10_000, 20
+"""Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +74,13 @@ class BagDirectory:
         if self._scratch is not None:
             self._scratch.cleanup()
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+    def begin_ns(self) -> int | None:
+        """Return the log time of the first message of all files, None where one of them does not say."""
+        begins = [part.begin_ns() for part in self._parts]
+        known = [begin for begin in begins if begin is not None]
+        return min(known) if known and len(known) == len(begins) else None
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file.
 
         Raises
@@ -88,7 +93,8 @@ class BagDirectory:
             if not len(own):
                 continue
             begins, ends = [], []
-            for block in part.blocks(frozenset(own[np.isin(merged, list(wanted))].tolist())):
+            mine, whole = (frozenset(own[np.isin(merged, list(numbers))].tolist()) for numbers in (wanted, cut.whole))
+            for block in part.blocks(mine, cut._replace(whole=whole)):
                 if len(block.log_time_ns):
                     begins.append(int(block.log_time_ns.min()))
                     ends.append(int(block.log_time_ns.max()))
@@ -102,9 +108,6 @@ class BagDirectory:
 
     def _read_metadata(self) -> _Metadata:
         """Return what metadata.yaml says; a recorder that was killed leaves none, or half of it."""
-        from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
-
         file = self._path / "metadata.yaml"
         if not file.is_file():
             self._problems.say("no metadata.yaml; the storage files in it were read by name")
@@ -112,25 +115,21 @@ class BagDirectory:
         try:
             if file.stat().st_size > _LARGEST_METADATA_BYTES:
                 raise ValueError("far too long")
-            document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
-            information = document["rosbag2_bagfile_information"]
-            by_message = str(information.get("compression_mode")).upper() == "MESSAGE"
-            return _Metadata(
-                files=tuple(name for name in information["relative_file_paths"] if isinstance(name, str)),
-                message_compression=str(information.get("compression_format")) if by_message else "",
-            )
-        except (YAMLError, LookupError, TypeError, AttributeError, ValueError, OSError, RecursionError):
+            return _metadata(file.read_text(encoding="utf-8"))
+        except (ValueError, OSError, RecursionError):
             self._problems.say("its metadata.yaml cannot be read; the storage files in it were read by name")
             return _Metadata()
 
     def _find_files(self, names: tuple[str, ...]) -> list[Path]:
         """Return the files that metadata.yaml names and that are there; all storage files where it names none."""
-        named = [self._path / Path(name).name for name in dict.fromkeys(names)]
-        missing = [file.name for file in named if not file.is_file()]
-        if missing:
-            self._problems.say(f"metadata.yaml names files that are not there: {', '.join(missing)}")
-        if len(missing) < len(named):
-            return [file for file in named if file.name not in missing]
+        named = [self._path / name for name in dict.fromkeys(Path(name).name for name in names)]
+        there = [file for file in named if file.is_file()]
+        if len(there) < len(named):
+            found = frozenset(there)
+            missing = [file.name for file in named if file not in found]
+            self._problems.say(f"metadata.yaml names files that are not there: {some_of(missing)}")
+        if there:
+            return there
         self._by_name = True
         return storage_files(self._path)
 
@@ -154,7 +153,7 @@ class BagDirectory:
         folder = Path(self._scratch.name) / str(len(self.files))
         folder.mkdir(exist_ok=True)
         target = folder / file.stem
-        left = LARGEST_CHUNK_BYTES + _LARGEST_RATIO * file.stat().st_size
+        left = LARGEST_CHUNK_BYTES + LARGEST_RATIO * file.stat().st_size
         try:
             with (
                 file.open("rb") as source,
@@ -165,7 +164,7 @@ class BagDirectory:
                     sink.write(piece)
                     left -= len(piece)
             if left <= 0:
-                self._problems.say(f"{file.name}: is over {_LARGEST_RATIO} times its size when decompressed; cut there")
+                self._problems.say(f"{file.name}: is over {LARGEST_RATIO} times its size when decompressed; cut there")
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
@@ -193,3 +192,76 @@ class BagDirectory:
             own = np.array(sorted(numbers), np.int64)
             self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
         return list(merged.values())
+
+
+def _metadata(text: str) -> _Metadata:
+    """Return what the text of a metadata.yaml says of the storage files.
+
+    Raises
+    ------
+    ValueError
+        No YAML, none of a bag, an alias, or more files than a bag has.
+    """
+    document = _plain_yaml(text)
+    information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    files = information.get("relative_file_paths") if isinstance(information, dict) else None
+    if not isinstance(information, dict) or not isinstance(files, list) or len(files) > _MOST_FILES:
+        raise ValueError("not the metadata of a bag")
+    by_message = str(information.get("compression_mode")).upper() == "MESSAGE"
+    return _Metadata(
+        files=tuple(name for name in files if isinstance(name, str)),
+        message_compression=str(information.get("compression_format")) if by_message else "",
+    )
+
+
+def _plain_yaml(text: str) -> object:  # noqa: PLR0912 - one branch for each kind of event
+    """Return a YAML text as dicts, lists and strings.
+
+    An alias, with which a short text can stand for gigabytes, is refused; merge keys are keys like any other.
+
+    Raises
+    ------
+    ValueError
+        No YAML, an alias, or a key that is no text.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import (
+        AliasEvent,
+        CollectionEndEvent,
+        CollectionStartEvent,
+        MappingStartEvent,
+        ScalarEvent,
+    )
+
+    open_ones: list[tuple[dict[str, object] | list[object], list[str]]] = [([], [])]
+    try:
+        for event in YAML(typ="safe").parse(text):
+            if isinstance(event, AliasEvent):
+                raise ValueError("has an alias")  # noqa: TRY004 - of the text
+            if isinstance(event, CollectionEndEvent):
+                open_ones.pop()
+                continue
+            if isinstance(event, CollectionStartEvent):
+                value: object = {} if isinstance(event, MappingStartEvent) else []
+            elif isinstance(event, ScalarEvent):
+                value = event.value
+            else:
+                continue
+            parent, key = open_ones[-1]
+            if isinstance(parent, list):
+                parent.append(value)
+            elif key:
+                parent[key.pop()] = value
+            elif isinstance(value, str):
+                key.append(value)
+            else:
+                raise ValueError("a key is no text")
+            if isinstance(value, dict | list):
+                open_ones.append((value, []))
+                if len(open_ones) > _DEEPEST:
+                    raise ValueError("nested too deeply")
+    except YAMLError as err:
+        raise ValueError("no YAML") from err
+    documents = open_ones[0][0]
+    return documents[0] if isinstance(documents, list) and documents else None

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText, escaped, shortened
 
 Bytes = NDArray[np.uint8]
 
-MOST_PROBLEMS = 20
+MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 
 MOST_NAMED = 12
 """Names that a message lists before it says that there are more."""
@@ -38,12 +39,49 @@ class Channel:
     """
 
     id: int
-    topic: str
-    message_type: str
-    encoding: str
+    topic: LogText
+    message_type: LogText
+    encoding: LogText
     definition: str = ""
     definition_format: Literal["msg", "idl"] = "msg"
     count: int | None = None
+
+
+class Cut(NamedTuple):
+    """The part of a log that is read: log times in [begin_ns, end_ns); the channels in `whole` are read in full."""
+
+    begin_ns: int = 0
+    end_ns: int = LATEST_NS
+    whole: frozenset[int] = frozenset()
+
+    def needs(self, held: frozenset[int] | None, begin_ns: int, end_ns: int, wanted: frozenset[int]) -> bool:
+        """Return whether a chunk has to be read.
+
+        Parameters
+        ----------
+        held : its channels, None where no index says
+        begin_ns, end_ns : its first and last log time by the index; 0 and 0 where that is not known
+        """
+        if held is not None and not held & wanted:
+            return False
+        known = 0 < begin_ns <= end_ns
+        outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
+        return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
+
+    def of(self, block: Block) -> Block:
+        """Return a block without the messages outside the cut."""
+        if self == WHOLE:
+            return block
+        inside = (block.log_time_ns >= self.begin_ns) & (block.log_time_ns < self.end_ns)
+        if self.whole:
+            inside |= np.isin(block.channel, list(self.whole))
+        if inside.all():
+            return block
+        _, *columns = block
+        return Block(block.data, *(column[inside] for column in columns))
+
+
+WHOLE = Cut()
 
 
 class Block(NamedTuple):
@@ -82,8 +120,15 @@ class Container(Protocol):
         """The files that make up this log."""
         ...
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the channels in `wanted` (others may be among them), in file order."""
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+        """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
+
+        What an index shows to be outside the cut is not read.
+        """
+        ...
+
+    def begin_ns(self) -> int | None:
+        """Return the log time of the first message, None where only reading the log shows it."""
         ...
 
     def share_read(self) -> float:
@@ -100,13 +145,13 @@ class Problems(list[str]):
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        self._name = name
+        self._name = LogText(name)
 
     def say(self, problem: str) -> None:
         """Add a sentence."""
-        text = printable(f"{self._name}: {problem}")
+        text = shortened(escaped(f"{self._name}: {problem}"), LONGEST_PROBLEM)
         if text not in self and len(self) <= MOST_PROBLEMS:
-            self.append(text if len(self) < MOST_PROBLEMS else printable(f"{self._name}: and more of the kind"))
+            self.append(text if len(self) < MOST_PROBLEMS else f"{self._name}: and more of the kind")
 
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
@@ -119,17 +164,13 @@ def with_possible_times(block: Block, problems: Problems) -> Block:
     return Block(block.data, *(column[possible] for column in columns))
 
 
-def printable(text: str) -> str:
-    """Return a text from a log fit for one line: what is no printable character becomes a replacement character."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 def some_of(names: Sequence[str]) -> str:
-    """Return names in a row, the first ones of many."""
-    return ", ".join([*names[:MOST_NAMED], *(["…"] if len(names) > MOST_NAMED else [])])
+    """Return names from a log in a row, the first ones of many."""
+    shown = [str(LogText(name)) for name in names[:MOST_NAMED]]
+    return ", ".join([*shown, *(["…"] if len(names) > MOST_NAMED else [])])
 
 
-def ros_type_name(name: str) -> str:
+def ros_type_name(name: str) -> LogText:
     """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``."""
-    package, _, rest = printable(name).partition("/")
-    return f"{package}/{rest.removeprefix('msg/')}"
+    package, _, rest = name.partition("/")
+    return LogText(f"{package}/{rest.removeprefix('msg/')}")

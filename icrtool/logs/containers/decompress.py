@@ -12,9 +12,37 @@ from icrtool.logs.containers.channel import Block
 LARGEST_CHUNK_BYTES = 1 << 28
 """A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; one that claims more than this is damaged."""
 
+LARGEST_RATIO = 100
+"""A log as a whole inflates no more than this, beside one chunk of the largest size."""
+
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOCK_BYTES = 1 << 24
 _UNKNOWN_SIZE_BYTES = 1 << 24
+
+
+class Inflation:
+    """How much of a log was decompressed, held below a multiple of what it takes in the file.
+
+    Recorded chunks shrink by 2 to 20 times. A chunk that is made to inflate 1,000 times costs little space, and a
+    thousand of them would cost minutes.
+    """
+
+    def __init__(self) -> None:
+        self._left = LARGEST_CHUNK_BYTES
+
+    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
+        """Decompress a chunk as `decompress` does.
+
+        Raises
+        ------
+        DecompressionError
+            Damaged data; or the chunks before this one inflated more than `LARGEST_RATIO` times and one chunk.
+        """
+        if self._left < 0:
+            raise DecompressionError(f"the log inflates more than {LARGEST_RATIO} times")
+        out = decompress(data, compression, size, partial=partial)
+        self._left += LARGEST_RATIO * len(data) - len(out)
+        return out
 
 
 class DecompressionError(Exception):

@@ -13,16 +13,23 @@ from numpy.typing import NDArray
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import (
+    WHOLE,
     Block,
     Bytes,
     Channel,
+    Cut,
     Problems,
-    printable,
     ros_type_name,
     with_possible_times,
 )
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress, unpack_messages
+from icrtool.logs.containers.decompress import (
+    LARGEST_CHUNK_BYTES,
+    DecompressionError,
+    Inflation,
+    unpack_messages,
+)
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from mcap.records import Channel as McapChannel
@@ -45,12 +52,15 @@ class _Chunk(NamedTuple):
     ----------
     channels : those it holds, None where that is not told
     index_length : length of the message index records that follow it
+    begin_ns, end_ns : first and last log time in it, 0 where that is not told
     """
 
     at: int
     length: int
     channels: frozenset[int] | None = None
     index_length: int = 0
+    begin_ns: int = 0
+    end_ns: int = 0
 
 
 class McapFile:
@@ -72,6 +82,7 @@ class McapFile:
         self.files = [path]
         self.problems = Problems(path.name)
         self._table = RecordTable()
+        self._inflation = Inflation()
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
@@ -97,18 +108,23 @@ class McapFile:
         """Release the file."""
         self._stream.close()
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+    def begin_ns(self) -> int | None:
+        """Return the log time of the first message by the index, None without one."""
+        begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
+        return min(begins, default=None)
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, chunk by chunk."""
         if not wanted:
             return
-        blocks = self._walk() if self._chunks is None else self._indexed(self._chunks, wanted)
+        blocks = self._walk() if self._chunks is None else self._indexed(self._chunks, wanted, cut)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
         yield from blocks
 
-    def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int]) -> Iterator[Block]:
+    def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         for chunk in chunks:
-            if chunk.channels is None or chunk.channels & wanted:
+            if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
                 yield from self._read_chunk(chunk)
 
     def _channel(self, number: int) -> Channel:
@@ -117,9 +133,9 @@ class McapFile:
         encoding, written = channel.message_encoding, schema.encoding if schema else ""
         return Channel(
             id=number,
-            topic=printable(channel.topic),
-            message_type=ros_type_name(schema.name) if schema else "",
-            encoding=printable(encoding),
+            topic=LogText(channel.topic),
+            message_type=ros_type_name(schema.name) if schema else LogText(""),
+            encoding=LogText(encoding),
             definition=schema.data.decode("utf-8", "replace") if schema and (encoding, written) in _ENCODINGS else "",
             definition_format="idl" if written == "ros2idl" else "msg",
             count=self._counts.get(number) if self._chunks is not None else None,
@@ -145,7 +161,8 @@ class McapFile:
                 case ChunkIndex() as index:
                     held = frozenset(index.message_index_offsets) or None
                     start, length = index.chunk_start_offset + _HEAD_BYTES, index.chunk_length - _HEAD_BYTES
-                    chunks.append(_Chunk(start, length, held, index.message_index_length))
+                    times = index.message_start_time, index.message_end_time
+                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times))
                 case None:
                     return None
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
@@ -273,7 +290,7 @@ class McapFile:
             if chunk.length > LARGEST_CHUNK_BYTES:
                 raise DecompressionError(f"it claims {chunk.length} bytes")
             self._stream.seek(chunk.at)
-            records = np.frombuffer(_chunk_records(self._stream.read(chunk.length), cut=cut), np.uint8)
+            records = np.frombuffer(_chunk_records(self._stream.read(chunk.length), self._inflation, cut=cut), np.uint8)
         except DecompressionError as err:
             if not cut:
                 self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
@@ -336,7 +353,7 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     return record
 
 
-def _chunk_records(content: bytes, *, cut: bool) -> bytes:
+def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
     """Return the records of a chunk record's content, decompressed and checked against its checksum."""
     if len(content) < 40:
         raise DecompressionError("its header is cut off")
@@ -350,7 +367,7 @@ def _chunk_records(content: bytes, *, cut: bool) -> bytes:
     packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
     if len(packed) < length and not cut:
         raise DecompressionError("its header is damaged")
-    data = decompress(packed, compression, size, partial=cut)
+    data = inflation.decompress(packed, compression, size, partial=cut)
     if checksum and not cut and zlib.crc32(data) != checksum:
         raise DecompressionError("its checksum is wrong")
     return data

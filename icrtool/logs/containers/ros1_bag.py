@@ -10,14 +10,15 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import Block, Bytes, Channel, Problems, printable, ros_type_name
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, decompress
+from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, Problems, ros_type_name
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
-_LARGEST_HEADER_BYTES = 1 << 24
+_LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 
 
 class _Record(NamedTuple):
@@ -34,15 +35,22 @@ class _Record(NamedTuple):
     def number(self, name: bytes, size: int = 4) -> int:
         return int.from_bytes(self.fields.get(name, b"")[:size], "little")
 
+    def time(self, name: bytes) -> int:
+        """Return a time [ns], 0 where there is none."""
+        seconds, nanoseconds = (int.from_bytes(self.fields.get(name, b"")[at : at + 4], "little") for at in (0, 4))
+        return seconds * 1_000_000_000 + nanoseconds
+
     def text(self, name: bytes) -> str:
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
 class _Chunk(NamedTuple):
-    """File offset of a chunk record; the connections in it, where the index tells."""
+    """File offset of a chunk record; by the index its connections, where listed, and its first and last log time."""
 
     at: int
     connections: frozenset[int] | None
+    begin_ns: int
+    end_ns: int
 
 
 class Ros1Bag:
@@ -59,6 +67,7 @@ class Ros1Bag:
         self.files = [path]
         self.problems = Problems(path.name)
         self._table = RecordTable()
+        self._inflation = Inflation()
         self._connections: dict[int, Channel] = {}
         self._stream = path.open("rb")
         try:
@@ -82,7 +91,12 @@ class Ros1Bag:
         """Release the file."""
         self._stream.close()
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+    def begin_ns(self) -> int | None:
+        """Return the log time of the first message by the index, None without one."""
+        begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
+        return min(begins, default=None)
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted connections, chunk by chunk."""
         if not wanted:
             return
@@ -90,7 +104,7 @@ class Ros1Bag:
             yield from self._walk()
             return
         for chunk in self._chunks:
-            if chunk.connections is not None and not chunk.connections & wanted:
+            if not cut.needs(chunk.connections, chunk.begin_ns, chunk.end_ns, wanted):
                 continue
             record = self._record(chunk.at)
             if record is None or record.op != _CHUNK:
@@ -133,7 +147,7 @@ class Ros1Bag:
         counts: dict[int, int] = {}
         while at != self._size:
             record = self._record(at)
-            if record is None or record.length > min(_LARGEST_HEADER_BYTES, self._size - record.at):
+            if record is None or record.length > min(_LARGEST_CONTENT_BYTES, self._size - record.at):
                 return None
             self._stream.seek(record.at)
             content = self._stream.read(record.length)
@@ -144,7 +158,10 @@ class Ros1Bag:
                 for connection, count in held:
                     counts[connection] = counts.get(connection, 0) + count
                 place = record.number(b"chunk_pos", 8)
-                chunks[place] = _Chunk(place, frozenset(connection for connection, _ in held) or None)
+                chunks[place] = _Chunk(
+                    place, frozenset(connection for connection, _ in held) or None, record.time(b"start_time"),
+                    record.time(b"end_time"),
+                )  # fmt: skip
             else:
                 return None
             at = record.at + record.length
@@ -170,7 +187,7 @@ class Ros1Bag:
                 yield from self._read_chunk(record, learn=learn, cut=cut)
             if cut:
                 break
-            if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_HEADER_BYTES:
+            if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 self._stream.seek(record.at)
                 self._learn(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
             at = record.at + record.length
@@ -184,7 +201,8 @@ class Ros1Bag:
                 raise DecompressionError(f"it claims {record.length} bytes")
             self._stream.seek(record.at)
             packed = self._stream.read(record.length)
-            data = np.frombuffer(decompress(packed, record.text(b"compression"), size, partial=cut), np.uint8)
+            records = self._inflation.decompress(packed, record.text(b"compression"), size, partial=cut)
+            data = np.frombuffer(records, np.uint8)
         except DecompressionError as err:
             if not cut:
                 self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")
@@ -212,9 +230,9 @@ class Ros1Bag:
             return
         self._connections[number] = Channel(
             id=number,
-            topic=printable(topic or fields.get(b"topic", "")),
+            topic=LogText(topic or fields.get(b"topic", "")),
             message_type=ros_type_name(fields[b"type"]),
-            encoding="ros1",
+            encoding=LogText("ros1"),
             definition=fields.get(b"message_definition", ""),
         )
 

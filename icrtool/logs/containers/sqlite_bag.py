@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -13,10 +13,20 @@ from urllib.parse import quote
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import Block, Channel, Problems, printable, ros_type_name, with_possible_times
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, Problems, ros_type_name, with_possible_times
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
+from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
+_TABLES = frozenset({"topics", "messages", "message_definitions"})
+_FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "sum"})
+"""All that a query of ours reads and calls."""
+
+_MOST_TOPICS = 1 << 17
+_STEPS, _LEAST_STEPS, _STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
+"""Of SQLite's machine: between two looks at whether to stop; what a query may take, beside some for each byte of the
+file. Pages of a damaged table may refer to one another without end."""
+
 _FIRST_ROWS, _MOST_ROWS = 64, 4096
 _BLOCK_BYTES = 1 << 24
 _UNKNOWN_ROWS = 1 << 40
@@ -49,9 +59,12 @@ class SqliteBag:
         self.problems = Problems(path.name)
         self._made_beside: Path | None = None
         self._last_row = 0
+        self._steps_left = 0
+        self._interruption: BaseException | None = None
         try:
             self._database = self._connect()
             try:
+                self._restrict()
                 self.channels = self._read_topics()
                 self._message_compression = message_compression or self._found_compression()
                 self._rows = self._count_rows()
@@ -59,7 +72,9 @@ class SqliteBag:
                 self.close()
                 raise
         except _DAMAGE as err:
-            found = "; ".join([printable(str(err)), *self.problems])
+            if self._interruption is not None:
+                raise self._interruption from None
+            found = "; ".join([str(err), *self.problems])
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def share_read(self) -> float:
@@ -72,11 +87,19 @@ class SqliteBag:
         if self._made_beside is not None:
             self._made_beside.unlink(missing_ok=True)
 
-    def blocks(self, wanted: frozenset[int]) -> Iterator[Block]:
+    def begin_ns(self) -> int | None:
+        """Return the time of the first message, None where it cannot be read."""
+        try:
+            begin = self._query("SELECT min(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
+        except _DAMAGE:
+            return None
+        return begin if isinstance(begin, int) else None
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
         if not wanted:
             return
-        blocks = self._stored(wanted)
+        blocks = self._stored(wanted, cut)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
         yield from blocks
@@ -110,22 +133,53 @@ class SqliteBag:
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         return database
 
+    def _restrict(self) -> None:
+        """Let queries read plain tables only, for a time that is bounded, and stop when the program is to end.
+
+        Raises
+        ------
+        sqlite3.DatabaseError
+            A table of a recorder is a view, a virtual table, or has computed columns.
+        """
+        query = "SELECT name, type FROM pragma_table_list WHERE schema = 'main' AND NOT wr"
+        kinds = {name: kind for name, kind in self._database.execute(query).fetchmany(_MOST_TOPICS) if name in _TABLES}
+        for name, kind in kinds.items():
+            columns = self._database.execute(f"PRAGMA table_xinfo({name})").fetchall()
+            if kind != "table" or any(column[-1] for column in columns):
+                raise sqlite3.DatabaseError(f"{name} is not a plain table")
+        self._tables = frozenset(kinds)
+        self._database.set_authorizer(_allow)
+        self._database.set_progress_handler(self._look_up, _STEPS)
+
+    def _look_up(self) -> bool:
+        """Return whether the running query has to stop. Signals are handled here, and would be lost in SQLite."""
+        try:
+            self._steps_left -= _STEPS
+        except BaseException as err:  # noqa: BLE001 - it is raised again where the query ends
+            self._interruption = err
+        return self._interruption is not None or self._steps_left < 0
+
+    def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
+        """Run a query with a fresh bound of work."""
+        self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._path.stat().st_size
+        return self._database.execute(query, parameters)
+
     def _read_topics(self) -> list[Channel]:
-        tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        tables = self._tables
         if not {"topics", "messages"} <= tables:
             raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(map(str, tables))) or 'none'}")
         definitions = self._read_definitions() if "message_definitions" in tables else {}
         channels = []
-        for number, topic, name, encoding in self._database.execute(
+        for number, topic, name, encoding in self._query(
             "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer' ORDER BY id"
-        ):
+        ).fetchmany(_MOST_TOPICS):
             written, text = definitions.get(name, ("", ""))
             channels.append(
                 Channel(
                     id=number,
-                    topic=printable(str(topic)),
+                    topic=LogText(str(topic)),
                     message_type=ros_type_name(str(name)),
-                    encoding=printable(str(encoding)),
+                    encoding=LogText(str(encoding)),
                     definition=text if written in ("ros2msg", "ros2idl") else "",
                     definition_format="idl" if written == "ros2idl" else "msg",
                 )
@@ -136,7 +190,7 @@ class SqliteBag:
         """Return encoding and text of the message definitions by type."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         try:
-            return {name: (encoding, str(text)) for name, encoding, text in self._database.execute(query)}
+            return {name: (encoding, str(text)) for name, encoding, text in self._query(query).fetchmany(_MOST_TOPICS)}
         except _DAMAGE as err:
             self.problems.say(f"its message definitions cannot be read ({err})")
             return {}
@@ -144,25 +198,44 @@ class SqliteBag:
     def _found_compression(self) -> str:
         """Tell message compression by the first message: a serialised one never begins like a compressed one."""
         try:
-            first = self._database.execute("SELECT data FROM messages LIMIT 1").fetchone()
+            first = self._query("SELECT data FROM messages LIMIT 1").fetchone()
         except _DAMAGE:
             return ""
         return "zstd" if first and isinstance(first[0], bytes) and first[0].startswith(ZSTD_MAGIC) else ""
 
     def _count_rows(self) -> int:
         try:
-            return self._database.execute("SELECT max(rowid) FROM messages").fetchone()[0] or 0
+            last = self._query("SELECT max(rowid) FROM messages").fetchone()[0] or 0
         except _DAMAGE:
             return _UNKNOWN_ROWS
+        if not isinstance(last, int):
+            raise sqlite3.DatabaseError("its rows are not numbered")
+        return last
 
-    def _stored(self, wanted: frozenset[int]) -> Iterator[Block]:
+    def _rows_within(self, cut: Cut) -> tuple[int, int]:
+        """Return the row before the first message in a cut, and the last one in it; by the index of times, if any."""
+        if cut == WHOLE:
+            return 0, self._rows
+        within = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
+        if cut.whole:
+            within = f"({within}) OR topic_id IN ({_numbers(cut.whole)})"
+        try:
+            first, last = self._query(f"SELECT min(rowid), max(rowid) FROM messages WHERE {within}").fetchone()  # noqa: S608
+        except _DAMAGE:
+            return 0, self._rows
+        return (first - 1, last) if first is not None else (0, 0)
+
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages as they are stored; where pages are damaged, go on behind them."""
-        batch = self._batch_query(wanted)
-        after, count, step = 0, _FIRST_ROWS, 1
-        while after < self._rows:
+        batch = self._batch_query(wanted, cut)
+        after, stop = self._rows_within(cut)
+        count, step = _FIRST_ROWS, 1
+        while after < stop:
             try:
                 block, last = batch(after, count)
             except _DAMAGE as err:
+                if self._interruption is not None:
+                    raise self._interruption from None
                 if count == 1:
                     self.problems.say(f"damaged ({err}); what could be read of it was read")
                     after, step = after + step, 2 * step
@@ -201,7 +274,7 @@ class SqliteBag:
         self.problems.say("cut off; what could be read of it was read")
         return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
-    def _batch_query(self, wanted: frozenset[int]) -> Callable[[int, int], tuple[Block | None, int | None]]:
+    def _batch_query(self, wanted: frozenset[int], cut: Cut) -> Callable[[int, int], tuple[Block | None, int | None]]:
         """Return what reads up to so many messages behind a row.
 
         It gives them, None where they cannot be joined, and their last row, None where no row is left.
@@ -212,11 +285,16 @@ class SqliteBag:
         it cannot join (a column holds any type) is left to a batch of one.
         """
         # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
-        topics, lost = (",".join(str(number) for number in sorted(rows)) for rows in (wanted, self._rows_cut_off()))
+        topics, lost = _numbers(wanted), _numbers(self._rows_cut_off())
+        within = ""
+        if cut != WHOLE:
+            within = (
+                f"AND (timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns} OR topic_id IN ({_numbers(cut.whole)}))"
+            )
         rows = (
             "SELECT topic_id AS topic, timestamp AS time, length(data) AS size, data, rowid AS number, "  # noqa: S608
             "typeof(data) = 'blob' AS sound FROM messages "
-            f"WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) AND rowid > ? ORDER BY rowid LIMIT ?"
+            f"WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) {within} AND rowid > ? ORDER BY rowid LIMIT ?"
         )
         joined = (
             "SELECT group_concat(topic), group_concat(time), group_concat(size), CAST(group_concat(data, '') AS BLOB), "  # noqa: S608
@@ -224,10 +302,21 @@ class SqliteBag:
         )
 
         def batch(after: int, count: int) -> tuple[Block | None, int | None]:
-            row = self._database.execute(joined if count > 1 else rows, (after, count)).fetchone()
+            row = self._query(joined if count > 1 else rows, (after, count)).fetchone()
             return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
 
         return batch
+
+
+def _numbers(numbers: Iterable[int]) -> str:
+    return ",".join(str(number) for number in sorted(numbers))
+
+
+def _allow(action: int, first: str | None, second: str | None, _: str | None, view: str | None) -> int:
+    """Say whether SQLite may do something: read a recorder's tables, and call a few functions."""
+    reads = action == sqlite3.SQLITE_READ and (first in _TABLES or not first) and view is None
+    calls = action == sqlite3.SQLITE_FUNCTION and second in _FUNCTIONS
+    return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
 
 
 def _packed(row: Row) -> Block | None:

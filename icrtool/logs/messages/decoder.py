@@ -26,6 +26,10 @@ _MAX_NESTING = 8
 _MOST_REMEMBERED = 512
 """Ranges and columns of a message's shape; of messages with more, each one is walked."""
 
+_STEPS_PER_BYTE, _LEAST_STEPS, MOST_STEPS = 4, 256, 1 << 24
+"""Steps of the program that a message may take: those without a byte of their own are the ends of loops, and loops
+over elements of no size, which would go on for ever. The last bounds the time of one message to some 0.1 s."""
+
 _ZERO, _FOUR, _AS_BEFORE = (cast(int, np.int64(value)) for value in (0, 4, -1))
 """With a type: of a function that is called with a plain number numba compiles a copy for that number."""
 
@@ -185,7 +189,12 @@ def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, com
             at += 4
             base = at
         depth, shift, taking, step = 0, 0, True, 0
+        steps_left = min(_STEPS_PER_BYTE * (stop - at) + _LEAST_STEPS + 2 * len(program), MOST_STEPS)
         while step < len(program):
+            steps_left -= 1
+            if steps_left < 0:
+                readable[m] = False
+                break
             operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
             capacity = program[step, 4]
             if operation in (SKIP, TAKE):

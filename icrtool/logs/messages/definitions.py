@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
-from typing import Any
+from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.schema import BASE, NAME, Definitions
+from icrtool.records.text import LONGEST_NAME, shortened
 
 _SEPARATOR = "=" * 80 + "\n"
+LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
+"""Of a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
 _TIME: Definitions = {
     f"builtin_interfaces/msg/{name}": ([], [("sec", (BASE, ("int32", 0))), ("nanosec", (BASE, ("uint32", 0)))])
     for name in ("Time", "Duration")
@@ -63,19 +66,27 @@ def parse_definition(channel: Channel) -> Definitions:
     ------
     DefinitionError
     """
+    return _parse(channel.definition, channel.definition_format, channel.message_type)
+
+
+@lru_cache(maxsize=64)
+def _parse(text: str, written: Literal["msg", "idl"], message_type: str) -> Definitions:
+    """Parse a definition text; the topics of a log share few."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
-    text = channel.definition
+    if len(text) > LONGEST_DEFINITION or text.count(_SEPARATOR) > MOST_TYPES:
+        why = f"the definition in the log is longer than {LONGEST_DEFINITION} characters or {MOST_TYPES} types"
+        raise DefinitionError(message_type, why, "this type is not read")
     try:
-        if channel.definition_format == "msg":
-            return get_types_from_msg(text, full_name(channel.message_type))
+        if written == "msg":
+            return get_types_from_msg(text, full_name(message_type))
         parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
         types: dict[str, Any] = {}
         for part in parts:
             types.update(get_types_from_idl(part.split("\n", 1)[1]))
     except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
-        first = str(err).partition("\n")[0]
-        raise DefinitionError(channel.message_type, "the definition in the log cannot be parsed", first) from err
+        first = shortened(str(err).partition("\n")[0], LONGEST_NAME)
+        raise DefinitionError(message_type, "the definition in the log cannot be parsed", first) from err
     return types
 
 

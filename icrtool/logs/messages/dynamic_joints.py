@@ -18,6 +18,7 @@ from icrtool.logs.messages.decoder import walk_messages
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables
+from icrtool.records.text import LogText
 
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
 MOST_JOINTS = 100
@@ -145,6 +146,6 @@ def _interface(table: TopicTable, joint: str, quantity: str) -> NDArray[np.float
     if quantity not in texts:
         return told
     for place in range(min(names.shape[1], values.shape[1])):
-        here = names[:, place] == texts.index(quantity)
+        here = names[:, place] == texts.index(LogText(quantity))
         told[here] = values[here, place]
     return told

@@ -36,6 +36,12 @@ _STRING_COLUMNS = 3
 LONGEST_UNROLLED = 4096
 """A fixed array of which elements are taken is no longer than this: a covariance has 36."""
 
+DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_COLUMNS = 32, 20_000, 1 << 31, 1 << 16
+"""Bounds of a definition: messages within one another, fields in all, elements of a fixed array, columns taken.
+
+Real definitions reach a depth of 6 and some hundred fields; a definition that refers to itself has no end.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Slot:
@@ -114,6 +120,8 @@ class _Compiler:
         self._cdr = cdr
         self._capacity = capacity
         self.rows: list[list[int]] = []
+        self.fields = 0
+        self._depth = 0
         self.columns = 0
         self.slots: dict[str, Slot] = {}
         self._last_take = 0
@@ -122,8 +130,15 @@ class _Compiler:
         """Write the fields of message type `name`; `loop` is (repeat, stride, count column) of the loop around it."""
         if name not in self._definitions:
             raise DefinitionError(name, "its definition is not in the log and not bundled")
+        if self._depth >= DEEPEST:
+            raise DefinitionError(name, f"its definition nests more than {DEEPEST} messages", "this type is not read")
+        self._depth += 1
         for field, (node, detail) in self._definitions[name][1]:
+            self.fields += 1
+            if self.fields > MOST_FIELDS:
+                raise DefinitionError(name, f"its definition has more than {MOST_FIELDS} fields", "it is not read")
             self.field(f"{prefix}{field}", int(node), detail, loop)
+        self._depth -= 1
 
     def field(self, path: str, node: int, detail: FieldDetail, loop: tuple[int, int, int]) -> None:
         """Write one field."""
@@ -134,6 +149,8 @@ class _Compiler:
         else:
             (element, inner), count = detail
             fixed = count if node == ARRAY else None
+            if fixed is not None and fixed > LONGEST_FIXED:
+                raise DefinitionError(path, "its definition has an array longer than a message can be")
             if int(element) == BASE and inner[0] in _SIZES:
                 self._numbers(path, inner[0], fixed, loop)
             else:
@@ -215,6 +232,7 @@ class _Compiler:
         self.rows[begin][6] = len(self.rows)
         if takes:
             self.columns = first + stride * repeat
+            self._check_columns()
             self._last_take = len(self.rows)
 
     def _body_width(self, element: int, inner: FieldDetail, path: str) -> int:
@@ -223,13 +241,20 @@ class _Compiler:
         if element == BASE:
             trial._base(path, inner[0], (1, 1, -1))
         else:
+            trial.fields, trial._depth = self.fields, self._depth
             trial.message(inner, f"{path}.", (1, 1, -1))
+            self.fields = trial.fields
         return max(trial.columns, 1)
 
     def _reserve(self, columns: int) -> int:
         first = self.columns
         self.columns += columns
+        self._check_columns()
         return first
+
+    def _check_columns(self) -> None:
+        if self.columns > MOST_COLUMNS:
+            raise DefinitionError("message", f"more than {MOST_COLUMNS} numbers of each message would be taken")
 
     def _skip(self, size: int, count: int) -> None:
         if not self._cdr:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -14,12 +15,20 @@ from icrtool.logs.messages.decoder import empty_table, walk_into
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.tables import Ints
+from icrtool.records.text import LogText
 
 _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
 
 _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: the columns would be such a distance apart, and fall on the same few lines of the cache."""
+
+_FIRST_ROWS = 64
+"""Rows that a topic begins with; they double as its messages come: a log may hold thousands of topics."""
+
+_LARGEST_TABLE = 1 << 22
+_MOST_BYTES_AT_ONCE = 1 << 24
+"""Numbers in a table of rows, and bytes of messages that one compiled call goes through: it cannot be interrupted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +45,11 @@ class TopicTable:
     definition_source : where the message definition came from
     """
 
-    topic: str
-    message_type: str
+    topic: LogText
+    message_type: LogText
     log_time_ns: Ints
     columns: dict[str, NDArray[Any]]
-    texts: dict[str, list[str]]
+    texts: dict[str, list[LogText]]
     unreadable: int
     definition_source: str
 
@@ -64,7 +73,7 @@ class TopicTable:
             raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
         return values
 
-    def words(self, path: str) -> tuple[Ints, list[str]]:
+    def words(self, path: str) -> tuple[Ints, list[LogText]]:
         """Return a column of texts as indices (n,) or (n, k), -1 where a message has less, and the texts.
 
         Raises
@@ -86,10 +95,10 @@ class TopicTable:
         columns = {path: values[chosen] for path, values in self.columns.items()}
         return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
 
-    def text(self, path: str) -> str:
+    def text(self, path: str) -> LogText:
         """Return the first text of a text field, empty when there is none."""
         texts = self.texts.get(path)
-        return texts[0] if texts else ""
+        return texts[0] if texts else LogText("")
 
 
 @dataclass(slots=True)
@@ -136,7 +145,7 @@ class TopicCollector:
     _rows: _Rows = field(default_factory=_Rows)
     _times: list[Ints] = field(default_factory=list)
     _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
-    _texts: dict[str, dict[int, str]] = field(default_factory=dict)
+    _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
     def __post_init__(self) -> None:
@@ -162,6 +171,11 @@ class TopicCollector:
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
         start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
+        for rows in _pieces(end - start, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1)):
+            self._feed(block, start[rows], end[rows], times[rows])
+
+    def _feed(self, block: Block, start: Ints, end: Ints, times: Ints) -> None:
+        """Add some messages of a block."""
         new = self._walk(block, start, end, times)
         most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
         if self._capacity < min(most, self.largest_capacity):
@@ -178,13 +192,18 @@ class TopicCollector:
         """Walk messages into the rows behind the filled ones; return those rows that are not like the one before."""
         if self._rows.filled + len(start) > len(self._rows.table):
             self._settle()
-        if len(start) > len(self._rows.table):
-            self._rows = _Rows.empty(self.layout, max(len(start), _ROWS_AT_ONCE))
+            if len(self._rows.table) < max(len(start), self._more_rows()):
+                self._rows = _Rows.empty(self.layout, max(len(start), self._more_rows()))
         rows = slice(self._rows.filled, self._rows.filled + len(start))
         table, readable, walked = self._rows.table[rows], self._rows.readable[rows], self._rows.walked[rows]
         walk_into(self.layout, block.data, start, end, table, readable, walked)
         self._rows.times_ns[rows] = times_ns
         return table[readable & walked]
+
+    def _more_rows(self) -> int:
+        """Return the rows of the next table: twice those of the present one, within bounds."""
+        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1))
+        return min(max(2 * len(self._rows.table), _FIRST_ROWS), most)
 
     def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
         """Learn the texts of a text field that are in some rows and were not seen before."""
@@ -196,7 +215,8 @@ class TopicCollector:
             for code, row in zip(codes.tolist(), first.tolist(), strict=True):
                 if code not in texts:
                     place, length = int(told[row, 0]), int(told[row, 1])
-                    texts[code] = block.data[place : place + length].tobytes().decode("utf-8", "replace")
+                    raw = block.data[place : place + length].tobytes()
+                    texts[code] = LogText(raw.decode("utf-8", "replace"))
 
     def _settle(self) -> None:
         """Turn the filled rows into columns, and have them free again."""
@@ -237,7 +257,7 @@ class TopicCollector:
         self._times.clear()
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
         columns: dict[str, NDArray[Any]] = {}
-        texts: dict[str, list[str]] = {}
+        texts: dict[str, list[LogText]] = {}
         unreadable, self._unreadable = self._unreadable, 0
         gathered, self._parts = self._parts, {}
         for path, parts in gathered.items():
@@ -257,6 +277,16 @@ class TopicCollector:
         )
 
 
+def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
+    """Return slices of messages of some sizes [bytes] (n,), each of bounded rows and, but for one message, bytes."""
+    if len(sizes) <= most_rows and int(sizes.sum()) <= _MOST_BYTES_AT_ONCE:
+        return [slice(0, len(sizes))]
+    whole = np.cumsum(sizes) // _MOST_BYTES_AT_ONCE
+    edges = np.flatnonzero(np.diff(whole, prepend=-1))
+    edges = np.unique(np.concatenate([edges, np.arange(0, len(sizes), most_rows), [len(sizes)]]))
+    return [slice(int(begin), int(end)) for begin, end in pairwise(edges)]
+
+
 def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
     """Join tables of one topic and type: a ROS 1 bag gives each publisher a connection of its own."""
     groups: dict[tuple[str, str], list[TopicTable]] = {}
@@ -272,7 +302,7 @@ def _merged(group: list[TopicTable]) -> TopicTable:
     times = np.concatenate([table.log_time_ns for table in group])
     order = np.argsort(times, kind="stable")
     columns: dict[str, NDArray[Any]] = {}
-    texts: dict[str, list[str]] = {}
+    texts: dict[str, list[LogText]] = {}
     # Publishers may have been built from different versions of the type: what all of them tell is kept.
     for path in group[0].columns:
         if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):

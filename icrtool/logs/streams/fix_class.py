@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_TOLD, OTHER_FIX, RTK_FIX, Bytes, Ints
+from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, Bytes, Ints
 
 GBAS = 2
 """NavSatStatus: fixed or float, the drivers do not agree; without any of these the status tells nothing."""
@@ -28,7 +28,7 @@ NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49:
 """Position types of NovAtel as novatel_oem7_msgs numbers them; all others do without fixed or float ambiguities."""
 
 
-def told_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -> Bytes | None:
+def class_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -> Bytes | None:
     """Read ``status.status`` (n,): that of NavSatFix, or by `codes`; None where it tells nothing.
 
     Drivers of NavSatFix that know only "fix" say 0 whatever they have: without a single GBAS nothing is told.
@@ -41,34 +41,34 @@ def told_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) ->
         if not (status == GBAS).any():
             return None
         return np.where(status == GBAS, RTK_FIX, OTHER_FIX).astype(np.uint8)
-    told = _looked_up(status, codes, NOT_TOLD)
+    told = _looked_up(status, codes, NOT_STATED)
     informative = (told == FIXED_FIX) | (told == FLOAT_FIX) | (told == RTK_FIX)
     return told if informative.any() else None
 
 
-def told_by_carrier(flags: Ints | None) -> Bytes | None:
+def class_by_carrier(flags: Ints | None) -> Bytes | None:
     """Read the carrier solution of u-blox flags (n,)."""
-    return None if flags is None else _looked_up((flags >> 6) & 3, UBLOX_CARRIER, NOT_TOLD)
+    return None if flags is None else _looked_up((flags >> 6) & 3, UBLOX_CARRIER, NOT_STATED)
 
 
-def told_by_mode(modes: Ints | None) -> Bytes | None:
+def class_by_mode(modes: Ints | None) -> Bytes | None:
     """Read the mode of a Septentrio block (n,)."""
     return None if modes is None else _looked_up(modes & 0x0F, SEPTENTRIO_MODE, OTHER_FIX)
 
 
-def told_by_type(table: TopicTable, path: str) -> Bytes | None:
+def class_by_type(table: TopicTable, path: str) -> Bytes | None:
     """Read a NovAtel position type (n,), a word (``NARROW_INT``) or a number."""
     if path in table.texts:
         codes, texts = table.words(path)
         by_word = [_of_word(text) for text in texts]
-        return np.array([*by_word, NOT_TOLD], np.uint8)[codes]
+        return np.array([*by_word, NOT_STATED], np.uint8)[codes]
     values = table.find(path)
     return None if values is None else _looked_up(values.astype(np.int64), NOVATEL_TYPES, OTHER_FIX)
 
 
 def _of_word(text: str) -> int:
     if not text:
-        return NOT_TOLD
+        return NOT_STATED
     if text.endswith(("_FLOAT", "RTKFLOAT")):
         return FLOAT_FIX
     return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX

@@ -11,10 +11,11 @@ import numpy as np
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
 from icrtool.logs.streams.stamps import increasing, stamp_rows
-from icrtool.records.tables import GyroSamples
+from icrtool.records.tables import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
-GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "angular_velocity.z")
+GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
+GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *GYRO_AXES)
 
 FASTEST_RADPS = math.radians(1000.0)
 """A rate beyond this is no robot's."""
@@ -54,3 +55,21 @@ def find_gyro(
     rows = rows[order]
     sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     return GyroSamples(topic, stamps[rows], sign * rate[rows])
+
+
+def find_gyros(tables: Sequence[TopicTable], clock: Literal["header", "log"]) -> tuple[GyroAxes, ...]:
+    """Return the turn rates of every inertial unit, about all three axes."""
+    found = []
+    for table in tables:
+        if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in GYRO_AXES):
+            continue
+        rates = np.column_stack([table.floats(axis) for axis in GYRO_AXES])
+        with np.errstate(invalid="ignore"):
+            sound = (np.abs(rates) <= FASTEST_RADPS).all(axis=1)
+        if np.count_nonzero(~sound) > MOST_BAD * len(rates) or not np.ptp(rates[sound], axis=0).any():
+            continue
+        stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
+        order, _, _ = increasing(stamps[rows])
+        rows = rows[order]
+        found.append(GyroAxes(table.topic, stamps[rows], rates[rows]))
+    return tuple(found)

@@ -10,7 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.fix_class import GPSFIX_STATUS, told_by_carrier, told_by_mode, told_by_status, told_by_type
+from icrtool.logs.streams.fix_class import (
+    GPSFIX_STATUS,
+    class_by_carrier,
+    class_by_mode,
+    class_by_status,
+    class_by_type,
+)
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows
 from icrtool.records.tables import Bools, Bytes, Floats, Ints
 
@@ -62,7 +68,7 @@ class PositionSource:
     variance : (n, 3) north, east, covariance of both [m^2]; NaN where not told
     usable : (n,) rows to use; `rejected` counts the others by reason
     has_orientation : the same message tells the heading in the same frame
-    told_class : uint8 (n,) how the position was solved, None where no message says
+    stated_class : uint8 (n,) how the position was solved, None where no message says
     """
 
     topic: str
@@ -77,7 +83,7 @@ class PositionSource:
     score: float = 0.0
     why: str = ""
     problem: str = ""
-    told_class: Bytes | None = None
+    stated_class: Bytes | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -98,7 +104,7 @@ def no_position(table: TopicTable, problem: str) -> PositionSource:
 
 def _geodetic(
     table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
-    told_class: Bytes | None = None,
+    stated_class: Bytes | None = None,
 ) -> PositionSource:  # fmt: skip
     """Build a source from latitude, longitude, height; drop rows without a fix, not finite, or at 0, 0."""
     rejected: dict[str, int] = {}
@@ -130,7 +136,7 @@ def _geodetic(
     return PositionSource(
         table.topic, table.message_type, stamp_rows(table),
         np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
-        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", told_class=told_class,
+        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", stated_class=stated_class,
     )  # fmt: skip
 
 
@@ -163,7 +169,7 @@ def _without_fix(table: TopicTable) -> Bools:
 
 def _navsatfix(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    told = told_by_status(table)
+    told = class_by_status(table)
     return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", told)
 
 
@@ -177,7 +183,7 @@ def _gpsfix(table: TopicTable) -> PositionSource:
         variance[:, column] = np.where(unknown, from_radius, variance[:, column])
     variance[unknown, 2] = np.where(np.isfinite(from_radius[unknown]), 0.0, np.nan)
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    told = told_by_status(table, GPSFIX_STATUS)
+    told = class_by_status(table, GPSFIX_STATUS)
     return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", told)
 
 
@@ -206,7 +212,7 @@ def _navpvt(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     flags = _bits(table, "flags")
     no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
-    variance, told = _accuracy(table.floats(*H_ACC) * 1e-3), told_by_carrier(flags)
+    variance, told = _accuracy(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
     return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", told)
 
 
@@ -235,7 +241,7 @@ def _septentrio(mode: str, what: str, score: float) -> Reader:
         variance = _accuracy(np.where(accuracy < SEPTENTRIO_UNKNOWN, accuracy * 0.01, np.nan))
         if "latitude_std_dev" in table.columns:
             variance = _deviations(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
-        return _geodetic(table, geodetic, variance, no_fix, score, what, told_by_mode(modes))
+        return _geodetic(table, geodetic, variance, no_fix, score, what, class_by_mode(modes))
 
     return read
 
@@ -259,7 +265,7 @@ def _novatel(
         geodetic = _place(table, *place)
         geodetic[:, 2] += np.nan_to_num(table.floats("undulation"))
         variance = _deviations(*(table.floats(name) for name in deviations))
-        told = told_by_type(table, kind)
+        told = class_by_type(table, kind)
         return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, told)
 
     return read

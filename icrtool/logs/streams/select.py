@@ -55,11 +55,11 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The source of each role, and in words why it was chosen."""
+    """The source of each role, and in words why it was chosen; `heading` is None where no topic states one."""
 
     wheels: WheelMotion
     gnss: PositionSource
-    heading: HeadingSource
+    heading: HeadingSource | None
     why: dict[Role, str]
 
 
@@ -148,7 +148,7 @@ def _read_all(
 
 def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
     topics = config.topics
-    by_topic = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
+    by_topic: dict[str, TopicTable] = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
     if topics.wheel_left is not None and topics.wheel_right is not None:
         left, right = by_topic.get(topics.wheel_left), by_topic.get(topics.wheel_right)
         return [pair_motion(left, right, config)] if left is not None and right is not None else []
@@ -233,7 +233,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     _check_configured("gnss", found.gnss, topics.gnss, found.unread, log, channels)
     _check_configured("heading", found.heading, topics.heading, found.unread, log, channels)
     gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
-    if wheels is None or gnss is None or heading is None:
+    if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
@@ -245,7 +245,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
         {
             "wheels": _reason(wheels, found.wheels, topics.wheels or _pair_name(topics)),
             "gnss": _reason(gnss, found.gnss, topics.gnss),
-            "heading": _reason(heading, found.heading, topics.heading),
+            "heading": "" if heading is None else _reason(heading, found.heading, topics.heading),
         },
     )
 
@@ -256,7 +256,7 @@ def _pair_name(topics: TopicsConfig) -> str | None:
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Hold a configured pair against the log."""
-    types = {channel.topic: channel.message_type for channel in channels}
+    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     for side in ("left", "right"):
         topic = getattr(topics, f"wheel_{side}")
         if topic is None:
@@ -285,7 +285,7 @@ def _check_configured(
     """Hold a configured topic against the log. One with a mere doubt about it is used, as it was asked for."""
     if configured is None:
         return
-    types = {channel.topic: channel.message_type for channel in channels}
+    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
     if configured not in types:
         raise ConfigError(key, f"{configured} is not in {log}", f"it holds {', '.join(_listing(channels, unread))}")

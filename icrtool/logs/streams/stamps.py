@@ -69,12 +69,3 @@ def increasing(stamps: Ints) -> tuple[Ints, int, int]:
     ordered = stamps[order]
     keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
     return order[keep], backwards, len(stamps) - int(np.count_nonzero(keep))
-
-
-def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
-    """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""
-    if len(stamps) < 2:
-        return float("nan"), float("nan")
-    interval = np.diff(stamps)
-    median = float(np.median(interval))
-    return (1e9 / median if median > 0 else float("inf")), float(interval.std()) / 1e6

@@ -31,7 +31,7 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
     Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
     """
     kind = " + ".join(dict.fromkeys((left.message_type, right.message_type)))
-    topic = f"{left.topic} + {right.topic}"
+    topic = left.topic + " + " + right.topic  # not shortened: it is compared with the configuration
     commanded = bool(COMMANDED.search(left.topic))
     score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
 

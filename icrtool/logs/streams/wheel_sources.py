@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -164,11 +164,11 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     position, speed = (
         _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)]) for values in (_unwound(told), speeds)
     )
-    why = f"{what}: left {', '.join(texts[i] for i in left)}, right {', '.join(texts[i] for i in right)}"
+    why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
     return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
 
 
-def _wheels_among(texts: list[str], config: Config) -> tuple[list[int], list[int]]:
+def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
     left, right = wheel_joints(texts)
     given = config.wheels
     if given.left_joints:

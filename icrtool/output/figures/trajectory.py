@@ -53,6 +53,11 @@ FIX_LOOKS: dict[int, dict[str, Any]] = {
     FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
+SLIP_COLOR = FLOAT_COLOR
+SLIP_LOOK: dict[str, Any] = {
+    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": SLIP_COLOR,
+    "linestyle": "none", "zorder": 4.6,
+}  # fmt: skip
 REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
 """Markers by class: shape and luminance tell them apart."""
 
@@ -85,6 +90,7 @@ def draw_trajectory(run: Run, odometry: Odometry) -> Figure:
         if path is not None:
             label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
             _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
+    _draw_events(axes, run)
     ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
     axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
     axes.plot(table.east_m[-1:], table.north_m[-1:], markerfacecolor="black", markersize=6, label="end", **ends)
@@ -162,6 +168,18 @@ def _draw_places(
     seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
     shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
     axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
+
+
+def _draw_events(axes: Axes, run: Run) -> None:
+    """Mark where the slip events were: the filter's path through each, and a ring at its begin."""
+    table, label = run.table, "slip event"
+    for event in run.sensors.events:
+        rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
+        if rows.any():
+            east, north = table.east_m[rows], table.north_m[rows]
+            axes.plot(east, north, color=SLIP_COLOR, linewidth=3.0, zorder=4.5)
+            axes.plot(east[:1], north[:1], label=label, **SLIP_LOOK)
+            label = "_"
 
 
 def _draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, label: str, order: float) -> None:

@@ -9,16 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.calibration.held_out_fits import FEWEST_TO_CHOOSE
+from icrtool.calibration.held_out import FEWEST_TO_CHOOSE
 from icrtool.calibration.model_comparison import Ladder
-from icrtool.motion.window_models import CONSTANT
+from icrtool.calibration.record import FittedModel
+from icrtool.motion.models import TypicalDrive
 from icrtool.output.text_format import FITTED, TABLE_WIDTH
 from icrtool.records.dropout import Rung
-
-TERM_KEYS = (
-    "y_icr_right_m", "y_icr_left_m", "x_icr_m", "left_scale", "right_scale", "bend", "speed_spm", "wheels_read_later_s"
-)  # fmt: skip
-
 
 LADDER_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -45,15 +41,13 @@ def format_ladder(ladder: Ladder) -> str:
 
 
 def extended_line(ladder: Ladder) -> str:
-    """Say which extended models were chosen for the blocks, and which one for the whole drive."""
+    """Return which models were chosen for the blocks, and which one for the whole drive."""
     names = {name: fit.model.label for name, fit in ladder.fits.items()}
-    whole = f"for all of the way: {names[ladder.best]}"
+    whole = f"for the whole drive: {names[ladder.best]}"
     if ladder.blocks < FEWEST_TO_CHOOSE:
-        return f"extended: not chosen, {ladder.blocks} blocks are too few, it is the window fit; {whole}"
-    if set(ladder.chosen) == {CONSTANT.name}:
-        return f"extended: none pays without the block judged, it is the window fit; {whole}"
+        return f"extended: {ladder.blocks} blocks are too few to choose, it is {names[ladder.chosen[0]]}; {whole}"
     used = dict.fromkeys(names[name] for name in ladder.chosen)
-    return f"extended, chosen without the block judged: {', '.join(used)}; {whole}"
+    return f"extended, chosen without the block it is tested on: {'; '.join(used)}; {whole}"
 
 
 def ladder_rows(ladder: Ladder) -> Iterator[Sequence[str | int | float]]:
@@ -93,14 +87,22 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             }
             for rung in ladder.rungs
         ],
-        "fits": {
-            name: {
-                "value": dict(zip(TERM_KEYS, fit.parameters.tolist(), strict=True)),
-                "std": dict(zip(TERM_KEYS, np.sqrt(np.diag(fit.parameter_covariance)).tolist(), strict=True)),
-                "windows": fit.windows,
-            }
-            for name, fit in ladder.fits.items()
-        },
+        "fits": {FITS.get(name, name): _fit(fit, ladder.width_m) for name, fit in ladder.fits.items()},
+    }
+
+
+FITS = {"icr": "window"}
+"""Names of fits that differ from those in the family: ``icr`` is the filter's row."""
+
+
+def _fit(fit: FittedModel, width_m: float) -> dict[str, Any]:
+    """Return parameters and track ICRs of a fit, with one standard deviation."""
+    geometry, covariance = fit.geometry(width_m, TypicalDrive())
+    terms = fit.model.terms
+    return {
+        "value": dict(zip(terms, fit.parameters.tolist(), strict=True)) | geometry._asdict(),
+        "std": dict(zip(terms, fit.std.tolist(), strict=True))
+        | dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
     }
 
 

@@ -57,6 +57,7 @@ def format_run(run: Run) -> str:
         *_position_lines(run),
         *_heading_lines(run),
         *_delay_lines(run),
+        *event_lines(run),
     ]
     return "\n".join(line.rstrip() for line in lines)
 
@@ -250,6 +251,20 @@ def _delay_lines(run: Run) -> list[str]:
         shift = length_text(TYPICAL_DELAY_S * speed)
         lines.append(f"of the fixes: not shown by this drive; {TYPICAL_DELAY_S:g} s late would move x by {shift}")
     return [_line("" if number else "delays", line) for number, line in enumerate(lines)]
+
+
+def event_lines(run: Run) -> list[str]:
+    """Return how many slip events of each kind there were, and the worst: the one that missed most distance."""
+    events = run.summary["events"]
+    if not events:
+        return []
+    kinds = [event["kind"] for event in events]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    worst = max(events, key=lambda event: (event["end_s"] - event["begin_s"]) * event["severity"])
+    lasted = duration_text(worst["end_s"] - worst["begin_s"])
+    missed = f"{100 * worst['severity']:.0f} % of the wheels' motion missed"
+    worst_text = f"worst: {worst['kind']} from {worst['begin_s']:.1f} s for {lasted}, {missed}"
+    return [_line("slip", f"{counts}; the ICRs are not learned there"), _line("", worst_text)]
 
 
 def _line(label: str, text: str) -> str:

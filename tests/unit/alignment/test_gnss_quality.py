@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.gnss_quality import judge_fixes
-from icrtool.alignment.heading_alignment import check_heading
 from icrtool.config import load_config
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
@@ -20,7 +20,7 @@ from icrtool.records.run import Run
 from icrtool.records.tables import (
     FIXED_FIX,
     FLOAT_FIX,
-    NOT_TOLD,
+    NOT_STATED,
     OTHER_FIX,
     RTK_FIX,
     Bools,
@@ -74,8 +74,8 @@ def confess(log: RobotLog, float_: Bools, how: str) -> RobotLog:
     if how == "status":
         told[float_] = OTHER_FIX
     if how == "not":
-        told = np.full(len(float_), NOT_TOLD, np.uint8)
-    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), told_class=told))
+        told = np.full(len(float_), NOT_STATED, np.uint8)
+    return replace(log, gnss=replace(log.gnss, var_north_m2=variance, var_east_m2=variance.copy(), stated_class=told))
 
 
 def icrs(run: Run) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_outliers_are_no_jumps_and_no_float() -> None:
 def test_float_throughout_is_no_loss_and_keeps_the_variance_it_states() -> None:
     log = clean()
     told = np.full(len(log.gnss.stamp_ns), FLOAT_FIX, np.uint8)
-    run = fit(replace(log, gnss=replace(log.gnss, told_class=told)), load_config(sets=[WIDTH]))
+    run = fit(replace(log, gnss=replace(log.gnss, stated_class=told)), load_config(sets=[WIDTH]))
     assert not run.sensors.fixes.down_weighted.any()
     assert not len(run.outages_ns)
     assert np.array_equal(run.sensors.fixes.var_north_m2, log.gnss.var_north_m2)
@@ -208,7 +208,7 @@ def park_then_drive(told: int, jitter_s: float = 0.03) -> RobotLog:
     )
 
 
-@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_TOLD])
+@pytest.mark.parametrize("told", [FIXED_FIX, RTK_FIX, NOT_STATED])
 def test_stamps_that_jitter_are_no_float_where_a_robot_parks_and_then_drives(told: int) -> None:
     log = park_then_drive(told)
     run = fit(log, load_config(sets=[WIDTH]))
@@ -222,7 +222,9 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
     noise = np.where((t > 60) & (t < 80), 0.04, 0.0) * rng.normal(size=(2, len(t)))
     noisy = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + noise[0], east_m=log.gnss.east_m + noise[1]))
     sold = {
-        told: judge_fixes(confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, check_heading(noisy, CONFIG)).sold
+        told: judge_fixes(
+            confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).heading
+        ).sold
         for told in ("flags", "not")
     }
     assert not sold["flags"].any()
@@ -244,7 +246,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     count = len(log.gnss.stamp_ns)
     said, told_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, told_class=told_class))
-    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
     assert quality.warnings == (f"made: {words}",)
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
 
@@ -252,7 +254,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
 def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     lossy, float_ = lose_rtk(clean())
     log = confess(lossy, float_, "flags")
-    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
     count = int(np.count_nonzero(float_))
     # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
     (warning,) = quality.warnings
@@ -267,7 +269,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> 
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, told_class=told))
-    quality = judge_fixes(log, CONFIG, check_heading(log, CONFIG))
+    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
     assert quality.sold.any()
     assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)

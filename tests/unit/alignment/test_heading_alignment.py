@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.heading_alignment import check_heading
+from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
@@ -84,12 +84,14 @@ def rows_to_and_fro() -> RobotLog:
 
 def test_the_other_convention_is_told_from_an_offset_by_the_turns_between_rows() -> None:
     log = rows_to_and_fro()
-    assert check_heading(log, load_config()).warnings == ()
-    other = check_heading(told(log, math.pi / 2 - log.heading.heading_rad), load_config())
+    assert align_streams(log, load_config()).heading.warnings == ()
+    other = align_streams(told(log, math.pi / 2 - log.heading.heading_rad), load_config()).heading
     assert other.agreement > 0.8
     assert other.applied_mirror
     assert "other convention" in other.warnings[0]
-    paper = check_heading(other_log := told(log, -log.heading.heading_rad), load_config(sets=["filter.preset=paper"]))
+    paper = align_streams(
+        other_log := told(log, -log.heading.heading_rad), load_config(sets=["filter.preset=paper"])
+    ).heading
     assert "set frames.heading" in paper.warnings[0]
     assert np.abs(icrs(fit(other_log, load_config(sets=[WIDTH]))) - ICRS).max() < ICR_TOLERANCE_M
 
@@ -160,8 +162,8 @@ def rows(straight_m: float = 40.0, speed: float = 1.0) -> RobotLog:
 @pytest.mark.parametrize("left_scale", [0.98, 1.0, 1.02])
 def test_a_heading_in_whole_degrees_on_straight_rows_is_not_stuck(left_scale: float) -> None:
     log = rows()
-    wheels = replace(log.wheels, v_left_mps=left_scale * log.wheels.v_left_mps)
-    check = check_heading(replace(log, wheels=wheels), load_config(sets=[WIDTH]))
+    wheels = replace(log.wheels, left=left_scale * log.wheels.left)
+    check = align_streams(replace(log, wheels=wheels), load_config(sets=[WIDTH])).heading
     assert check.warnings == ()
     assert check.agreement > 0.99
 
@@ -170,7 +172,7 @@ def test_a_heading_stuck_from_the_first_turn_on_is_refused_on_straight_rows() ->
     log = rows()
     stuck = np.where(np.arange(len(log.heading.heading_rad)) > 2000, log.heading.heading_rad[0], 0.3)
     with pytest.raises(DataError, match="stays the same while the wheels turn the robot"):
-        check_heading(told(log, stuck), load_config(sets=[WIDTH]))
+        align_streams(told(log, stuck), load_config(sets=[WIDTH]))
 
 
 def test_a_noisy_heading_is_not_an_unexplained_one() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.wheel_alignment import check_wheels
+from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
@@ -21,12 +21,12 @@ ICR_TOLERANCE_M = 0.05
 
 
 def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
-    return replace(log, wheels=replace(log.wheels, v_left_mps=left, v_right_mps=right))
+    return replace(log, wheels=replace(log.wheels, left=left, right=right))
 
 
 def test_good_wheels_are_left_as_they_are() -> None:
     log = make_log(seconds=120.0)
-    check = check_wheels(log, CONFIG)
+    check = align_streams(log, CONFIG).wheels
     assert check.warnings == ()
     assert check.log is log
     assert check.scale == pytest.approx(1.0, abs=0.01)
@@ -66,7 +66,7 @@ def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # ty
 )
 def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
     log = make_log(seconds=120.0)
-    check = check_wheels(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
+    check = align_streams(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG).wheels
     assert any(words in warning for warning in check.warnings)
     assert check.applied_scale == 1.0
 
@@ -89,7 +89,7 @@ def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
             gnss=PositionFixes(stamps[fix], north, east, known, known, 0 * known),
             heading=HeadingSamples(stamps, told, np.full(len(t), 1e-4)),
         )
-        assert check_wheels(straight, CONFIG).warnings == ()
+        assert align_streams(straight, CONFIG).wheels.warnings == ()
 
 
 def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:
@@ -107,13 +107,13 @@ def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backward
 def test_preset_paper_corrects_nothing() -> None:
     log = make_log(seconds=120.0)
     spoilt = with_wheels(log, log.wheels.v_right_mps, log.wheels.v_left_mps)
-    check = check_wheels(spoilt, load_config(sets=["filter.preset=paper"]))
+    check = align_streams(spoilt, load_config(sets=["filter.preset=paper"])).wheels
     assert check.log is spoilt
 
 
 def test_a_configured_scale_is_not_touched() -> None:
     log = make_log(seconds=120.0)
     spoilt = with_wheels(log, 1.07 * log.wheels.v_left_mps, 1.07 * log.wheels.v_right_mps)
-    check = check_wheels(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"]))
+    check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"])).wheels
     assert check.applied_scale == 1.0
     assert any("check wheel radius" in warning for warning in check.warnings)

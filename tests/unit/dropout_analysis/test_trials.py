@@ -204,10 +204,9 @@ def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
     code = (
         "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
-        "from icrtool.kernels import error_statistics, open_loop, open_loop_fast as fast, window_errors\n"
+        "from icrtool.kernels import error_statistics, open_loop, open_loop_fast as fast\n"
         "kernels = [open_loop.find_trial_ends, open_loop.integrate_trials, open_loop.integrate_path, fast.last_end,\n"
-        "    fast.plan_block, fast.solve_block, error_statistics.resample_blocks, window_errors.march,\n"
-        "    window_errors.fill_misses]\n"
+        "    fast.plan_block, fast.solve_block, error_statistics.resample_blocks]\n"
         "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -30,7 +30,7 @@ def slipping(log: RobotLog, seed: int, share: float = 0.08, lasts_s: float = 20.
     rng, t = np.random.default_rng(seed), (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
     steps = (t / lasts_s).astype(int)
     left, right = 1.0 + share * rng.standard_normal((2, steps[-1] + 1))[:, steps]
-    wheels = replace(log.wheels, v_left_mps=left * log.wheels.v_left_mps, v_right_mps=right * log.wheels.v_right_mps)
+    wheels = replace(log.wheels, left=left * log.wheels.v_left_mps, right=right * log.wheels.v_right_mps)
     return replace(log, wheels=wheels)
 
 

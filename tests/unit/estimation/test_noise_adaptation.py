@@ -62,7 +62,7 @@ def test_the_cost_is_least_near_the_noise_a_drive_was_made_with() -> None:
     """Track speeds with white errors of 0.6 m/s at 100 Hz: as Q of 0.6 m/s along the path."""
     log, rng = make_log(seed=3, seconds=120.0, rate=100.0), np.random.default_rng(4)
     both = 0.6 * rng.standard_normal(len(log.wheels.stamp_ns))
-    wheels = replace(log.wheels, v_left_mps=log.wheels.v_left_mps + both, v_right_mps=log.wheels.v_right_mps + both)
+    wheels = replace(log.wheels, left=log.wheels.v_left_mps + both, right=log.wheels.v_right_mps + both)
     config = load_config(sets=[WIDTH, "filter.process_position_mps=0.3", "filter.process_heading_degps=7"])
     run = fit(replace(log, wheels=wheels), config)
     ladder = [0.075, 0.15, 0.3, 0.6, 1.2, 2.4]
@@ -88,7 +88,7 @@ def turning_errors(log: RobotLog, std_degps: float, lasts_s: float = 0.5) -> Rob
     side = turn * 1.1 / 2
     return replace(
         log,
-        wheels=replace(log.wheels, v_left_mps=log.wheels.v_left_mps + side, v_right_mps=log.wheels.v_right_mps - side),
+        wheels=replace(log.wheels, left=log.wheels.v_left_mps + side, right=log.wheels.v_right_mps - side),
     )
 
 

@@ -71,7 +71,7 @@ def lost(log: RobotLog) -> RobotLog:
     t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
     seen = np.flatnonzero((t < 100.0) | (t >= 120.0))
     gnss = PositionFixes(
-        *(getattr(log.gnss, name)[seen] for name in PositionFixes.__slots__ if name != "told_class"), None
+        *(getattr(log.gnss, name)[seen] for name in PositionFixes.__slots__ if name != "stated_class"), None
     )
     return replace(log, gnss=gnss)
 

@@ -364,7 +364,7 @@ def test_mcap_channel_that_is_no_utf_8_is_left_out_and_said(tmp_path):
         Message(2, START_NS, b"two", START_NS, 0),
     )
     found, problems = read_log(path)
-    assert found == [("/a\ufffd\ufffd[31m", START_NS, b"one")]
+    assert found == [(r"/a\n\x1b[31m", START_NS, b"one")]
     assert problems == ["log.mcap: a schema or channel that cannot be read was left out"]
 
 
@@ -633,7 +633,7 @@ def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
         """
     )
     database.close()
-    expected = [*messages, ("/huge", 8, b"\1"), ("/\ufffd\ufffd", 9, b"\2")]
+    expected = [*messages, ("/huge", 8, b"\1"), ("/\ufffd\\n", 9, b"\2")]
     problems = ["log.db3: rows without a time or a message left out"]
     for log in (path, path.parent):
         assert read_log(log) == (expected, problems)
@@ -660,7 +660,9 @@ def test_an_sqlite_file_that_is_no_bag_is_refused(tmp_path, tables):
     database = sqlite3.connect(path)
     database.executescript(f"{tables}; PRAGMA user_version = 3;")
     database.close()
-    with pytest.raises(LogError, match="not a readable rosbag2 database; its tables are "):
+    with pytest.raises(
+        LogError, match=r"not a readable rosbag2 database; (its tables are|messages is not a plain table)"
+    ):
         open_log(path)
 
 
@@ -710,7 +712,7 @@ def test_a_compressed_file_that_is_none_is_refused(tmp_path, content):
 def test_a_compressed_file_that_is_a_bomb_does_not_fill_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(bag_directory, "LARGEST_CHUNK_BYTES", 1 << 20)
-    monkeypatch.setattr(bag_directory, "_LARGEST_RATIO", 10)
+    monkeypatch.setattr(bag_directory, "LARGEST_RATIO", 10)
     path = write_directory(tmp_path / "log", make_messages(2), mode=CompressionMode.FILE)
     (file,) = path.glob("*.zstd")
     file.write_bytes(rle_bomb(100_000))

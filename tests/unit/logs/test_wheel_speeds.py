@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
 from icrtool.logs.streams.wheel_speeds import wheel_samples
-from icrtool.records.tables import Floats, Ints, PositionFixes
+from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
 
 RADIUS_M, STEP_NS = 0.1, 20_000_000
 CONFIG = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}"])
@@ -20,8 +21,10 @@ NOTHING = PositionFixes(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
 def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[str]]:
     stamps = STEP_NS * np.arange(len(left), dtype=np.int64)
     motion = motion_of("/wheels", "some/Type", StampedRows(None, stamps, "", 0), position=(left, right))
-    samples, _, warnings = wheel_samples(motion, stamps, CONFIG, NOTHING, "log")
-    return samples.stamp_ns, samples.v_left_mps, samples.v_right_mps, warnings
+    raw, _ = wheel_samples(motion, stamps, CONFIG, "log")
+    headings = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    log = with_wheel_speeds(RobotLog("log", raw, NOTHING, headings, None, (), (), {}, ()), CONFIG)
+    return log.wheels.stamp_ns, log.wheels.v_left_mps, log.wheels.v_right_mps, list(log.warnings)
 
 
 @pytest.fixture

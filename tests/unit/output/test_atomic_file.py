@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.atomic_file import whole_file
+from icrtool.output import disk
+from icrtool.output.atomic_file import check_place, whole_file
 from icrtool.output.exports.acceptance import write_junit, write_markdown
 
 
@@ -37,7 +39,40 @@ def test_a_file_system_that_only_reads_is_one_error(tmp_path: Path, monkeypatch,
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
-    for name in ("write_bytes", "replace", "unlink"):
+    for name in ("touch", "write_bytes", "replace", "unlink"):
         monkeypatch.setattr(Path, name, refuse)
     with pytest.raises(OutputError, match="cannot be written; Read-only file system"):
         write(tmp_path / "a", [])
+
+
+@pytest.mark.parametrize("call", ["sync", "replace"])
+def test_a_disk_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch, call: str) -> None:
+    (tmp_path / "a.txt").write_text("old")
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(disk, call, fail)
+    with pytest.raises(OutputError, match="Input/output error"), whole_file(tmp_path / "a.txt") as partial:
+        partial.write_text("new")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path(os.devnull)):
+        with pytest.raises(OutputError, match="device or pipe"):
+            check_place(place)
+        with pytest.raises(OutputError, match="device or pipe"), whole_file(place):
+            pass
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "a.txt").symlink_to("real/b.txt")
+    (tmp_path / "real" / ".b.12345678.partial.txt").write_text("of a killed process")
+    with whole_file(tmp_path / "a.txt") as partial:
+        partial.write_text("new")
+    assert (tmp_path / "a.txt").is_symlink()
+    assert [(path.name, path.read_text()) for path in (tmp_path / "real").iterdir()] == [("b.txt", "new")]

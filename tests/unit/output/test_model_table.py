@@ -45,16 +45,7 @@ def test_the_document_is_json(ladder: Ladder) -> None:
     assert set(document["fits"]["window"]["value"]) >= {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}
 
 
-@pytest.mark.parametrize(
-    ("blocks", "chosen", "best", "said"),
-    [
-        (2, "window", "window_late", "extended: not chosen, 2 blocks are too few, it is the window fit"),
-        (3, "window", "window_late", "extended: none pays without the block judged, it is the window fit"),
-        (3, "window_late", "window_late", "extended, chosen without the block judged: with delay"),
-    ],
-)
-def test_the_line_says_what_was_chosen_and_why_not(
-    ladder: Ladder, blocks: int, chosen: str, best: str, said: str
-) -> None:
-    line = extended_line(replace(ladder, blocks=blocks, chosen=(chosen,) * blocks, best=best))
-    assert line == f"{said}; for all of the way: with delay"
+def test_the_line_names_what_was_chosen_or_why_nothing_was(ladder: Ladder) -> None:
+    line = extended_line(replace(ladder, blocks=3, chosen=("icr", "five", "five"), best="eight"))
+    assert [ladder.fits[name].model.label in line for name in ("icr", "five", "eight")] == [True] * 3
+    assert "too few" in extended_line(replace(ladder, blocks=2, chosen=("multiplier",) * 2, best="icr"))

@@ -25,14 +25,14 @@ def written(tmp_path: Path, run: Run) -> Path:
 
 
 def names_in(directory: Path) -> list[str]:
-    return sorted(str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file())
+    return sorted(str(path.relative_to(directory)) for path in directory.rglob("[!.]*") if path.is_file())
 
 
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) -> None:
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
     plots = [f"plots/{name}.{form}" for name in figures.FIGURES for form in ("png", "svg")]
     assert names_in(tmp_path / "runs" / "barn") == sorted(
-        ["B2SUMS", "measurements.npz", "run.json", "states.csv", *plots]
+        ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.csv", *plots]
     )
     assert {"trajectory", "icr_estimates", "icr_clusters", "gnss_difference"} == set(figures.FIGURES)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
@@ -83,7 +83,7 @@ def test_what_is_not_a_number_becomes_null_and_letters_stay() -> None:
 
 def test_states_may_be_parquet(tmp_path: Path, run: Run) -> None:
     write_run(run, tmp_path / "barn", states="parquet", plots=())
-    assert names_in(tmp_path / "barn") == ["B2SUMS", "measurements.npz", "run.json", "states.parquet"]
+    assert names_in(tmp_path / "barn") == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert open_run(tmp_path / "barn").table.north_m.tobytes() == run.table.north_m.tobytes()
 
 
@@ -103,7 +103,7 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Ru
     (written / "dropout").mkdir()
     (written / "dropout" / "summary.csv").write_text("of the old states")
     write_run(run, written, states="parquet", plots=())
-    assert names_in(written) == ["B2SUMS", "measurements.npz", "run.json", "states.parquet"]
+    assert names_in(written) == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
 

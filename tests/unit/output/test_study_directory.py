@@ -37,7 +37,7 @@ def small(name, robot: str | None = None) -> StudyResult:
 def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> None:
     result = small(name)
     write_study(result, tmp_path / "study")
-    assert sorted(path.name for path in (tmp_path / "study").iterdir()) == sorted(
+    assert sorted(path.name for path in (tmp_path / "study").glob("[!.]*")) == sorted(
         ["study.json", f"{name}.csv", f"{name}.png"]
     )
     document = json.loads((tmp_path / "study" / "study.json").read_text(encoding="utf-8"))
@@ -58,9 +58,9 @@ def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> N
 def test_an_old_study_is_replaced_and_anything_else_is_left_alone(tmp_path: Path) -> None:
     result = small("rate")
     write_study(result, tmp_path / "study", plots=())
-    (tmp_path / "study" / "old").touch()
+    before = (tmp_path / "study").stat().st_ino
     write_study(result, tmp_path / "study", plots=())
-    assert not (tmp_path / "study" / "old").exists()
+    assert (tmp_path / "study").stat().st_ino != before
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes").touch()
     with pytest.raises(OutputError, match="not a study directory"):

@@ -1,0 +1,226 @@
+"""Which side is which, which way a heading turns: hypotheses compared by their likelihood.
+
+Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
+with v the mean of the sides' speeds and u half their difference, its changes in ∫u and ∫v. Sides that are swapped or
+reversed exchange v and u or change their signs; a heading or a position of the other handedness turns psi round. One
+robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis says what they
+should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left side. Its cost is the squared
+Mahalanobis distance from there.
+
+Two symmetries are exact: position and heading mirrored together is sides swapped; a heading turned by 180 deg is sides
+swapped and both reversed. There the fewest faults decide, the gyro's sense counting as one.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
+from icrtool.records.tables import Floats, Ints
+
+EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
+"""How far robots lie from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry = 0."""
+
+DECISIVE = 25.0
+"""Twice the log-likelihood, five standard deviations: less does not overrule that everything is as it is named."""
+
+OVERLAP = 8.0
+FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "heading mirrored": 1.0,
+          "position mirrored": 1.5, "turned about": 0.5, "gyro upside down": 1.0}  # fmt: skip
+ABOUT_RAD = math.radians(135.0)
+MOST_WINDOWS = 4000
+
+
+class Convention(NamedTuple):
+    """One hypothesis.
+
+    Attributes
+    ----------
+    swapped : sides are exchanged; sign_left, sign_right : of the named sides, before they are exchanged
+    heading, position : +1, or -1 where mirrored
+    """
+
+    swapped: bool
+    sign_left: int
+    sign_right: int
+    heading: int
+    position: int
+
+    def faults(self, offset: float, gyro_sense: int) -> float:
+        """Return how many things would be wrong; `gyro_sense` as in `decide_conventions`."""
+        count = FAULTS["swapped"] * self.swapped
+        signs = self.sign_left + self.sign_right
+        count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
+        count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
+        count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
+        return count + FAULTS["gyro upside down"] * (gyro_sense * self.heading < 0)
+
+
+class Decision(NamedTuple):
+    """The convention that was chosen.
+
+    Attributes
+    ----------
+    margin : by how much twice its log-likelihood exceeds that of everything being as named
+    as_likely : another convention with the same likelihood and no more than half a fault more, None without one
+    """
+
+    convention: Convention
+    margin: float
+    as_likely: Convention | None
+
+
+AS_NAMED = Convention(swapped=False, sign_left=1, sign_right=1, heading=1, position=1)
+
+
+class _Shown(NamedTuple):
+    """What a handedness shows: Z (re v, im v, re u, im u), turn by u and by v, covariances, residuals."""
+
+    z: Floats
+    z_covariance: Floats
+    turn: Floats
+    turn_covariance: Floats
+    residuals: Floats
+
+
+def decide_conventions(
+    drive: DriveArrays, windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
+) -> Decision:
+    """Compare all hypotheses.
+
+    Parameters
+    ----------
+    metric : whether positions may be mirrored (a pose in a local frame); geodetic ones are not
+    gyro_sense : +1 where a gyro turns as the heading is named, -1 where the other way, 0 without one
+    mirror_allowed : whether the heading's handedness is free
+    """
+    if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
+        return Decision(AS_NAMED, 0.0, None)
+    shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
+    losses = _losses(shown, 0.5 * drive.fix_std_m / windows.length_m)
+    costs: dict[Convention, tuple[float, float]] = {}
+    for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
+        if (position < 0 and not metric) or (heading < 0 and not mirror_allowed):
+            continue
+        one = Convention(swapped, left, right, heading, position)
+        cost, offset = _cost(one, shown[heading * position])
+        costs[one] = cost + losses[heading * position], offset
+    named = costs[AS_NAMED][0]
+    best = min(cost for cost, _ in costs.values())
+    if named - best < DECISIVE:
+        return Decision(AS_NAMED, 0.0, None)
+    likely = {one: one.faults(offset, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
+    ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
+    chosen = ranked[0]
+    close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
+    return Decision(chosen, named - costs[chosen][0], ranked[1] if close else None)
+
+
+TIE = 9.0
+"""Hypotheses this near the best are as good."""
+
+FEWEST_WINDOWS = 16
+
+
+def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
+    """Fit displacements and turns for one handedness, with hardly any prior."""
+    v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
+    some = slice(None, None, max(1, len(windows.begin) // MOST_WINDOWS))
+    begin, end = windows.begin[some], windows.end[some]
+    nose = np.exp(1j * hand * np.interp(drive.wheel_t + drive.wheel_dt / 2, drive.heading_t, drive.heading))
+
+    def cumulated(rate: Floats) -> Floats:
+        return np.concatenate([[0.0], np.cumsum((rate * drive.wheel_dt)[:-1])])
+
+    spans = []
+    for rate in (v * nose, u * nose):
+        at = np.interp(drive.fix_t, drive.wheel_t, cumulated(rate))
+        spans.append((at[end] - at[begin]) / windows.length_m)
+    seen = (drive.fix[end] - drive.fix[begin]) / windows.length_m
+    columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
+    design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
+    place = _linear(design, target, np.concatenate([windows.group[some]] * 2), 10.0)
+    few = slice(None, None, max(1, len(windows.turn_begin) // MOST_WINDOWS))
+    first, last = windows.turn_begin[few], windows.turn_end[few]
+    turned = hand * (np.interp(last, drive.heading_t, drive.heading) - np.interp(first, drive.heading_t, drive.heading))
+    by = [
+        np.interp(last, drive.wheel_t, cumulated(rate)) - np.interp(first, drive.wheel_t, cumulated(rate))
+        for rate in (u, v)
+    ]
+    turn = _linear(np.column_stack(by), turned, windows.turn_group[few], 10.0)
+    return _Shown(place.x, place.covariance, turn.x, turn.covariance, place.residuals)
+
+
+def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
+    """Return twice the negative log-likelihood of either handedness, both in the noise of the better one."""
+    scale = max(min(mad_std(one.residuals, 0.0) for one in shown.values()), least)
+    return {
+        hand: float((2.0 * LOSS_SIGMAS**2 * (np.sqrt(1.0 + (one.residuals / scale / LOSS_SIGMAS) ** 2) - 1.0)).sum())
+        / OVERLAP
+        for hand, one in shown.items()
+    }
+
+
+def _linear(design: Floats, target: Floats, group: Ints, prior_std: float) -> RobustFit:
+    zero = np.zeros(design.shape[1])
+    return robust_least_squares(
+        lambda x: (design @ x - target, design), zero, zero, np.full(len(zero), prior_std),
+        group=group, overlap=OVERLAP,
+    )  # fmt: skip
+
+
+def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
+    """Return the squared Mahalanobis distance of what was shown from what a convention expects, and its offset."""
+    # named sides -> true sides -> (v, u) of the true sides, as a matrix on (v, u) of the named ones
+    sides = np.diag([float(one.sign_left), float(one.sign_right)])
+    if one.swapped:
+        sides = sides[::-1]
+    halves = np.array([[0.5, 0.5], [0.5, -0.5]])
+    true_by_named = halves @ sides @ np.linalg.inv(halves)
+    back = np.linalg.inv(true_by_named)
+    # p = Z (v, u)_named = Z back (v, u)_true
+    lift = np.kron(back.T, np.eye(2))
+    z, covariance = lift @ shown.z, lift @ shown.z_covariance @ lift.T
+    size = max(math.hypot(z[0], z[1]), math.hypot(z[2], z[3]), 1e-9)
+    offset = math.atan2(z[1], z[0])
+    c, s = math.cos(offset), math.sin(offset)
+    unturn = np.kron(np.eye(2), np.array([[c, s], [-s, c]])) / size
+    z, covariance = unturn @ z, unturn @ covariance @ unturn.T
+    away = z - np.array([1.0, 0.0, 0.0, 0.0])
+    cost = float(away @ np.linalg.solve(covariance + np.diag(EXPECTED_STD[:4] ** 2), away))
+    exchange = np.array([[back[1, 1], back[0, 1]], [back[1, 0], back[0, 0]]])
+    turn = exchange @ shown.turn * one.position
+    spread = exchange @ shown.turn_covariance @ exchange.T
+    size = max(float(np.abs(turn).max()), 1e-9)
+    away = turn / size - np.array([1.0, 0.0])
+    cost += float(away @ np.linalg.solve(spread / size**2 + np.diag(EXPECTED_STD[4:] ** 2), away))
+    return cost, math.remainder(offset * one.position, 2 * math.pi)
+
+
+def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
+    """Say which sides or senses are not as named; the heading's own is reported with its offset."""
+    one, done = decision.convention, ": corrected" if corrects else ""
+    notes = []
+    if one.swapped:
+        notes.append(f"left and right wheels are swapped{done}")
+    signs = (one.sign_left, one.sign_right)
+    reversed_ = {(-1, 1): "the left wheels count", (1, -1): "the right wheels count", (-1, -1): "both wheels count"}
+    if signs in reversed_:
+        notes.append(f"{reversed_[signs]} backwards{done}")
+    if one.position < 0:
+        notes.append(f"positions are mirrored (east for west){done}")
+    if decision.as_likely is not None:
+        notes.append(f"{_in_words(decision.as_likely)} would explain the log as well: check the wheels' names")
+    return notes
+
+
+def _in_words(one: Convention) -> str:
+    parts = ["swapped sides"] * one.swapped
+    parts += ["a reversed left side"] * (one.sign_left < 0) + ["a reversed right side"] * (one.sign_right < 0)
+    parts += ["a mirrored heading"] * (one.heading < 0) + ["mirrored positions"] * (one.position < 0)
+    return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"

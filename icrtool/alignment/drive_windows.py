@@ -1,0 +1,158 @@
+"""A log as arrays, cut into windows of driven distance: what the alignment estimator compares."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.gnss_steps import bend_std_m, unbroken
+from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+
+WINDOW_M = 2.0
+WINDOW_IN_POSITION_STD = 12.0
+"""A window is so long that noise of the fixes turns its displacement by no more than 7 deg."""
+
+STARTS_A_WINDOW = 8
+LONGEST_WINDOW_S = 30.0
+"""A window that takes longer holds an outage or a stop."""
+
+TURN_WINDOW_S, TURN_STEP_S = 1.0, 0.5
+"""Heading changes are compared over this time; windows start at every step."""
+
+UNSTATED_STD_M, NOISIER = 0.01, 1.5
+"""Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
+
+
+class DriveArrays(NamedTuple):
+    """A log in seconds since its first wheel sample.
+
+    Attributes
+    ----------
+    wheel_t, wheel_dt : (n,) `wheel_dt` is 0 where the next sample is too far away
+    v_left, v_right : (n,) [m/s]
+    heading_t, heading : (h,) unwrapped [rad], clockwise from north
+    fix_t : (m,); fix : complex (m,), north + j east [m]
+    travel : (n,) mean of the distances of both sides [m], without their signs
+    fix_std_m : noise of the fixes, an axis
+    same_clock : position and heading are fields of the same messages
+    """
+
+    wheel_t: Floats
+    wheel_dt: Floats
+    v_left: Floats
+    v_right: Floats
+    heading_t: Floats
+    heading: Floats
+    fix_t: Floats
+    fix: Complexes
+    travel: Floats
+    fix_std_m: float
+    same_clock: bool
+
+
+class DriveWindows(NamedTuple):
+    """Windows of a drive.
+
+    Attributes
+    ----------
+    begin, end : (w,) rows of the fixes, first and last of a window
+    length_m : wheel distance of a window
+    turn_begin, turn_end : (u,) [s] windows of heading changes
+    group, turn_group : (w,), (u,) stretches of distance that are independent of one another
+    """
+
+    begin: Ints
+    end: Ints
+    length_m: float
+    turn_begin: Floats
+    turn_end: Floats
+    group: Ints
+    turn_group: Ints
+
+
+def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
+    """Return a log as arrays; `heading` in place of its own."""
+    wheels, gnss = log.wheels, log.gnss
+    heading = log.heading if heading is None else heading
+    epoch = int(wheels.stamp_ns[0])
+    wheel_t, fix_t, heading_t = (
+        (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
+    )
+    dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
+    step = dt * (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps)) / 2
+    topics = {stream.role: stream.topic for stream in log.streams}
+    return DriveArrays(
+        wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps, heading_t, np.unwrap(heading.heading_rad),
+        fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
+        fix_std_m(gnss), "gnss" in topics and topics["gnss"] == topics.get("heading", ""),
+    )  # fmt: skip
+
+
+def fix_std_m(gnss: PositionFixes) -> float:
+    """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more."""
+    variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
+    known = variance[np.isfinite(variance) & (variance > 0)]
+    stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
+    seen = bend_std_m(gnss)
+    return seen if seen > NOISIER * stated else stated
+
+
+def cut_windows(drive: DriveArrays) -> DriveWindows:
+    """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
+
+    All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
+    """
+    length = max(WINDOW_M, WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0))
+    at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
+    cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
+    begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)
+    end = np.searchsorted(at_fix, at_fix[begin] + length)
+    begin, end = begin[end < len(at_fix)], end[end < len(at_fix)]
+    first, last = _common_span(drive)
+    whole = (drive.fix_t[begin] >= first) & (drive.fix_t[end] <= last)
+    whole &= drive.fix_t[end] - drive.fix_t[begin] < LONGEST_WINDOW_S
+    whole &= (at_fix[end] - at_fix[begin] < 2.0 * length) & _clear(drive, drive.fix_t[begin], drive.fix_t[end])
+    begin, end = begin[whole], end[whole]
+    turn_begin, turn_end = _turn_windows(drive, first, last)
+    size = _group_length(float(drive.travel[-1]), length)
+    turn_travel = np.interp(turn_begin, drive.wheel_t, drive.travel)
+    return DriveWindows(
+        begin, end, length, turn_begin, turn_end,
+        np.floor(at_fix[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
+    )  # fmt: skip
+
+
+def _group_length(total: float, length: float) -> float:
+    """Return the distance that counts as one independent observation: 10 windows, where there are 40 of them."""
+    return min(max(total / 40.0, 2.0 * length), 10.0 * length)
+
+
+def _common_span(drive: DriveArrays) -> tuple[float, float]:
+    """Return begin and end of what wheels and heading both cover [s]."""
+    starts, ends = [drive.wheel_t[0]], [drive.wheel_t[-1]]
+    if len(drive.heading_t):
+        starts.append(drive.heading_t[0])
+        ends.append(drive.heading_t[-1])
+    return float(max(starts)), float(min(ends))
+
+
+def _clear(drive: DriveArrays, begin: Floats, end: Floats) -> Bools:
+    """Return which spans (w,) hold no gap in the wheel data."""
+    gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
+    return np.asarray(np.searchsorted(gap, begin) == np.searchsorted(gap, end))
+
+
+def _turn_windows(drive: DriveArrays, first: float, last: float) -> tuple[Floats, Floats]:
+    """Return begin and end of windows [s] in which wheels and heading were sampled and the wheels turned."""
+    t = drive.heading_t
+    if not len(t):
+        return np.empty(0), np.empty(0)
+    begin = t[0] + TURN_STEP_S * np.unique(np.floor((t - t[0]) / TURN_STEP_S))
+    begin = begin[(begin >= first) & (begin + TURN_WINDOW_S <= last)]
+    end = begin + TURN_WINDOW_S
+    sampled = np.searchsorted(t, end) > np.searchsorted(t, begin) + 1
+    moved = np.interp(end, drive.wheel_t, drive.travel) > np.interp(begin, drive.wheel_t, drive.travel)
+    kept = sampled & moved & _clear(drive, begin, end)
+    return begin[kept], end[kept]

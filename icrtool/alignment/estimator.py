@@ -1,0 +1,244 @@
+"""One estimate of what relates wheels, heading and positions: scales, ICRs, heading offset, delays.
+
+With the heading measured along the path, all of it is linear but for the heading offset and the delays. Windows of
+driven distance from fix i to fix j, and windows of time of the heading itself:
+
+    p_j - p_i = e^{j d} [a ∫v e^{j psi} + m ∫u e^{j psi} + c ∫j u e^{j psi} + l ∫j v w e^{j psi}],   u = (V_l - V_r)/2
+    psi(t + T) - psi(t) = k ∫w + q ∫v/b + g T,                                                       w = (V_l - V_r)/b
+
+with psi taken tau_h later than stamped, and p tau_p earlier. Then a is the wheel scale, W = a b/k, and in general
+y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c/(2 k/b) (Pentzer 2014, Eqs. 8-12).
+
+Not separable: a sideways crab from the offset; the antenna's place from the ICRs (forward from x_icr, right from the
+middle of y); sideways slip l from tau_p at constant speed. Priors decide.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
+from icrtool.kernels.robust import RobustFit, robust_least_squares
+from icrtool.records.tables import Complexes, Floats
+
+NAMES = (
+    "scale",
+    "middle",
+    "x",
+    "slip",
+    "turn",
+    "asymmetry",
+    "drift",
+    "offset",
+    "position_after_heading",
+    "heading_delay",
+)
+A, M, C, L, K, Q, G, D, TP, TH = range(10)
+
+PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
+PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.15, 0.5])
+"""They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
+far to either side. Delays of position and heading of one
+robot usually agree to 0.15 s."""
+
+MIDDLE_STD_M = 0.1
+"""The middle of the ICRs lies this near to the antenna, to either side."""
+
+SAME_CLOCK_STD_S = 1e-3
+"""Fields of the same messages are late together."""
+
+STEP_S = 0.02
+"""Delays are differentiated over this step."""
+
+OVERLAP = 1.0
+"""Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
+
+FEWEST_WINDOWS = 16
+MOST_STEPS = 15
+
+
+class Geometry(NamedTuple):
+    """What the estimate says of the robot, with covariance.
+
+    Attributes
+    ----------
+    values : (6,) y_icr_right, y_icr_left, x_icr [m], left scale, right scale, W [m]
+    covariance : (6, 6)
+    """
+
+    values: Floats
+    covariance: Floats
+
+
+class AlignmentFit(NamedTuple):
+    """The parameters in the order of `NAMES`, with covariance.
+
+    Attributes
+    ----------
+    fit : the robust fit; width_m : b that w was formed with
+    windows : DriveWindows it was made of
+    """
+
+    fit: RobustFit
+    width_m: float
+    windows: DriveWindows
+
+    def estimate(self, name: str) -> tuple[float, float]:
+        """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
+        if name == "position_delay":
+            both = self.fit.covariance[np.ix_([TP, TH], [TP, TH])]
+            return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
+        row = NAMES.index(name)
+        variance = float(self.fit.covariance[row, row])
+        # rounding may leave a variance below zero where the drive hardly shows the parameter
+        return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
+
+    @property
+    def heading_scatter(self) -> float:
+        """Robust scatter of the heading [rad], across windows or within a second, whichever is more."""
+        return max(self.across_std, float(self.fit.scale[-1]) / math.sqrt(2.0))
+
+    @property
+    def across_std(self) -> float:
+        """Robust scatter of the displacements across the heading, over the window's length [rad]."""
+        return float(self.fit.scale[len(self.windows.begin)]) / self.windows.length_m
+
+    def geometry(self) -> Geometry:
+        """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
+        x, b = self.fit.x, self.width_m
+        columns = []
+        for i in range(len(x)):
+            moved = x.astype(np.complex128)
+            moved[i] += 1e-20j
+            columns.append(_geometry(moved, b).imag / 1e-20)
+        jacobian = np.column_stack(columns)
+        return Geometry(_geometry(x.astype(np.complex128), b).real, jacobian @ self.fit.covariance @ jacobian.T)
+
+
+def _geometry(x: Complexes, b: float) -> Complexes:
+    left, right = (x[K] + x[Q] / 2) / b, (x[K] - x[Q] / 2) / b
+    y_right, y_left = (x[A] + x[M]) / 2 / left, -(x[A] - x[M]) / 2 / right
+    width = y_right - y_left
+    return np.array([y_right, y_left, -x[C] * b / (2 * x[K]), left * width, right * width, width])
+
+
+def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
+    """Estimate all parameters jointly; None with too few windows.
+
+    Parameters
+    ----------
+    drive : with a heading; windows : of the same drive
+    width_m : the track width b
+
+    Notes
+    -----
+    Soft-L1 weights, each residual kind (along, across, turn) with its own robust scale; covariance from groups of
+    distance (`icrtool.kernels.robust`).
+    """
+    if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
+        return None
+    model = _Model(drive, windows, width_m)
+    start = PRIOR_MEAN.copy()
+    start[D] = model.first_offset()
+    w, u = len(windows.begin), len(windows.turn_begin)
+    kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
+    group = np.concatenate([windows.group, windows.group, windows.turn_group])
+    prior_std = PRIOR_STD.copy()
+    prior_std[TP] = SAME_CLOCK_STD_S if drive.same_clock else prior_std[TP]
+    prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
+    try:
+        fit = robust_least_squares(
+            model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
+        )
+    except np.linalg.LinAlgError:
+        # exact data on one circle: nothing separates the parameters
+        return None
+    return AlignmentFit(fit, width_m, windows)
+
+
+class _Model:
+    """Residuals of the windows and their Jacobian."""
+
+    def __init__(self, drive: DriveArrays, windows: DriveWindows, width_m: float) -> None:
+        self.drive, self.windows, self.b = drive, windows, width_m
+        self.v = (drive.v_left + drive.v_right) / 2
+        self.u = (drive.v_left - drive.v_right) / 2
+        self.middle_t = drive.wheel_t + drive.wheel_dt / 2
+        self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
+        self.turn_v, self.turn_w = self._cumulate(self.v).real, self._cumulate(2 * self.u / width_m).real
+        self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
+            windows.turn_begin, drive.heading_t, drive.heading
+        )
+
+    def _cumulate(self, rate: Floats | Complexes) -> Complexes:
+        total: Complexes = np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
+        return total
+
+    def first_offset(self) -> float:
+        """Return the direction of the displacements from wheels laid along the heading [rad]."""
+        nose = np.exp(1j * np.interp(self.middle_t, self.drive.heading_t, self.drive.heading))
+        at = np.interp(self.drive.fix_t, self.drive.wheel_t, self._cumulate(self.v * nose))
+        laid = at[self.windows.end] - at[self.windows.begin]
+        unit = self.seen * np.conj(laid)
+        return float(np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12))))
+
+    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return residuals along, across and of turns, and their Jacobian."""
+        place, place_slopes = self._displacements(x)
+        turn, turn_slopes = self._turns(x)
+        return (
+            np.concatenate([place.real, place.imag, turn]),
+            np.concatenate([place_slopes.real, place_slopes.imag, turn_slopes]),
+        )
+
+    def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
+        """Return predicted minus seen displacements in the frame of the heading (w,), and their slopes (w, k)."""
+        drive, windows = self.drive, self.windows
+        offset, late_h, late_p = float(x[D]), float(x[TH]), float(x[TH] + x[TP])
+
+        def heading_at(t: Floats) -> Floats:
+            return np.interp(t + late_h, drive.heading_t, drive.heading)
+
+        nose = np.exp(1j * (heading_at(self.middle_t) + offset))
+        rate = (heading_at(self.middle_t + STEP_S) - heading_at(self.middle_t - STEP_S)) / (2 * STEP_S)
+        sideways = 1j * self.v * 2 * self.u / self.b
+        # the turn rate, as a speed difference: with an asymmetry it does not vanish where both sides are equal
+        turning = self.u + x[Q] / (2.0 * x[K]) * self.v
+        body = x[A] * self.v + x[M] * self.u + 1j * x[C] * turning + x[L] * sideways
+        t = drive.fix_t - late_p
+        begin, end = windows.begin, windows.end
+
+        def between(velocity: Complexes) -> Complexes:
+            at = np.interp(t, drive.wheel_t, self._cumulate(velocity))
+            return np.asarray(at[end] - at[begin], np.complex128)
+
+        path = self._cumulate(body * nose)
+        at = np.interp(t, drive.wheel_t, path)
+        predicted = at[end] - at[begin]
+        speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
+        slopes = np.zeros((len(begin), len(x)), np.complex128)
+        slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
+        slopes[:, C], slopes[:, L] = between(1j * turning * nose), between(sideways * nose)
+        slopes[:, D] = 1j * predicted
+        slopes[:, TP] = -(speed[end] - speed[begin])
+        slopes[:, TH] = slopes[:, TP] + between(1j * rate * body * nose)
+        psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + offset
+        level = np.exp(-0.5j * (psi[begin] + psi[end]))
+        return (predicted - self.seen) * level, slopes * level[:, None]
+
+    def _turns(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return predicted minus seen heading changes (u,), and their slopes (u, k)."""
+        windows, t = self.windows, self.drive.wheel_t
+        begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
+
+        def over(values: Floats, shift: float = 0.0) -> Floats:
+            return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
+
+        slopes = np.zeros((len(begin), len(x)))
+        slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        slopes[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        predicted = x[K] * slopes[:, K] + x[Q] * slopes[:, Q] + x[G] * TURN_WINDOW_S
+        return predicted - self.turned, slopes

@@ -1,0 +1,162 @@
+"""Wheel speeds in m/s of what a log sends: metres per unit by the configuration, else by the position reference."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.errors import ConfigError, DataError
+from icrtool.records.tables import Bools, Floats, Ints, PositionFixes, RobotLog, WheelSamples, WheelUnit
+
+WINDOW_S = 2.0
+LEAST_MOVE_M = 0.3
+FEWEST_WINDOWS = 8
+"""The distance by the position reference is compared with that of the wheels over straight windows of this length."""
+
+FASTEST_MPS = 100.0
+"""No robot on wheels or tracks is faster: a number over it is damage, and would make a distance of any length."""
+
+SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
+"""A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
+
+UNIT_TOLERANCE = 0.35
+"""A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Metres by the position reference per unit of the wheels: median, its standard deviation, windows used."""
+
+    value: float
+    std: float
+    windows: int
+
+
+def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
+    """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
+
+    What no wheel can have done is left out; configured scales of the sides are applied. What was used, and what had
+    to be estimated, stands in the stream's ``why`` and in the warnings.
+
+    Raises
+    ------
+    ConfigError
+        A radius or resolution that is needed and cannot be found from the log.
+    DataError
+        Fewer than two usable samples.
+    """
+    wheels = log.wheels
+    if wheels.unit == "mps":
+        return log
+    topic = next((stream.topic for stream in log.streams if stream.role == "wheels"), "wheels")
+    factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+    warnings = [f"{log.name}: {note}" for note in estimated]
+    with np.errstate(over="ignore"):
+        left = wheels.left * factor * _side_scale(config.wheels.left_scale)
+        right = wheels.right * factor * _side_scale(config.wheels.right_scale)
+    stamps = wheels.stamp_ns
+    possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
+    if not possible.all():
+        count = np.count_nonzero(~possible)
+        warnings.append(f"{log.name}: {topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out")
+        stamps, left, right = stamps[possible], left[possible], right[possible]
+    if (spikes := _spikes(left) | _spikes(right)).any():
+        warnings.append(
+            f"{log.name}: {topic}: {np.count_nonzero(spikes)} wheel speeds, up to "
+            f"{max(np.abs(left).max(), np.abs(right).max()):.0f} m/s, unlike those around them left out: "
+            "were counters reset?"
+        )
+        stamps, left, right = stamps[~spikes], left[~spikes], right[~spikes]
+    if len(stamps) < 2:
+        raise DataError(log.name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
+    streams = tuple(
+        replace(stream, count=len(stamps), why=f"{stream.why}{how}") if stream.role == "wheels" else stream
+        for stream in log.streams
+    )
+    samples = WheelSamples(stamps, left, right, from_position=wheels.from_position)
+    return replace(log, wheels=samples, streams=streams, warnings=(*log.warnings, *warnings))
+
+
+def _spikes(speed: Floats) -> Bools:
+    """Mark single samples (n,) far faster than those before and after them, and than almost all others."""
+    size = np.abs(speed)
+    if len(size) < 2:
+        return np.zeros(len(size), np.bool_)
+    around = np.maximum(np.append(size[1], size[:-1]), np.append(size[1:], size[-2]))
+    usual = float(np.quantile(size, USUAL_SHARE))
+    spikes: Bools = (size > max(SPIKE_MPS, SPIKE_RATIO * usual)) & (size > SPIKE_RATIO * around)
+    return spikes
+
+
+def _side_scale(scale: float | str) -> float:
+    """Return a side's configured scale; ``auto`` is 1 here, and judged where position and heading are known."""
+    return scale if isinstance(scale, float | int) else 1.0
+
+
+def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
+    """Compare distances by reference and wheels over straight windows; None where too few are straight."""
+    if len(gnss.stamp_ns) < 2:
+        return None
+    begin, end, window = max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9)
+    inside = gnss.stamp_ns[(gnss.stamp_ns >= begin) & (gnss.stamp_ns < end)]
+    # Only windows that a fix begins: one stamp that is years off would make billions of them.
+    edges = begin + window * np.unique((inside - begin) // window)
+    if len(edges) < 2:
+        return None
+    places = np.searchsorted(gnss.stamp_ns, edges)
+    places = places[places < len(gnss.stamp_ns)]
+    moments = gnss.stamp_ns[places]
+    interval = np.diff(stamps) / 1e9
+    sides = []
+    for speed in (left, right):
+        travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])
+        sides.append(np.diff(np.interp(moments, stamps, travelled)))
+    distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
+    chord = np.hypot(np.diff(gnss.north_m[places]), np.diff(gnss.east_m[places]))
+    whole = np.abs(np.diff(moments) / 1e9 - WINDOW_S) < WINDOW_S / 4
+    straight = whole & (turn < 0.1 * np.abs(distance)) & (chord > LEAST_MOVE_M) & (np.abs(distance) > 0)
+    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+        return None
+    ratio = chord[straight] / np.abs(distance[straight])
+    centre = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - centre)))
+    return Scale(centre, 1.2533 * spread / math.sqrt(len(ratio)), len(ratio))
+
+
+def _metres_per_unit(
+    wheels: WheelSamples, gnss: PositionFixes, config: Config, topic: str
+) -> tuple[float, str, list[str]]:
+    """Return metres per unit, how it is known in words, and what had to be estimated for want of a key."""
+    radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
+    known: dict[WheelUnit, float] = {"m": 1.0}
+    if radius is not None:
+        known["rad"] = radius
+        if counts is not None:
+            known["counts"] = 2 * math.pi * radius / counts
+    unit, per = wheels.unit, "" if wheels.from_position else "/s"
+    if unit in known:
+        return known[unit], "" if unit == "m" else f" in {unit}{per}", []
+    scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
+    if unit == "unknown" and scale is not None:
+        name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
+        if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
+            return value, f" in {name}{per} (by the position reference)", []
+    if scale is None and unit == "unknown":
+        raise ConfigError(
+            "wheels.quantity",
+            f"{topic} names no unit, and the log has no straight driving to find it from",
+            "drive straight for some metres; where they are ticks, give --set wheels.quantity=counts",
+        )
+    lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
+    if scale is None:
+        raise ConfigError(
+            lacking,
+            f"needed to read {topic}, which is in {unit}",
+            f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
+        )
+    how = f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
+    why = "no unit that the robot's keys know fits" if radius and counts else f"{lacking} is not given"
+    return scale.value, how, [f"{why}{how}"]

@@ -1,0 +1,213 @@
+"""``icrtool batch``."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+from icrtool.cli.fit import plot_formats
+from icrtool.cli.options import POSITIVE
+
+if TYPE_CHECKING:
+    from icrtool.fleet.one_log import Request
+    from icrtool.fleet.row import Row
+
+
+@click.command("batch")
+@click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
+@click.option("-o", "--output", metavar="DIR", required=True, type=click.Path(path_type=Path),
+              help="Folder of the tables and, under runs/, of the run directories.")  # fmt: skip
+@click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
+              help="Logs at the same time; default: cores, fewer where memory would not hold them.")  # fmt: skip
+@click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
+@click.option("--timeout", "timeout_s", metavar="SECONDS", type=POSITIVE, default=1800.0, show_default=True,
+              help="End a log that takes longer.")  # fmt: skip
+@click.option("--redo", is_flag=True, help="Process logs again that are done.")
+@click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
+              help="Distance over which 95 % of the trials stay within this error; repeatable.")  # fmt: skip
+@click.option(
+    "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
+)
+@click.option("--ladder/--no-ladder", default=True, show_default=True,
+              help="Compare all models on distance they were not fitted to.")  # fmt: skip
+@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@click.option("--json", "as_json", is_flag=True, help="Print fleet.json, and nothing else, on standard output.")
+@options.configuration
+@options.verbosity
+def command(
+    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float, redo: bool,
+    budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool, plots: str, as_json: bool,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    """Fit and report on many logs, in several processes, and collect a table with a row per log.
+
+    A FOLDER is searched recursively. A MANIFEST (CSV or TOML) lists logs or patterns with their robot, configuration,
+    group and tags. A log that fails, hangs or kills its process costs only itself. The same command continues an
+    interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
+
+    Exit status: 3 if a gate failed, else 1 if a log could not be used.
+
+    \b
+    Example:
+      icrtool batch season/ -o results --robot husky-a200
+      icrtool batch logs.csv -o results -j 4 --gate "icr.p95@10m <= 1.5"
+    """  # noqa: D301 - click reads the escape
+    from icrtool.fleet.batch import BatchOptions, plan, run_batch
+    from icrtool.fleet.fleet_files import fleet_document, write_fleet
+    from icrtool.output.run_directory import json_bytes
+
+    asked = BatchOptions(
+        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s,
+    )  # fmt: skip
+    requests = plan(places, output, asked)
+    output.mkdir(parents=True, exist_ok=True)
+    view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
+    rows: list[Row] = []
+    with (
+        executor_of(requests, jobs, scheduler) as executor,
+        view.live(),
+        closing(run_batch(requests, executor, asked, view.stage)) as coming,
+    ):
+        for row in coming:
+            rows.append(row)
+            view.row(row)
+    order = {request.row.log: number for number, request in enumerate(requests)}
+    rows.sort(key=lambda row: order[row.log])
+    write_fleet(rows, output)
+    if as_json:
+        click.echo(json_bytes(fleet_document(rows)).decode(), nl=False)
+    elif not quiet:
+        click.echo(summary_of(rows, output))
+    if any(row.gates_failed for row in rows):
+        raise SystemExit(3)
+    if any(row.status == "failed" for row in rows):
+        raise SystemExit(1)
+
+
+@contextmanager
+def executor_of(requests: Sequence[Request], jobs: int | None, scheduler: str | None) -> Iterator[Executor]:
+    """Give what runs the logs: threads that own a process each, or a Dask cluster."""
+    from icrtool.errors import ConfigError
+    from icrtool.fleet.batch import local_executor
+    from icrtool.fleet.worker import close_all
+
+    if scheduler is None:
+        try:
+            with local_executor(requests, jobs) as executor:
+                yield executor
+        finally:
+            close_all()
+        return
+    try:
+        from distributed import Client
+    except ImportError as err:
+        raise ConfigError("--scheduler", "needs Dask", "pip install 'icrtool[cluster]'") from err
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as err:
+        raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
+    with client, client.get_executor() as executor:
+        yield executor
+
+
+class View:
+    """What is shown of a batch while it runs: a line per log, and on a terminal a line about those that run."""
+
+    def __init__(self, logs: int, *, quiet: bool, as_json: bool, verbose: bool) -> None:
+        self._logs = logs
+        self._prints = not quiet and not as_json
+        self._reports = not quiet
+        self._verbose = verbose
+        self._live = not quiet and sys.stderr.isatty()
+        self._begun = time.monotonic()
+        self._counts: Counter[str] = Counter()
+        self._stages: dict[str, str] = {}
+
+    @contextmanager
+    def live(self) -> Iterator[None]:
+        """Remove the line about what runs at the end."""
+        try:
+            yield
+        finally:
+            self._clear()
+
+    def stage(self, log: str, stage: str) -> None:
+        """Show that a log has come to a stage."""
+        self._stages[log] = stage
+        self._show()
+
+    def row(self, row: Row) -> None:
+        """Show what a log has come to."""
+        self._stages.pop(row.log, None)
+        self._counts[row.status] += 1
+        self._clear()
+        if row.status == "failed":
+            if self._reports:
+                click.echo(f"Error: {shown(row.log)}: {shown(row.reason)}", err=True)
+                if self._verbose and row.details:
+                    click.echo("\n".join(shown(line) for line in row.details.splitlines()), err=True)
+        elif self._prints:
+            click.echo(line_of(row))
+        for verdict in row.verdicts:
+            if not verdict.passed:
+                value = "no trial of that length" if verdict.value_m is None else f"{verdict.value_m:.4g} m"
+                click.echo(f"FAIL  {shown(row.log)}: {verdict.gate}: {value}", err=True)
+        self._show()
+
+    def _show(self) -> None:
+        if not self._live:
+            return
+        done, worked = self._counts.total(), self._counts["done"] + self._counts["failed"]
+        parts = [f"{done}/{self._logs} done"]
+        if self._counts["failed"]:
+            parts.append(f"{self._counts['failed']} failed")
+        elapsed = time.monotonic() - self._begun
+        if worked:
+            rate = worked / elapsed
+            left = (self._logs - done) / rate
+            parts += [f"{60 * rate:.3g} logs/min", f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"]
+        parts += [f"{shown(log)}: {stage}" for log, stage in list(self._stages.items())]
+        width = shutil.get_terminal_size().columns - 1
+        click.echo(f"\r\x1b[2K{'  '.join(parts)[:width]}", err=True, nl=False)
+
+    def _clear(self) -> None:
+        if self._live:
+            click.echo("\r\x1b[2K", err=True, nl=False)
+
+
+def line_of(row: Row) -> str:
+    """Return a line about a log that could be used."""
+    parts = [f"{row.status:7}", shown(row.log)]
+    if row.duration_s is not None and row.distance_m is not None:
+        parts.append(f"{row.duration_s:.0f} s  {row.distance_m:.0f} m")
+    right, left = row.icr.get("y_icr_right_m"), row.icr.get("y_icr_left_m")
+    if right is not None and left is not None:
+        std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
+        parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
+    if (p95 := row.errors.get("icr_p95_10m_m")) is not None:
+        parts.append(f"95 % within {p95:.3g} m after 10 m")
+    return "  ".join(parts)
+
+
+def summary_of(rows: Sequence[Row], output: Path) -> str:
+    """Return the last line: how many logs came to what, and where the tables are."""
+    counts = Counter(row.status for row in rows)
+    parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
+    failed_gates = sum(row.gates_failed for row in rows)
+    parts += [f"{failed_gates} gates failed"] if failed_gates else []
+    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: fleet.csv, failures.csv, runs/"
+
+
+def shown(text: str) -> str:
+    """Return a text of a log's or a library's as a terminal can show it."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -1,0 +1,226 @@
+"""A batch: hand the logs to an executor, skip what is done, retry what died, give a row each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from hashlib import blake2b, sha256
+from pathlib import Path
+
+import msgspec
+
+from icrtool import __version__
+from icrtool.config import Config, builtin_robots, load_config
+from icrtool.errors import ConfigError, OutputError
+from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
+from icrtool.fleet.one_log import Request, files_of, path_of
+from icrtool.fleet.recordings import Recording, find_recordings
+from icrtool.fleet.row import File, Row, as_text
+from icrtool.fleet.worker import close_all, process_apart
+
+RUNS, ROWS = "runs", ".rows"
+
+PROCESS_BYTES = 400 << 20
+"""Memory of a process with a small log."""
+
+LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
+"""Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
+
+Watch = Callable[[str, str], None]
+"""Called with the name of a log and the stage it has come to."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOptions:
+    """What is asked of every log.
+
+    Attributes
+    ----------
+    config_file, robot, sets : as in `icrtool.load_config`; a manifest's line comes before the first two
+    redo : process logs again that are done
+    timeout_s : a log that takes longer is ended
+    """
+
+    config_file: Path | None = None
+    robot: str | None = None
+    sets: tuple[str, ...] = ()
+    plots: tuple[str, ...] = ("png",)
+    gates: tuple[str, ...] = ()
+    budgets_m: tuple[float, ...] = (0.5,)
+    ladder: bool = True
+    redo: bool = False
+    timeout_s: float = 1800.0
+
+
+def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
+    """Return a request for each recording among logs, folders and manifests.
+
+    Raises
+    ------
+    LogError
+        A place does not exist, or no recording is found.
+    ConfigError
+        A manifest or a configuration cannot be used, or a gate cannot be read.
+    OutputError
+        `output` is a run, or something else than a directory.
+    """
+    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.output.run_directory import RUN_FILE
+
+    for gate in options.gates:
+        parse_gate(gate)
+    if (output / RUN_FILE).is_file():
+        raise OutputError(output, "is a run itself", "name another place for the batch")
+    if output.exists() and not output.is_dir():
+        raise OutputError(output, "a file is there", "name another place for the batch")
+    entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
+    searched = [place for place in places if not is_manifest(place)]
+    searched += [place for entry in entries for place in entry.places]
+    return [_request(one, about(one.path, entries), output, options) for one in find_recordings(searched)]
+
+
+def finished(request: Request) -> Row | None:
+    """Return the row of a log that an earlier batch processed with the same input, configuration and version.
+
+    A log that failed for a reason of its own, and would fail again, counts as processed.
+    """
+    try:
+        row = msgspec.json.decode(path_of(request.row_file).read_bytes(), type=Row)
+    except (OSError, msgspec.MsgspecError, ValueError):
+        return None
+    if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
+        return None
+    if row.status == "failed":
+        return replace(row, log=request.row.log, group=request.row.group, tags=request.row.tags)
+    if (
+        not Path(path_of(request.directory), "run.json").is_file()
+        or not Path(path_of(request.directory), "dropout").is_dir()
+    ):
+        return None
+    why = "done before: same input, configuration and version"
+    return replace(row, status="skipped", reason=why, log=request.row.log, group=request.row.group,
+                   tags=request.row.tags)  # fmt: skip
+
+
+def run_batch(
+    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None
+) -> Generator[Row, None, None]:
+    """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
+
+    Parameters
+    ----------
+    executor : runs `process_apart`; threads on this machine, or workers of a cluster
+    watch : called when a log comes to its next stage, where the executor is on this machine
+    """
+    todo: list[Request] = []
+    for request in requests:
+        done = finished(request) if not options.redo else None
+        if done is not None:
+            yield done
+        else:
+            todo.append(request)
+    again: list[Request] = []
+    for request, row in _all_of(todo, executor, options, watch):
+        if row.status == "failed" and not row.repeatable:
+            again.append(request)
+        else:
+            yield row
+    for request in again:
+        # One at a time: what wanted too much memory beside others may find enough alone.
+        for _, row in _all_of([request], executor, options, watch):
+            yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
+
+
+def local_executor(requests: Sequence[Request], jobs: int | None) -> ThreadPoolExecutor:
+    """Return an executor on this machine: a thread for each of `jobs` processes, by default as `default_jobs`."""
+    return ThreadPoolExecutor(jobs if jobs is not None else default_jobs(requests), thread_name_prefix="log")
+
+
+def default_jobs(requests: Sequence[Request]) -> int:
+    """Return the number of cores, or of the largest logs that the free memory holds at once."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    largest = max((_size(path_of(request.path)) for request in requests), default=0)
+    each = PROCESS_BYTES + min(LOG_FACTOR * largest, LOG_BYTES)
+    free = _free_bytes()
+    return max(1, min(cores, len(requests), int(free // each) if free is not None else cores))
+
+
+def _all_of(
+    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None
+) -> Generator[tuple[Request, Row], None, None]:
+    pending: dict[Future[Row], Request] = {}
+    try:
+        for request in requests:
+            stage = _stage(watch, request.row.log) if isinstance(executor, ThreadPoolExecutor) and watch else None
+            extra = (stage,) if stage is not None else ()
+            pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
+        for future in as_completed(pending):
+            yield pending[future], future.result()
+    except BaseException:
+        for future in pending:
+            future.cancel()
+        close_all()
+        raise
+
+
+def _stage(watch: Watch, log: str) -> Callable[[str], None]:
+    return lambda stage: watch(log, stage)
+
+
+def _request(one: Recording, known: About, output: Path, options: BatchOptions) -> Request:
+    config = _config(one, known, options)
+    document = {"config": config.effective(), "version": __version__, "plots": options.plots, "gates": options.gates,
+                "budgets": options.budgets_m, "ladder": options.ladder, "robot": known.robot}  # fmt: skip
+    key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
+    row = Row(one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot, group=known.group, tags=known.tags, key=key)
+    place = blake2b(os.fsencode(one.name), digest_size=16).hexdigest()
+    # Workers of a cluster may have another working directory.
+    folder = output.absolute()
+    return Request(
+        path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
+        row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
+        budgets_m=options.budgets_m, ladder=options.ladder,
+    )  # fmt: skip
+
+
+def _config(one: Recording, known: About, options: BatchOptions) -> Config:
+    """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
+    builtin = known.robot in builtin_robots()
+    if known.robot and not builtin and known.config is None and options.config_file is None:
+        advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
+        raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
+    robot = known.robot if builtin else options.robot if not known.robot else None
+    return load_config(known.config or options.config_file, robot, options.sets)
+
+
+def _same_files(stored: Sequence[File], path: Path) -> bool:
+    """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
+    try:
+        files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+        if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
+            return False
+        for file, before in zip(files, stored, strict=True):
+            status = file.stat()
+            if status.st_size != before.bytes:
+                return False
+            if status.st_mtime_ns != before.mtime_ns and files_of(file)[0].sha256 != before.sha256:
+                return False
+    except OSError:
+        return False
+    return True
+
+
+def _size(path: Path) -> int:
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _free_bytes() -> int | None:
+    """Return the memory that is free for processes; None where the system does not state it."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):
+        return None

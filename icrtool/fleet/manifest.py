@@ -1,0 +1,137 @@
+"""A manifest: which logs, and of which robot, with which configuration, in which group (CSV or TOML)."""
+
+from __future__ import annotations
+
+import csv
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from icrtool.errors import ConfigError
+
+COLUMNS = ("log", "robot", "config", "group", "tags")
+
+SUFFIXES = {".csv", ".toml"}
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a manifest states about a log.
+
+    Attributes
+    ----------
+    robot : a built-in robot, or the name of one that `config` describes
+    config : configuration file
+    """
+
+    robot: str = ""
+    config: Path | None = None
+    group: str = ""
+    tags: tuple[str, ...] = ()
+
+    def updated(self, other: About) -> About:
+        """Return it with what another one states in its place."""
+        return replace(
+            self,
+            robot=other.robot or self.robot,
+            config=other.config or self.config,
+            group=other.group or self.group,
+            tags=tuple(dict.fromkeys((*self.tags, *other.tags))),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line of a manifest: the files and folders that its pattern matches, and what holds for them."""
+
+    places: tuple[Path, ...]
+    about: About
+
+
+def is_manifest(path: Path) -> bool:
+    """Return whether a path is a manifest, by its suffix."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def read_manifest(path: Path) -> list[Entry]:
+    """Read a manifest: CSV with the columns of `COLUMNS`, or TOML with a table ``[[logs]]`` each.
+
+    Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, has an unknown column, a log that does not exist or a pattern that matches nothing.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = _toml_rows(path, text) if path.suffix.lower() == ".toml" else _csv_rows(path, text)
+    except OSError as err:
+        raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
+    except (ValueError, RecursionError, csv.Error) as err:
+        raise ConfigError(path, "not a manifest", str(err) or "nested too deep") from err
+    if not rows:
+        raise ConfigError(path, "an empty manifest", "give it a line for each log or pattern")
+    return [_entry(path, row) for row in rows]
+
+
+def about(path: Path, entries: Sequence[Entry]) -> About:
+    """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
+    found = About()
+    whole = path.resolve()
+    for entry in entries:
+        if any(whole.is_relative_to(place.resolve()) for place in entry.places):
+            found = found.updated(entry.about)
+    return found
+
+
+def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
+    reader = csv.DictReader(text.splitlines(), strict=True)
+    if "log" not in (reader.fieldnames or ()):
+        raise ConfigError(path, "not a manifest", f"its first line must name the column log, of {', '.join(COLUMNS)}")
+    rows: list[Mapping[str, Any]] = []
+    for number, row in enumerate(reader, start=2):
+        if None in row or None in row.values():
+            raise ConfigError(f"{path}:{number}", "has not as many values as the first line has names", "add commas")
+        rows.append({**row, "tags": [tag.strip() for tag in (row.get("tags") or "").split(";") if tag.strip()]})
+    return rows
+
+
+def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
+    document = tomllib.loads(text)
+    rows = document.get("logs")
+    if set(document) - {"logs"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ConfigError(path, "not a manifest", "it holds tables [[logs]] and nothing else")
+    return rows
+
+
+def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
+    if unknown := set(row) - set(COLUMNS):
+        raise ConfigError(f"{path}: {min(unknown)}", "unknown column", f"a manifest has {', '.join(COLUMNS)}")
+    pattern, tags = row.get("log", ""), row.get("tags", [])
+    texts = [row.get(key, "") for key in ("robot", "config", "group")]
+    if not isinstance(pattern, str) or not pattern or not all(isinstance(text, str) for text in [*texts, *tags]):
+        raise ConfigError(f"{path}: log", "each line needs a log or a pattern, and texts", f"found {dict(row)!r}"[:200])
+    robot, config, group = texts
+    return Entry(
+        _matching(path, pattern),
+        About(robot.strip(), path.parent / config.strip() if config.strip() else None, group.strip(), tuple(tags)),
+    )
+
+
+def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
+    """Return what a pattern matches; a name with a bracket or a star of its own is taken as it is, if it is there."""
+    named = path.parent / pattern
+    if named.exists():
+        return (named,)
+    try:
+        base = Path(named.anchor) if Path(pattern).is_absolute() else path.parent
+        relative = str(Path(pattern).relative_to(base)) if Path(pattern).is_absolute() else pattern
+        found = tuple(sorted(base.glob(relative)))
+    except (ValueError, NotImplementedError) as err:
+        raise ConfigError(f"{path}: log", f"{pattern!r} is not a pattern", str(err)) from err
+    if not found:
+        raise ConfigError(f"{path}: log", f"{pattern!r} matches nothing", f"it is relative to {path.parent}")
+    return found

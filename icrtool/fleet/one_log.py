@@ -1,0 +1,177 @@
+"""The work on one log of a batch: fit, dropout analysis, run directory, and the row that comes of it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from icrtool import __version__
+from icrtool.config import Config
+from icrtool.errors import IcrToolError, OutputError
+from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text, multiplier_of
+
+if TYPE_CHECKING:
+    from icrtool.dropout_analysis.report import DropoutReport
+
+Stage = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """All that processing a log needs; travels to the process that does it as JSON. Paths are bytes: of any name.
+
+    Attributes
+    ----------
+    path : of the log
+    row : what is known of it before: names, robot, group, tags, key
+    directory : of the run
+    row_file : where the row is written, for a batch that continues this one
+    """
+
+    path: bytes
+    row: Row
+    directory: bytes
+    row_file: bytes
+    config: Config
+    plots: tuple[str, ...] = ("png",)
+    gates: tuple[str, ...] = ()
+    budgets_m: tuple[float, ...] = (0.5,)
+    ladder: bool = True
+
+    def encode(self) -> bytes:
+        """Return it as one line of JSON."""
+        return msgspec.json.encode(self)
+
+
+def path_of(name: bytes) -> Path:
+    """Return a path of a request."""
+    return Path(os.fsdecode(name))
+
+
+_REQUEST = msgspec.json.Decoder(Request)
+"""Made at import, as in `icrtool.fleet.worker`."""
+
+
+def decode_request(line: bytes) -> Request:
+    """Return what `Request.encode` wrote."""
+    return _REQUEST.decode(line)
+
+
+def process(request: Request, stage: Stage) -> Row:
+    """Fit a log, analyse the run, write both, and return its row; a log that cannot be used gives a row that says why.
+
+    Parameters
+    ----------
+    stage : called with what is done next
+    """
+    from icrtool.output.atomic_file import whole_file
+
+    begun = time.monotonic()
+    try:
+        row = _results(request, stage)
+    except IcrToolError as err:
+        # A full disk may not be full the next time; the log's own errors come again.
+        row = failed(request, str(err), repeatable=not isinstance(err, OutputError))
+    row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
+    row_file = path_of(request.row_file)
+    row_file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(row_file) as file:
+        file.write_bytes(msgspec.json.encode(row))
+    return row
+
+
+def failed(request: Request, reason: str, *, details: str = "", repeatable: bool) -> Row:
+    """Return the row of a log that could not be processed."""
+    inputs = files_of(path_of(request.path)) if repeatable else ()
+    return replace(
+        request.row, status="failed", reason=reason, details=details, repeatable=repeatable, inputs=inputs,
+        tool_version=__version__,
+    )  # fmt: skip
+
+
+def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File, ...]:
+    """Return the files of a log with their sha256; those in `hashes`, by path, are not read again."""
+    import hashlib
+
+    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+    found = []
+    for file in files:
+        digest = (hashes or {}).get(str(file))
+        if digest is None:
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        status = file.stat()
+        found.append(File(as_text(file), status.st_size, status.st_mtime_ns, digest))
+    return tuple(found)
+
+
+def _results(request: Request, stage: Stage) -> Row:
+    """Fit and analyse a log, write run and report."""
+    from icrtool.dropout_analysis.dropout_report import dropout_report
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+    from icrtool.output.run_directory import check_target
+
+    directory = path_of(request.directory)
+    check_target(directory)
+    stage("reading")
+    log = read_log(path_of(request.path), request.config)
+    stage("filtering")
+    run = fit(log, request.config)
+    stage("writing the run")
+    run.write(directory, plots=request.plots)
+    stage("dropout analysis")
+    report = dropout_report(run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder)
+    stage("writing the report")
+    report.write(directory / "dropout", plots=request.plots)
+    return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
+
+
+def _row(request: Request, summary: dict[str, Any], first_ns: int, report: DropoutReport) -> Row:
+    icr = summary["icr"]
+    multiplier, multiplier_std = multiplier_of(summary)
+    final, std = icr.get("final") or {}, icr.get("final_std") or {}
+    verdicts = [
+        GateVerdict(one.gate.text, _finite(one.value_m), _finite(one.margin_m), one.passed) for one in report.verdicts
+    ]
+    return replace(
+        request.row,
+        status="done",
+        robot=request.row.robot or request.config.robot.name or "",
+        start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
+        duration_s=summary["drive"]["duration_s"],
+        distance_m=summary["drive"]["distance_m"],
+        icr={name: final.get(name) for name in ICRS} | {f"std_{name}": std.get(name) for name in ICRS},
+        multiplier=multiplier,
+        multiplier_std=multiplier_std,
+        errors=_errors(report),
+        outages=len(report.outages),
+        warnings=len(summary["warnings"]),
+        verdicts=tuple(verdicts),
+        inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
+    )
+
+
+def _errors(report: DropoutReport) -> dict[str, float | None]:
+    columns = report.summary_columns()
+    rows = list(zip(*(columns[name] for name in ("model", "horizon_m", "p95_m", "expected_error_m")), strict=True))
+    errors: dict[str, float | None] = {}
+    for model, horizon_m, p95_m, expected_m in rows:
+        if float(horizon_m) in HORIZONS_M:
+            errors[f"{model}_p95_{float(horizon_m):g}m_m"] = _finite(p95_m)
+            errors[f"{model}_expected_{float(horizon_m):g}m_m"] = _finite(expected_m)
+    for budget in report.budgets:
+        errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = _finite(budget.distance_m)
+    return errors
+
+
+def _finite(value: Any) -> float | None:  # noqa: ANN401 - a number of numpy's or Python's
+    number = float(value)
+    return number if number - number == 0 else None

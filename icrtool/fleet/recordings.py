@@ -1,0 +1,160 @@
+"""Find the recordings in files and folders, by content, and name the run of each."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+from icrtool.errors import LogError
+from icrtool.fleet.row import as_text
+from icrtool.logs.containers.mcap_file import is_mcap
+from icrtool.logs.containers.one_recording import STORAGE, storage_files
+from icrtool.logs.containers.ros1_bag import is_ros1_bag
+from icrtool.logs.containers.sqlite_bag import is_sqlite
+from icrtool.logs.read_log import log_name
+
+LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
+"""A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
+
+OWN_FILES = ("run.json", "fleet.json", "study.json")
+"""A folder that holds one of these is a result, not a place of recordings."""
+
+FIRST_BYTES = 65536
+"""The tables of an SQLite file are named on its first page, which is at most this long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording.
+
+    Attributes
+    ----------
+    path : as `icrtool.read_log` takes it
+    name : path of its run below ``runs/``, unique in the batch
+    log : path below the common parent of what was searched, as tables show it
+    """
+
+    path: Path
+    name: str
+    log: str
+
+
+def find_recordings(places: Sequence[Path]) -> list[Recording]:
+    """Return the recordings among files and, searched recursively, folders; each once, in the order of their paths.
+
+    Raises
+    ------
+    LogError
+        A place does not exist, or there is no recording in any of them.
+    """
+    found: dict[str, Path] = {}
+    for place in places:
+        if not place.exists():
+            raise LogError(place, "no such file or directory")
+        for path in _search(place) if place.is_dir() else [place]:
+            found.setdefault(os.path.realpath(path), path)
+    if not found:
+        what = places[0] if len(places) == 1 else f"{len(places)} places"
+        raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
+    root = common_parent(places)
+    return _named(sorted(found.values(), key=_natural), root)
+
+
+def common_parent(places: Sequence[Path]) -> Path:
+    """Return the folder that all places lie in; a folder that was given alone is that one, unless it is a recording."""
+    folders = [place if place.is_dir() and not is_bag_directory(place) else _absolute(place).parent for place in places]
+    return Path(os.path.commonpath([_absolute(folder) for folder in folders]))
+
+
+def is_recording(file: Path) -> bool:
+    """Return whether a file is a recording: by its first bytes, or by a recorder's suffix."""
+    if not file.is_file():
+        return False
+    if file.suffix in LOG_SUFFIXES:
+        return True
+    try:
+        with file.open("rb") as stream:
+            for is_kind in (is_mcap, is_ros1_bag):
+                stream.seek(0)
+                if is_kind(stream):
+                    return True
+            stream.seek(0)
+            if is_sqlite(stream):
+                stream.seek(0)
+                first = stream.read(FIRST_BYTES)
+                return b"messages" in first and b"topics" in first
+    except OSError:
+        pass
+    return False
+
+
+def is_bag_directory(folder: Path) -> bool:
+    """Return whether a folder is one ROS 2 recording: it has metadata.yaml, or holds the files of one split alone."""
+    if (folder / "metadata.yaml").is_file():
+        return any(STORAGE.search(entry.name) for entry in folder.iterdir())
+    try:
+        files = storage_files(folder)
+    except (LogError, OSError):
+        return False
+    # The recorder counts its files up: bag_0, bag_1, … A packed file can be read as part of a directory only.
+    stems = [file.name.split(".")[0].rpartition("_") for file in files]
+    numbers = [int(number) if stem and number.isdecimal() else -1 for stem, _, number in stems]
+    counted = len({stem for stem, _, _ in stems}) == 1 and all(b == a + 1 for a, b in pairwise(numbers))
+    packed = files[0].suffix not in LOG_SUFFIXES
+    return packed or (len(files) > 1 and counted and min(numbers) >= 0)
+
+
+def _search(folder: Path) -> Iterable[Path]:
+    """Yield the recordings below a folder; hidden entries and folders with results of ours are left out."""
+    if is_bag_directory(folder):
+        yield folder
+        return
+    if any((folder / name).is_file() for name in OWN_FILES):
+        return
+    try:
+        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as err:
+        raise LogError(folder, "cannot be searched", err.strerror or str(err)) from err
+    for entry in entries:
+        if entry.is_dir():
+            # A link to a folder could lead back up.
+            if not entry.is_symlink():
+                yield from _search(entry)
+        elif is_recording(entry):
+            yield entry
+
+
+def _named(paths: Sequence[Path], root: Path) -> list[Recording]:
+    """Name each recording after its path below `root`; where names collide, with the suffix of the file."""
+    logs = [PurePosixPath(Path(os.path.relpath(_absolute(path), root)).as_posix()) for path in paths]
+    short = [str(log.parent / log_name(path)) for log, path in zip(logs, paths, strict=True)]
+    # A run cannot lie in another one either.
+    count = Counter(name.casefold() for name in short)
+    parents = {str(parent).casefold() for name in short for parent in PurePosixPath(name).parents}
+    names = [
+        name if count[name.casefold()] == 1 and name.casefold() not in parents else str(log)
+        for name, log in zip(short, logs, strict=True)
+    ]
+    taken: set[str] = set()
+    for index, name in enumerate(names):
+        unique, number = name, 2
+        while unique.casefold() in taken:
+            unique, number = f"{name}-{number}", number + 1
+        taken.add(unique.casefold())
+        names[index] = unique
+    return [Recording(path, as_text(name), as_text(log)) for path, name, log in zip(paths, names, logs, strict=True)]
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.normpath(path.absolute()))
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort ``drive_10`` after ``drive_9``."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

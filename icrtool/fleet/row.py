@@ -1,0 +1,137 @@
+"""The row of a log in the tables of a fleet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+
+HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+
+Status = Literal["done", "failed", "skipped"]
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A file of a log as it was when it was read; `mtime_ns` and `bytes` spare hashing it again."""
+
+    path: str
+    bytes: int
+    mtime_ns: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class GateVerdict:
+    """What became of an acceptance limit."""
+
+    gate: str
+    value_m: float | None
+    margin_m: float | None
+    passed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a batch knows of a log.
+
+    Attributes
+    ----------
+    log : path below the common parent
+    run : directory of the run below that of the batch
+    status : ``skipped``: done by an earlier batch from the same input, configuration and version
+    reason : why it failed or was skipped
+    details : last lines of the process that failed
+    repeatable : whether the same input, configuration and version give this result again
+    icr : final ICRs [m] and, as ``std_…``, their standard deviations
+    multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
+    errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
+    outages, warnings : how many
+    key : hash of configuration, request and version
+    """
+
+    log: str
+    run: str
+    status: Status
+    reason: str = ""
+    details: str = ""
+    repeatable: bool = True
+    robot: str = ""
+    group: str = ""
+    tags: tuple[str, ...] = ()
+    start_utc: str = ""
+    duration_s: float | None = None
+    distance_m: float | None = None
+    icr: dict[str, float | None] = field(default_factory=dict)
+    multiplier: float | None = None
+    multiplier_std: float | None = None
+    errors: dict[str, float | None] = field(default_factory=dict)
+    events: int | None = None
+    outages: int | None = None
+    warnings: int | None = None
+    verdicts: tuple[GateVerdict, ...] = ()
+    inputs: tuple[File, ...] = ()
+    key: str = ""
+    tool_version: str = ""
+    took_s: float = 0.0
+
+    @property
+    def gates_failed(self) -> int:
+        """How many acceptance limits were missed."""
+        return sum(not verdict.passed for verdict in self.verdicts)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the row of fleet.csv."""
+        return {
+            "log": self.log,
+            "status": self.status,
+            "reason": self.reason,
+            "robot": self.robot,
+            "group": self.group,
+            "start_utc": self.start_utc,
+            "duration_s": self.duration_s,
+            "distance_m": self.distance_m,
+            **{name: self.icr.get(name) for name in (*ICRS, *(f"std_{name}" for name in ICRS))},
+            "multiplier": self.multiplier,
+            "multiplier_std": self.multiplier_std,
+            **self.errors,
+            "events": self.events,
+            "outages": self.outages,
+            "warnings": self.warnings,
+            "tool_version": self.tool_version,
+            "run": self.run,
+            "tags": ";".join(self.tags),
+            "gates_failed": self.gates_failed if self.status != "failed" else None,
+            "took_s": self.took_s,
+        }
+
+
+def as_text(path: object) -> str:
+    """Return a path as text that every file takes: bytes of its name that are no UTF-8 as escapes."""
+    return str(path).encode("utf-8", errors="backslashreplace").decode()
+
+
+def multiplier_of(summary: dict[str, Any]) -> tuple[float | None, float | None]:
+    """Return (y_r - y_l)/b of a run and its standard deviation, from the final covariance; None without b or ICRs."""
+    width = summary["config"]["robot"]["track_width_m"]
+    final, covariance = summary["icr"].get("final"), summary["icr"].get("final_covariance_m2")
+    if not width or not final or final.get("y_icr_right_m") is None:
+        return None, None
+    multiplier = (final["y_icr_right_m"] - final["y_icr_left_m"]) / width
+    if not covariance:
+        return multiplier, None
+    variance = covariance[0][0] + covariance[1][1] - 2.0 * covariance[0][1]
+    return multiplier, math.sqrt(variance) / width if variance >= 0 else None
+
+
+def columns_of(rows: Sequence[Row]) -> list[str]:
+    """Return the columns of all rows, those of the errors in the order of models and horizons."""
+    names: dict[str, None] = {}
+    fixed = list(Row("", "", "done").columns())
+    place = fixed.index("multiplier_std") + 1
+    for row in rows:
+        names |= dict.fromkeys(row.errors)
+    return [*fixed[:place], *names, *fixed[place:]]

@@ -1,0 +1,198 @@
+"""A process of its own for the work on a log: what hangs is killed, what dies is replaced, and costs one log.
+
+A worker process is started once and processes log after log, so that libraries and compiled code are loaded once.
+Requests and rows travel as lines of JSON through its standard input and output.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import msgspec
+
+from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
+from icrtool.fleet.row import Row
+
+LONGEST_DETAILS = 4000
+"""Letters kept of what a process printed before it died."""
+
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+"""One thread a log: the logs are what runs at the same time."""
+
+
+COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.worker")
+
+
+class Line(NamedTuple):
+    """What a worker process prints: the stage it is in, or the row it ends with."""
+
+    stage: str = ""
+    row: Row | None = None
+
+
+_LINE = msgspec.json.Decoder(Line)
+"""Made at import: msgspec crashes where several threads are the first to use a type."""
+
+
+class Worker:
+    """A process that processes one log at a time; started when it is needed."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._errors: IO[bytes] | None = None
+
+    def run(self, request: Request, timeout_s: float, stage: Stage) -> Row:
+        """Process a log; one that hangs or kills the process gives a row that says so."""
+        process, errors = self._started()
+        begin_of_errors = errors.seek(0, os.SEEK_END)
+        end = time.monotonic() + timeout_s
+        try:
+            assert process.stdin is not None  # noqa: S101 - for the type checker
+            process.stdin.write(request.encode() + b"\n")
+            process.stdin.flush()
+            while (text := self._lines.get(timeout=max(end - time.monotonic(), 0.0))) is not None:
+                line = _LINE.decode(text)
+                if line.row is not None:
+                    return line.row
+                stage(line.stage)
+        except queue.Empty:
+            self.close()
+            return failed(request, f"took longer than {timeout_s:g} s and was ended", repeatable=False)
+        except (OSError, ValueError):
+            pass  # it died, or what it wrote was cut off when it did
+        why = _how_it_ended(process)
+        details = ""
+        with suppress(ValueError):  # closed, where the batch was interrupted
+            errors.seek(begin_of_errors)
+            details = errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
+        self.close()
+        last = f": {details.splitlines()[-1]}" if details else ""
+        return failed(request, f"{why}{last}", details=details, repeatable=False)
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                with suppress(OSError):  # its other end is gone
+                    process.stdin.close()
+        if self._errors is not None:
+            self._errors.close()
+            self._errors = None
+
+    def _started(self) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+        """Return the process and the file that its errors go to."""
+        if self._process is not None and self._errors is not None and self._process.poll() is None:
+            return self._process, self._errors
+        self.close()
+        errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        home = str(Path(__file__).resolve().parents[2])
+        paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
+        # In a session of its own: Ctrl-C reaches the command, which ends its workers.
+        process = subprocess.Popen(  # noqa: S603 - our own command
+            COMMAND,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
+            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
+        )  # fmt: skip
+        self._process, self._errors, self._lines = process, errors, queue.SimpleQueue()
+        threading.Thread(target=_forward, args=(process.stdout, self._lines), daemon=True).start()
+        return process, errors
+
+
+def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
+    try:
+        status = process.wait(10)
+    except subprocess.TimeoutExpired:
+        return "its process closed its output and did not end"
+    if status >= 0:
+        return f"its process ended with exit status {status}"
+    name = signal.Signals(-status).name
+    return f"its process was ended by {name}{', for want of memory perhaps' if name == 'SIGKILL' else ''}"
+
+
+_mine = threading.local()
+_all: set[Worker] = set()
+
+
+def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> Row:
+    """Process a log in the process that belongs to the calling thread; the same on this machine and on a cluster.
+
+    Parameters
+    ----------
+    request : of `Request.encode`
+    timeout_s : after which the process is killed
+    stage : called with what is done next, where the caller is on the same machine
+    """
+    worker: Worker | None = getattr(_mine, "worker", None)
+    if worker is None:
+        worker = _mine.worker = Worker()
+        _all.add(worker)
+    return worker.run(decode_request(request), timeout_s, stage if stage is not None else _unheard)
+
+
+def close_all() -> None:
+    """End the worker processes of all threads."""
+    while _all:
+        _all.pop().close()
+
+
+def _unheard(_: str) -> None:
+    """Take a stage that nobody follows."""
+
+
+def _forward(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
+    """Put the lines of a process into a queue, None at its end."""
+    with stream:
+        for line in stream:
+            lines.put(line)
+    lines.put(None)
+
+
+def main() -> None:
+    """Process the logs that standard input asks for, until it ends."""
+    # What a library prints goes with the errors. Files of our own: Python's are locked by who waits for a line.
+    requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.set_threshold(100_000)
+
+    def say(line: Line) -> None:
+        output.write(msgspec.json.encode(line) + b"\n")
+        output.flush()
+
+    for text in _lines_of(requests):
+        say(Line(row=process(decode_request(text), lambda stage: say(Line(stage)))))
+
+
+def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:
+    """Yield the lines of a stream; end the process when it is closed, in the middle of a log too."""
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in stream:
+            lines.put(line)
+        # Whoever asked is gone.
+        os._exit(1)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        yield lines.get()
+
+
+if __name__ == "__main__":
+    main()

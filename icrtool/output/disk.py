@@ -1,0 +1,157 @@
+"""The calls that change directories on the disk, in one place: rename, exchange, link, sync, lock.
+
+`atomic_directory` and `atomic_file` use nothing else, so that a test can let each of them fail.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+if sys.platform != "win32":
+    import fcntl
+
+AT_FDCWD = -100
+RENAME_EXCHANGE = 2
+"""Linux <linux/fs.h> and macOS <sys/stdio.h> (RENAME_SWAP) have the same number."""
+
+NO_EXCHANGE = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
+"""What a kernel or a file system answers that cannot exchange; network file systems are among them."""
+
+NO_LINK = {errno.EPERM, errno.EXDEV, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EACCES}
+
+LONGEST_WRITE_S = 86400.0
+"""Where a file system has no locks, what is being written is taken for abandoned after this time."""
+
+SYNC_THREADS = 8
+"""A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
+
+
+def rename(source: Path, target: Path) -> None:
+    """Rename a file or a directory."""
+    source.rename(target)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Rename a file, over one that is there."""
+    source.replace(target)
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Give two directories each other's names in one step.
+
+    Returns
+    -------
+    bool
+        Whether it was done; False where the platform or the file system has no such call.
+
+    Raises
+    ------
+    OSError
+        It has one, and it failed.
+    """
+    if sys.platform not in ("linux", "darwin"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    if hasattr(libc, "renameat2"):
+        failed = libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE)
+    elif hasattr(libc, "renamex_np"):
+        failed = libc.renamex_np(os.fsencode(one), os.fsencode(other), RENAME_EXCHANGE)
+    else:
+        return False
+    if failed and (number := ctypes.get_errno()) not in NO_EXCHANGE:
+        raise OSError(number, os.strerror(number), str(one))
+    return not failed
+
+
+def link(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where the file system has no links; a symbolic link stays one."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except (OSError, NotImplementedError) as err:
+        if isinstance(err, OSError) and err.errno not in NO_LINK:
+            raise
+        shutil.copy2(source, target, follow_symlinks=False)
+        if not target.is_symlink():
+            sync(target)
+
+
+def sync(path: Path) -> None:
+    """Have the system write a file's content, or a directory's names, to the disk."""
+    if sys.platform == "win32" and path.is_dir():
+        return
+    # Windows syncs only what is open for writing.
+    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as err:
+        # Some network file systems have no sync for directories; a file whose sync fails is not written.
+        if err.errno not in NO_EXCHANGE or not path.is_dir():
+            raise
+    finally:
+        os.close(handle)
+
+
+def sync_tree(directory: Path) -> None:
+    """Sync all regular files below a directory, then all directories, the outermost last."""
+    files, directories = [], []
+    for folder, _, names in os.walk(directory, topdown=False):
+        directories.append(Path(folder))
+        files += [path for name in names if (path := Path(folder, name)).is_file() and not path.is_symlink()]
+    with ThreadPoolExecutor(SYNC_THREADS) as pool:
+        list(pool.map(sync, files))
+    for path in directories:
+        sync(path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a directory; what cannot be removed is hidden, and is left to the next run."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Lock a file or directory, where that is possible, until the block or the process ends."""
+    handle = None
+    if sys.platform != "win32":
+        with suppress(OSError):
+            handle = os.open(path, os.O_RDONLY)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Return whether no living process writes what `locked` locked."""
+    try:
+        if sys.platform != "win32":
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            finally:
+                os.close(handle)
+            return True
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # no locks here, or not ours to open: its age decides
+    try:
+        return time.time() - path.stat().st_mtime > LONGEST_WRITE_S
+    except OSError:
+        return False

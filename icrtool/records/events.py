@@ -1,0 +1,36 @@
+"""Slip events: spans in which the wheels and the motion of the robot disagree."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+SlipKind = Literal["immobilised", "slip", "skid", "spin"]
+"""Wheels turn and the robot stands; it misses distance along its heading; it moves sideways; it misses turn."""
+
+
+EVENT_COLUMNS = (
+    "kind", "begin_s", "end_s", "begin_ns", "end_ns", "north_m", "east_m", "distance_m", "severity", "confidence",
+)  # fmt: skip
+"""The columns of events.csv; seconds count from the first recorded state."""
+
+
+class SlipEvent(NamedTuple):
+    """One span in which the robot did not do what its wheels did.
+
+    Attributes
+    ----------
+    begin_ns, end_ns : stamps of the wheel clock
+    north_m, east_m : position at the begin, in the local plane
+    distance_m : length of the robot's path through the event, by the position reference
+    severity : share of the wheels' motion that the robot did not make, 0 to 1
+    confidence : probability that model error and sensor noise alone would not have made any such event in the log
+    """
+
+    kind: SlipKind
+    begin_ns: int
+    end_ns: int
+    north_m: float
+    east_m: float
+    distance_m: float
+    severity: float
+    confidence: float

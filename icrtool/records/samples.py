@@ -1,0 +1,218 @@
+"""What the sensors of a robot measured: typed columns by stamp, and where they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Complexes = NDArray[np.complex128]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Role = Literal["wheels", "gnss", "heading"]
+
+
+NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
+"""What a message says of how its position was solved: nothing, without carrier phase (or unknown), RTK float, RTK
+fixed, RTK without saying which."""
+
+
+def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
+    lengths = [len(column) for column in columns]
+    if any(length != len(stamp_ns) for length in lengths):
+        raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
+
+
+WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSamples:
+    """Speeds of the left and the right side.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), strictly increasing
+    left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
+    unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
+        configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
+    from_position : the log sends positions, of which these are the mean speeds to the next sample
+    """
+
+    stamp_ns: Ints
+    left: Floats
+    right: Floats
+    unit: WheelUnit = "mps"
+    from_position: bool = False
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.left, self.right)
+
+    @property
+    def v_left_mps(self) -> Floats:
+        """Speed of the left side [m/s], (n,)."""
+        return self._in_mps(self.left)
+
+    @property
+    def v_right_mps(self) -> Floats:
+        """Speed of the right side [m/s], (n,)."""
+        return self._in_mps(self.right)
+
+    def cut(self, rows: slice) -> WheelSamples:
+        """Return the samples of some rows."""
+        return replace(self, stamp_ns=self.stamp_ns[rows], left=self.left[rows], right=self.right[rows])
+
+    def _in_mps(self, speed: Floats) -> Floats:
+        if self.unit not in ("mps", "m"):
+            raise ValueError(f"wheels in {self.unit} per second: icrtool.alignment.wheel_units makes speeds of them")
+        return speed
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFixes:
+    """Positions of the antenna (or of the tracked reference point) in the local plane.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), non-decreasing
+    north_m, east_m : float64 (n,)
+    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
+    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
+    """
+
+    stamp_ns: Ints
+    north_m: Floats
+    east_m: Floats
+    var_north_m2: Floats
+    var_east_m2: Floats
+    cov_north_east_m2: Floats
+    stated_class: Bytes | None = None
+
+    def __post_init__(self) -> None:
+        told = () if self.stated_class is None else (self.stated_class,)
+        _check_lengths(
+            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2, *told
+        )
+
+    def cut(self, rows: slice) -> PositionFixes:
+        """Return the fixes of some rows."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingSamples:
+    """Headings, clockwise from north.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,), non-decreasing
+    heading_rad : float64 (n,), in (-pi, pi]
+    var_rad2 : float64 (n,), NaN where the log does not say
+    """
+
+    stamp_ns: Ints
+    heading_rad: Floats
+    var_rad2: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.heading_rad, self.var_rad2)
+
+
+@dataclass(frozen=True, slots=True)
+class GyroSamples:
+    """Turn rates, clockwise positive.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rate_radps : float64 (n,)
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rate_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rate_radps)
+
+
+@dataclass(frozen=True, slots=True)
+class GyroAxes:
+    """Turn rates about the three axes of an inertial unit, as sent.
+
+    Attributes
+    ----------
+    topic : where they were read
+    stamp_ns : int64 (n,), strictly increasing
+    rates_radps : float64 (n, 3), about x, y, z of the sensor
+    """
+
+    topic: str
+    stamp_ns: Ints
+    rates_radps: Floats
+
+    def __post_init__(self) -> None:
+        _check_lengths(self.stamp_ns, self.rates_radps)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherReceiver:
+    """Positions of a further receiver, in the same local plane."""
+
+    topic: str
+    fixes: PositionFixes
+
+
+@dataclass(frozen=True, slots=True)
+class Datum:
+    """Origin of the local plane: geodetic latitude, longitude [deg, WGS 84] and ellipsoidal height [m]."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class StreamChoice:
+    """Which topic feeds a role, and why.
+
+    Attributes
+    ----------
+    topic : topic name; a left/right pair reads ``/left + /right``
+    rate_hz : 1 / median interval
+    clock : ``header`` or ``log``: which stamps are used
+    jitter_ms : standard deviation of the interval between samples
+    """
+
+    role: Role
+    topic: str
+    message_type: str
+    count: int
+    rate_hz: float
+    clock: Literal["header", "log"]
+    jitter_ms: float
+    why: str
+
+
+def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
+    """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""
+    if len(stamps) < 2:
+        return float("nan"), float("nan")
+    interval = np.diff(stamps)
+    median = float(np.median(interval))
+    return (1e9 / median if median > 0 else float("inf")), float(interval.std()) / 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file that was read: path as given, size, SHA-256 (hex)."""
+
+    path: str
+    bytes: int
+    sha256: str

@@ -1,0 +1,70 @@
+"""Text that comes from a log or a path: names, topics, frames, message types."""
+
+from __future__ import annotations
+
+from typing import Self
+
+LONGEST_NAME = 80
+"""Characters of a name that are printed; of a longer one the beginning and the end are."""
+
+LONGEST_MESSAGE = 4000
+"""Characters of an error or a warning that are printed."""
+
+
+class LogText(str):
+    r"""A text from a log that prints only escaped and shortened.
+
+    The string itself is the escaped text, so what is made of it by joining, splitting or slicing is safe to print
+    too. `str` and `format` shorten it as well. Comparisons and dictionaries use the whole escaped text, so two long
+    names that differ in the middle stay different.
+
+    Attributes
+    ----------
+    raw : the text as it is in the log; for JSON, which has its own escapes, and for file names
+
+    Examples
+    --------
+    >>> print(LogText("wheel\x1b[2J"))
+    wheel\x1b[2J
+    """
+
+    raw: str
+
+    def __new__(cls, raw: str) -> Self:
+        """Return `raw` as a LogText; a LogText is returned as it is."""
+        if isinstance(raw, cls):
+            return raw
+        self = super().__new__(cls, escaped(raw))
+        self.raw = raw
+        return self
+
+    def __str__(self) -> str:
+        return shortened(str.__str__(self), LONGEST_NAME)
+
+    def __format__(self, spec: str) -> str:
+        return format(str(self), spec)
+
+    def __repr__(self) -> str:
+        return f"LogText({str(self)!r})"
+
+    def __reduce__(self) -> tuple[type[LogText], tuple[str]]:
+        return LogText, (self.raw,)
+
+
+def escaped(text: str) -> str:
+    """Return a text with every character that a terminal may act on, or hide, as a Python escape.
+
+    These are the control and format characters (bidirectional overrides, zero-width characters), line separators,
+    lone surrogates, and code points without a character.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def shortened(text: str, longest: int) -> str:
+    """Return a text of at most `longest` characters: where it is longer, an ellipsis replaces its middle."""
+    if len(text) <= longest:
+        return text
+    head = (longest - 1) // 2
+    return f"{text[:head]}…{text[head + 1 - longest :]}"

@@ -1,0 +1,59 @@
+"""Recordings made by a motion model: wheel speeds of a varied drive, a noisy reference, slip that wanders."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.kernels.trials import Drive
+from icrtool.motion.models import MotionModel, twist, wheel_motion
+from icrtool.motion.recording import Recording
+from icrtool.records.tables import Floats
+
+WIDTH_M = 0.6
+SLOWEST_TURN = 0.15
+"""A robot whose turn gain is less, or negative, is none."""
+
+
+def draw_parameters(model: MotionModel, rng: np.random.Generator) -> Floats:
+    """Draw a model's parameters from their prior."""
+    while True:
+        parameters = rng.normal(model.prior_mean, model.prior_std)
+        if "omega_w" not in model.terms or parameters[model.terms.index("omega_w")] > SLOWEST_TURN:
+            return parameters
+
+
+def make_recording(
+    model: MotionModel, parameters: Floats, seed: int = 0, seconds: float = 300.0, *, rate: float = 10.0,
+    slip: float = 0.05, noise_m: float = 0.01, noise_rad: float = 0.003, gyro: bool = False, name: str = "made",
+) -> Recording:  # fmt: skip
+    """Drive with stops, spins and bends.
+
+    Parameters
+    ----------
+    slip : standard deviation of the share by which speed and turn wander, over about a second
+    noise_m, noise_rad : white noise of the reference
+    """
+    rng = np.random.default_rng([seed, 7])
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    n, dt = len(t), 1.0 / rate
+    phase = rng.uniform(0.0, 6.3, 4)
+    mean = 0.8 + 0.5 * np.sin(0.21 * t + phase[0]) + 0.3 * np.sin(0.67 * t + phase[1])
+    turn = 0.7 * np.sin(0.33 * t + phase[2]) + 0.6 * np.sin(0.83 * t + phase[3])
+    v_left, v_right = mean + turn * WIDTH_M / 2, mean - turn * WIDTH_M / 2
+    v_x, v_y, omega = twist(model, parameters, wheel_motion(v_left, v_right, WIDTH_M))
+    keep = np.exp(-dt)
+    wander = np.zeros((3, n))
+    for k in range(1, n):
+        wander[:, k] = keep * wander[:, k - 1] + rng.normal(0.0, slip * np.sqrt(1.0 - keep**2), 3)
+    v_x, v_y, omega = v_x * (1 + wander[0]), v_y + v_x * wander[1] / 3, omega * (1 + wander[2])
+    heading = np.concatenate([[0.3], 0.3 + np.cumsum(dt * omega)[:-1]])
+    place = np.concatenate([[0.0], np.cumsum(dt * (v_x + 1j * v_y) * np.exp(1j * heading))[:-1]])
+    no = np.zeros(n, np.bool_)
+    drive = Drive(
+        np.append(np.full(n - 1, dt), 0.0), v_left, v_right,
+        place.real + rng.normal(0.0, noise_m, n), place.imag + rng.normal(0.0, noise_m, n),
+        heading + rng.normal(0.0, noise_rad, n),
+        np.concatenate([[0.0], np.cumsum(dt * np.hypot(v_x, v_y))[:-1]]), no, no.copy(),
+    )  # fmt: skip
+    rate_radps = omega + rng.normal(0.0, 0.005, n) + 0.002 if gyro else None
+    return Recording(name, t, drive, rate_radps, WIDTH_M, f"/logs/{name}", name)

@@ -1,0 +1,77 @@
+"""Every mixture of swapped, reversed and mirrored streams is recognised, up to the two exact symmetries."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions
+from icrtool.alignment.drive_windows import DriveArrays, cut_windows, drive_arrays
+from support.exact_drives import simulate
+
+
+def spoilt(drive: DriveArrays, one: Convention) -> DriveArrays:
+    """Return the drive as a log would hold it whose convention is `one`."""
+    left, right = (drive.v_right, drive.v_left) if one.swapped else (drive.v_left, drive.v_right)
+    return drive._replace(
+        v_left=one.sign_left * left,
+        v_right=one.sign_right * right,
+        heading=one.heading * drive.heading,
+        fix=drive.fix if one.position > 0 else np.conj(drive.fix),
+    )
+
+
+def equivalents(one: Convention) -> set[Convention]:
+    """Return the conventions that no residual tells from this one."""
+    mirrored = one._replace(swapped=not one.swapped, heading=-one.heading, position=-one.position)
+    return {
+        same
+        for each in (one, mirrored)
+        for same in (
+            each,
+            each._replace(swapped=not each.swapped, sign_left=-each.sign_left, sign_right=-each.sign_right),
+        )
+    }
+
+
+@pytest.fixture(scope="module")
+def drive() -> DriveArrays:
+    return drive_arrays(simulate(3, lever=(0.0, 0.0), offset_deg=0.0, scales=(1.0, 1.0), seconds=120.0))
+
+
+@pytest.mark.parametrize(
+    "one", [Convention(*parts) for parts in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1))]
+)
+def test_a_spoilt_log_is_recognised(drive: DriveArrays, one: Convention) -> None:
+    found = decide_conventions(spoilt(drive, one), cut_windows(drive), metric=True)
+    assert found.convention in equivalents(one)
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        AS_NAMED,
+        AS_NAMED._replace(swapped=True),
+        AS_NAMED._replace(sign_left=-1),
+        AS_NAMED._replace(sign_right=-1),
+        AS_NAMED._replace(sign_left=-1, sign_right=-1),
+        AS_NAMED._replace(heading=-1),
+        AS_NAMED._replace(position=-1),
+    ],
+)
+def test_a_single_fault_is_named_itself(drive: DriveArrays, one: Convention) -> None:
+    found = decide_conventions(spoilt(drive, one), cut_windows(drive), metric=True, gyro_sense=one.heading)
+    assert found.convention == one
+
+
+def test_geodetic_positions_are_never_mirrored(drive: DriveArrays) -> None:
+    mirrored = spoilt(drive, AS_NAMED._replace(position=-1))
+    assert decide_conventions(mirrored, cut_windows(drive), metric=False).convention.position == 1
+
+
+def test_a_straight_drive_decides_nothing() -> None:
+    drive = drive_arrays(simulate(1, path="straight", seconds=80.0))
+    swapped = spoilt(drive, AS_NAMED._replace(swapped=True))
+    assert decide_conventions(swapped, cut_windows(swapped), metric=True).convention == AS_NAMED

@@ -1,0 +1,83 @@
+"""The alignment estimate against drives made with known ICRs, scales, offset and delays, over many seeds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from icrtool.alignment.drive_windows import cut_windows, drive_arrays
+from icrtool.alignment.estimator import AlignmentFit, estimate_alignment
+from support.exact_drives import ICRS, simulate
+
+WIDTH_M, OFFSET_DEG, SCALES = 0.6, 5.0, (1.03, 0.98)
+SEEDS = 24
+LEAST_COVERAGE, LEAST_OF_ONE = 0.9, 0.8
+"""95 % are expected; of 24 drives, each number falls below 80 % by chance once in 400."""
+
+
+def estimate(seed: int, **drive: float) -> AlignmentFit:
+    log = simulate(seed, lever=(0.0, 0.0), offset_deg=OFFSET_DEG, scales=SCALES, seconds=160.0, **drive)
+    arrays = drive_arrays(log)
+    found = estimate_alignment(arrays, cut_windows(arrays), WIDTH_M)
+    assert found is not None
+    return found
+
+
+def test_two_standard_deviations_cover_the_truth_over_many_drives() -> None:
+    truth = np.array([*ICRS, *SCALES, ICRS[0] - ICRS[1]])
+    inside, others = [], []
+    for seed in range(SEEDS):
+        found = estimate(seed)
+        geometry = found.geometry()
+        inside.append(np.abs(geometry.values - truth) < 2.0 * np.sqrt(np.diag(geometry.covariance)))
+        offset, std = found.estimate("offset")
+        others.append(abs(offset + math.radians(OFFSET_DEG)) < 2.0 * std)
+        for name in ("heading_delay", "position_delay"):
+            value, std = found.estimate(name)
+            others.append(abs(value) < 2.0 * std)
+    assert np.mean(inside) >= LEAST_COVERAGE
+    assert np.mean(inside, axis=0).min() >= LEAST_OF_ONE
+    assert np.mean(others) >= LEAST_COVERAGE
+
+
+def test_the_estimate_is_as_sharp_as_the_sensors_allow() -> None:
+    """A coverage that large standard deviations buy would be worth nothing."""
+    geometry = estimate(0).geometry()
+    assert np.abs(geometry.values[:2] - ICRS[:2]).max() < 0.02
+    assert np.abs(geometry.values[3:5] - SCALES).max() < 0.02
+    assert np.sqrt(geometry.covariance[5, 5]) < 0.03
+
+
+@pytest.mark.parametrize(("gnss", "heading"), [(0.15, 0.0), (0.0, 0.12), (0.3, 0.1)])
+def test_delays_of_either_stream_are_found(gnss: float, heading: float) -> None:
+    found = estimate(5, gnss_delay=gnss, heading_delay=heading)
+    assert found.estimate("position_delay")[0] == pytest.approx(gnss, abs=0.03)
+    assert found.estimate("heading_delay")[0] == pytest.approx(heading, abs=0.03)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2, 5])
+def test_too_few_fixes_give_no_estimate(samples: int) -> None:
+    drive = drive_arrays(simulate(0, seconds=20.0))
+    short = drive._replace(fix_t=drive.fix_t[:samples], fix=drive.fix[:samples])
+    assert estimate_alignment(short, cut_windows(short), WIDTH_M) is None
+
+
+def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
+    log = simulate(0, path="straight", lever=(0.0, 0.0), scales=(1.0, 1.0), seconds=80.0)
+    drive = drive_arrays(log)
+    found = estimate_alignment(drive, cut_windows(drive), WIDTH_M)
+    assert found is not None
+    geometry = found.geometry()
+    assert np.sqrt(geometry.covariance[5, 5]) > 0.3 * abs(geometry.values[5])
+    assert found.estimate("scale")[0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_damaged_speed_makes_no_more_windows_than_there_are_fixes() -> None:
+    drive = drive_arrays(simulate(0, seconds=20.0))
+    left = drive.v_left.copy()
+    left[100] = 1e5
+    travel = np.concatenate([[0.0], np.cumsum((drive.wheel_dt * (np.abs(left) + np.abs(drive.v_right)) / 2)[:-1])])
+    windows = cut_windows(drive._replace(v_left=left, travel=travel))
+    assert len(windows.begin) <= len(drive.fix_t)

@@ -1,0 +1,169 @@
+"""Calibrations from several recordings: nothing left out reaches a fit or a choice; files come back as they were."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.calibration.held_out import choose, hold_out, plan_folds
+from icrtool.calibration.pooled import CalibrationResult, calibrate, calibrated_errors, recording_of
+from icrtool.config import parse_config
+from icrtool.errors import ConfigError, DataError, RunError
+from icrtool.estimation.fit import fit
+from icrtool.motion.fit import Pool
+from icrtool.motion.models import MODELS
+from icrtool.motion.recording import Recording, cut_windows
+from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.output.calibration_file import open_calibration, write_calibration
+from icrtool.output.tables.held_out import format_result
+from support.drives import make_log
+from support.recordings import WIDTH_M, make_recording
+
+SIX = MODELS["six"]
+TRUTH = np.array([0.96, -0.1, 0.6, -0.02, 0.1, -0.12])
+SOME = [MODELS[name] for name in ("no_slip", "multiplier", "icr", "six")]
+
+
+def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
+    return [make_recording(SIX, TRUTH, seed, 200.0, gyro=gyro, name=f"log {seed}") for seed in range(count)]
+
+
+@pytest.fixture(scope="module")
+def result() -> CalibrationResult:
+    return calibrate(logs(gyro=True), "made", 0.1)
+
+
+def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) -> None:
+    chosen = result.calibration.fitted
+    assert set(SIX.terms) <= set(chosen.model.terms)
+    for term, value in zip(SIX.terms, TRUTH, strict=True):
+        k = chosen.model.terms.index(term)
+        assert abs(chosen.parameters[k] - value) < 4.0 * chosen.std[k]
+    table = result.wheels
+    assert table.score("recommended").together.p95[1] < 0.5 * table.score("multiplier").together.p95[1]
+
+
+def test_wheels_and_gyro_together_are_not_worse_than_either(result: CalibrationResult) -> None:
+    assert result.gyro is not None
+    both = result.gyro.score("recommended").together.expected
+    assert np.all(both < 1.05 * result.wheels.score("recommended").together.expected)
+    assert np.all(both < 1.05 * result.gyro.score("no_slip_gyro").together.expected)
+
+
+def test_a_log_is_tested_with_parameters_of_the_others() -> None:
+    """Against a fit that never saw the log, with the log's own constants."""
+    recordings = logs(3)
+    table, _ = hold_out(recordings, [SIX], (5.0, 10.0))
+    alone = Pool([cut_windows(one) for one in recordings[:2]], [WIDTH_M] * 2, SIX).fit()
+    own = Pool([cut_windows(recordings[2])], [WIDTH_M], SIX).own_constants(0, alone.parameters)
+    rates = twist_rates(recordings[2], SIX, alone.parameters)
+    errors = trial_errors(recordings[2], cut_trials(recordings[2], (5.0, 10.0)), rates, float(own[1]))
+    # the two fits stop within a small share of their standard deviation of one another
+    assert table.score("six").folds[2].expected == pytest.approx(np.nanmean(errors, axis=0), rel=0.02)
+
+
+def test_a_block_that_is_spoilt_changes_neither_its_fit_nor_its_choice() -> None:
+    clean = logs(1)[0]
+    folds, drive = plan_folds([clean]), clean.drive
+    inside = (drive.distance > folds[-1].begin_m) & (drive.distance <= folds[-1].end_m)
+    spoilt = replace(clean, drive=drive._replace(north=drive.north * np.where(inside, 1.5, 1.0)))
+    before, after = (hold_out([one], SOME, (5.0,))[0] for one in (clean, spoilt))
+    assert before.chosen[-1] == after.chosen[-1]
+    assert after.score("six").folds[-1].expected[0] > 1.0
+    assert after.fits["six"].parameters != pytest.approx(before.fits["six"].parameters, abs=1e-3)
+
+
+def test_the_simplest_within_noise_is_chosen_and_never_worse_than_one_multiplier() -> None:
+    sizes = {"multiplier": 1, "icr": 3, "eight": 8}
+    noisy = {"multiplier": np.full(4, 1.0), "icr": np.array([0.31, 0.29, 0.31, 0.3]), "eight": np.full(4, 0.30)}
+    assert choose(noisy, sizes, "multiplier")[0] == "icr"
+    clear = noisy | {"eight": np.full(4, 0.25)}
+    assert choose(clear, sizes, "multiplier")[0] == "eight"
+    worse = noisy | {"icr": np.full(4, 1.2), "eight": np.full(4, 1.1)}
+    assert choose(worse, sizes, "multiplier")[0] == "multiplier"
+    assert choose({name: np.full(2, np.nan) for name in sizes}, sizes, "multiplier")[0] == "multiplier"
+
+
+def test_a_file_comes_back_as_it_was(result: CalibrationResult, tmp_path: Path) -> None:
+    file = write_calibration(result.calibration.summary(), tmp_path)
+    document = json.loads(file.read_text())
+    keys = {"schema", "model", "terms", "parameters", "covariance", "robot", "logs", "held_out", "recommended"}
+    assert keys | {"created", "tool_version"} <= set(document)
+    assert document["logs"][0].keys() >= {"path", "sha256"}
+    assert document["held_out"][0].keys() == {"model", "horizon_m", "p95_m", "expected_m", "log"}
+    again = open_calibration(file)
+    np.testing.assert_array_equal(again.fitted.parameters, result.calibration.fitted.parameters)
+    assert again.summary() == json.loads(json.dumps(result.calibration.summary()))
+
+
+@pytest.mark.parametrize("spoil", [{"schema": "other"}, {"terms": []}, {"parameters": {}}, {"robot": {}}, {"gyro": 3}])
+def test_what_is_no_calibration_is_one_error(
+    result: CalibrationResult, tmp_path: Path, spoil: dict[str, object]
+) -> None:
+    file = tmp_path / "cal.json"
+    file.write_text(json.dumps(result.calibration.summary() | spoil))
+    with pytest.raises(RunError, match="not a calibration"):
+        open_calibration(file)
+
+
+def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
+    calibration = result.calibration
+    v_x, v_y, omega = calibration.twist(0.5, 0.3)
+    assert (v_x, omega) == pytest.approx((0.96 * 0.4 - 0.1 * 0.1, 0.6 * 0.2 / WIDTH_M - 0.02 * 0.4 / WIDTH_M), abs=0.02)
+    log = make_log(0, 30.0)
+    path = calibration.odometry(log)
+    assert len(path.stamp_ns) == len(log.wheels.stamp_ns)
+    assert np.hypot(path.forward_m[-1], path.right_m[-1]) > 3.0
+    step = np.hypot(path.forward_m[1], path.right_m[1])
+    assert step == pytest.approx(
+        np.hypot(*calibration.twist(log.wheels.v_left_mps[0], log.wheels.v_right_mps[0])[:2]) * 0.02
+    )
+    icrs, covariance = calibration.warm_start()
+    assert icrs[0] > 0.0 > icrs[1]
+    assert np.all(np.linalg.eigvalsh(covariance) > -1e-12)
+    del v_y
+
+
+def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
+    new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
+    trials = cut_trials(new, (5.0, 10.0), all_starts=True)
+    errors = calibrated_errors(result.calibration, new, trials)
+    np.testing.assert_array_equal(np.isfinite(errors), trials.ends >= 0)
+    assert np.nanmean(errors[:, 1]) < 0.5
+    assert np.nanmean(calibrated_errors(result.calibration, new, trials, with_gyro=True)[:, 1]) < 0.5
+    assert not result.calibration.fitted_to(new.sha256)
+    assert result.calibration.fitted_to("log 1")
+    with pytest.raises(ConfigError, match="width"):
+        calibrated_errors(result.calibration, replace(new, width_m=1.0), trials)
+
+
+def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:
+    one, two = logs(2)
+    with pytest.raises(ConfigError, match="given twice"):
+        calibrate([one, two, one])
+    with pytest.raises(ConfigError, match="one robot at a time"):
+        calibrate([one, replace(two, width_m=1.0)])
+    with pytest.raises(DataError):
+        calibrate([make_recording(SIX, TRUTH, 0, 12.0)])
+
+
+def test_an_applied_scale_of_a_run_is_undone() -> None:
+    run = fit(make_log(0, 60.0), parse_config({"robot": {"track_width_m": 0.6}}))
+    plain = recording_of(run)
+
+    class Scaled:
+        name, table, in_gap, outages_ns, track_width_m = run.name, run.table, run.in_gap, run.outages_ns, 0.6
+        summary = {**run.summary, "wheels": {"applied_scale": 0.8}}  # noqa: RUF012 - a stand-in
+
+    np.testing.assert_allclose(recording_of(Scaled()).drive.v_left, plain.drive.v_left / 0.8)  # type: ignore[arg-type]
+
+
+def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:
+    text = format_result(result)
+    assert text.splitlines()[0].startswith(f"Recommended: {result.calibration.recommended}")
+    assert "each log left out in turn (3)" in text
+    assert max(map(len, text.splitlines())) <= 110

@@ -1,0 +1,96 @@
+"""Slip events in the filter: it follows the fixes through them and learns nothing there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.alignment.align import sensors_as_sent
+from icrtool.config import Config, parse_config
+from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
+from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.filter_records import GATED, Measurements
+from icrtool.kernels.smoother import run_smoother
+from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import SensorData
+from support.drives import EPOCH_NS, make_log
+from support.matrix_filter import run_filter_plain
+
+CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
+BEGIN_S, END_S = 30.0, 36.0
+
+
+def held_sensors(config: Config = CONFIG) -> SensorData:
+    """Sensors of a robot that stands from `BEGIN_S` to `END_S` while its wheels turn on."""
+    log = make_log(seed=3, seconds=80.0)
+    sensors = sensors_as_sent(log, config)
+    t = (sensors.fixes.stamp_ns - EPOCH_NS) / 1e9
+    t_heading = (sensors.headings.stamp_ns - EPOCH_NS) / 1e9
+    # the robot's own clock stops, the wheels' does not: their speeds are those of a clock that goes on
+    stopped, stopped_heading = (
+        np.where(x < BEGIN_S, x, np.maximum(x - (END_S - BEGIN_S), BEGIN_S)) for x in (t, t_heading)
+    )
+    psi = np.unwrap(sensors.headings.heading_rad)
+    wheel_t = (sensors.wheels.stamp_ns - EPOCH_NS) / 1e9
+    source = np.where(wheel_t < BEGIN_S, wheel_t, np.maximum(wheel_t - (END_S - BEGIN_S), BEGIN_S))
+    return replace(
+        sensors,
+        wheels=replace(
+            sensors.wheels,
+            v_left_mps=np.interp(source, wheel_t, sensors.wheels.v_left_mps),
+            v_right_mps=np.interp(source, wheel_t, sensors.wheels.v_right_mps),
+        ),
+        fixes=replace(
+            sensors.fixes,
+            north_m=np.interp(stopped, t, sensors.fixes.north_m),
+            east_m=np.interp(stopped, t, sensors.fixes.east_m),
+        ),
+        headings=replace(
+            sensors.headings, heading_rad=np.angle(np.exp(1j * np.interp(stopped_heading, t_heading, psi)))
+        ),
+    )  # fmt: skip
+
+
+def with_event(sensors: SensorData) -> SensorData:
+    begin, end = (EPOCH_NS + round(s * 1e9) for s in (BEGIN_S, END_S))
+    return replace(sensors, events=(SlipEvent("immobilised", begin, end, 0.0, 0.0, 0.0, 1.0, 1.0),))
+
+
+def test_fixes_in_an_event_are_followed_and_the_icrs_stay() -> None:
+    sensors = held_sensors()
+    plain, told = (set_up_filter(one, CONFIG) for one in (sensors, with_event(sensors)))
+    unaware, aware = (run_filter(s.data, s.t0, s.x0, s.P0, s.parameters) for s in (plain, told))
+    assert np.count_nonzero(aware.gnss_code == GATED) == 0
+    t = told.data.wheel_t[-len(aware.x) :]
+    before, after = np.searchsorted(t, [BEGIN_S - EVENT_MARGIN_S, END_S + EVENT_MARGIN_S])
+    assert np.abs(aware.x[after, 3:] - aware.x[before, 3:]).max() < 0.01
+    assert np.abs(unaware.x[after, 3:] - unaware.x[before, 3:]).max() > 0.05
+
+
+def test_an_outage_that_is_made_knows_no_event() -> None:
+    sensors = with_event(held_sensors())
+    outage = (EPOCH_NS + 32_000_000_000, EPOCH_NS + 34_000_000_000)
+    data = set_up_filter(sensors, CONFIG, outages_ns=(outage,)).data
+    inside = (data.wheel_t >= 32.0) & (data.wheel_t < 34.0)
+    assert not data.slipping[inside].any()
+    assert data.slipping[(data.wheel_t > 30.0) & (data.wheel_t < 31.9)].all()
+
+
+def test_the_filter_through_slip_equals_the_matrix_form() -> None:
+    setup = set_up_filter(with_event(held_sensors()), CONFIG)
+    arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
+    out, plain = run_filter(*arguments), run_filter_plain(*arguments)
+    for name in ("x", "variance", "distance", "P"):
+        assert getattr(out, name) == pytest.approx(getattr(plain, name), abs=1e-9)
+
+
+def test_smoothing_ends_at_the_state_of_the_filter_through_slip() -> None:
+    setup = set_up_filter(with_event(held_sensors()), CONFIG)
+    arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
+    assert run_smoother(*arguments).x[-1] == pytest.approx(run_filter(*arguments).x[-1], abs=1e-12)
+
+
+def test_measurements_without_flags_have_no_slip() -> None:
+    assert len(Measurements(*(np.empty(0) for _ in range(10))).slipping) == 0

@@ -1,0 +1,263 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from icrtool.errors import ConfigError, LogError, OutputError
+from icrtool.fleet import worker
+from icrtool.fleet.batch import BatchOptions, default_jobs, finished, plan, run_batch
+from icrtool.fleet.fleet_files import write_fleet
+from icrtool.fleet.one_log import Request
+from icrtool.fleet.row import Row
+
+# A worker whose logs behave as they are named; the row is kept as `icrtool.fleet.one_log.process` keeps it.
+SCRIPT = """
+import os, signal, sys, time
+from dataclasses import replace
+from pathlib import Path
+from icrtool.errors import DataError
+from icrtool.fleet import one_log, worker
+
+def results(request, stage):
+    stage("reading")
+    path = one_log.path_of(request.path)
+    with open(path.parent / "order.txt", "a", errors="surrogateescape") as order:
+        order.write(path.stem + chr(10))
+    if "hang" in path.stem:
+        time.sleep(60)
+    if "kill" in path.stem:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if "bug" in path.stem:
+        print("a library prints this")
+        raise KeyError("missing")
+    if "once" in path.stem and not (path.parent / "tried").exists():
+        (path.parent / "tried").touch()
+        os.abort()
+    if "bad" in path.stem:
+        raise DataError(path.name, "no wheels")
+    time.sleep(0.3 if "slow" in path.stem else 0)
+    directory = one_log.path_of(request.directory)
+    (directory / "dropout").mkdir(parents=True, exist_ok=True)
+    (directory / "run.json").write_text("{}")
+    return replace(request.row, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
+                   inputs=one_log.files_of(path))
+
+one_log._results = results
+worker.main()
+"""
+
+
+@pytest.fixture
+def season(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "script.py").write_text(SCRIPT)
+    monkeypatch.setattr(worker, "COMMAND", (sys.executable, str(tmp_path / "script.py")))
+    (tmp_path / "season").mkdir()
+    yield tmp_path / "season"
+    worker.close_all()
+
+
+def add(season: Path, *names: str) -> None:
+    for name in names:
+        (season / f"{name}.mcap").write_bytes(b"\x89MCAP0\r\n" + name.encode())
+
+
+def run(season: Path, jobs: int = 2, **options: object) -> dict[str, Row]:
+    asked = BatchOptions(timeout_s=20.0, **options)  # type: ignore[arg-type]
+    requests = plan([season], season.parent / "out", asked)
+    with ThreadPoolExecutor(jobs) as executor:
+        rows = list(run_batch(requests, executor, asked))
+    assert sorted(row.log for row in rows) == sorted(request.row.log for request in requests), "one row a log"
+    return {Path(row.log).stem: row for row in rows}
+
+
+def test_a_log_that_fails_hangs_or_dies_costs_only_itself(season: Path) -> None:
+    add(season, "a", "bad", "bug", "kill", "once", "z")
+    rows = run(season)
+    assert {name: row.status for name, row in rows.items()} == {
+        "a": "done", "bad": "failed", "bug": "failed", "kill": "failed", "once": "done", "z": "done",
+    }  # fmt: skip
+    assert rows["bad"].reason == "bad.mcap: no wheels"
+    assert "KeyError" in rows["bug"].reason
+    assert "Traceback" in rows["bug"].details
+    assert "a library prints this" in rows["bug"].details
+    assert "SIGKILL" in rows["kill"].reason
+    tried = (season / "order.txt").read_text().split()
+    assert {name: tried.count(name) for name in rows} == {"a": 1, "bad": 1, "bug": 2, "kill": 2, "once": 2, "z": 1}
+
+
+def test_a_log_that_hangs_is_ended(season: Path) -> None:
+    add(season, "hang", "a")
+    requests = plan([season], season.parent / "out", BatchOptions())
+    begun = time.monotonic()
+    with ThreadPoolExecutor(2) as executor:
+        rows = list(run_batch(requests, executor, BatchOptions(timeout_s=1.5)))
+    assert time.monotonic() - begun < 40
+    assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
+    assert any("longer than 1.5 s" in row.reason for row in rows)
+
+
+def test_what_is_done_is_skipped_until_input_configuration_or_request_change(season: Path) -> None:
+    add(season, "a", "b", "bad")
+    assert {row.status for row in run(season).values()} == {"done", "failed"}
+    again = run(season)
+    assert {name: row.status for name, row in again.items()} == {"a": "skipped", "b": "skipped", "bad": "failed"}
+    assert again["a"].distance_m == 7.0
+    assert len((season / "order.txt").read_text().split()) == 3, "the log's own error is kept, nothing ran again"
+    (season / "a.mcap").touch()  # another time, the same content
+    assert run(season)["a"].status == "skipped"
+    (season / "a.mcap").write_bytes(b"\x89MCAP0\r\nA")  # the same size and another content
+    assert {name: row.status for name, row in run(season).items()}["a"] == "done"
+    assert run(season, sets=("filter.preset=paper",))["b"].status == "done"
+    assert run(season, sets=("filter.preset=paper",), redo=True)["b"].status == "done"
+    (season.parent / "out" / "runs" / "b" / "run.json").unlink()
+    assert run(season, sets=("filter.preset=paper",))["b"].status == "done"
+
+
+def test_another_version_processes_all_again(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add(season, "a")
+    run(season)
+    monkeypatch.setattr("icrtool.fleet.batch.__version__", "99")
+    assert run(season)["a"].status == "done"
+
+
+def test_a_row_file_that_is_damaged_is_not_trusted(season: Path) -> None:
+    add(season, "a")
+    run(season)
+    (file,) = (season.parent / "out" / ".rows").iterdir()
+    for content in (b"", b"{}", b"[", file.read_bytes()[:-20]):
+        file.write_bytes(content)
+        assert run(season)["a"].status == "done"
+
+
+def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) -> None:
+    add(season, "a", "hang1", "hang2", "hang3")
+    asked = BatchOptions(timeout_s=50)
+    requests = plan([season], season.parent / "out", asked)
+    begun = time.monotonic()
+    with ThreadPoolExecutor(2) as executor:
+        rows = run_batch(requests, executor, asked)
+        assert next(rows).log == "a.mcap"
+        rows.close()
+    assert time.monotonic() - begun < 30, "nobody waits for what hangs"
+    assert threading.active_count() < 20
+    for name in ("hang1", "hang2", "hang3"):
+        (season / f"{name}.mcap").unlink()
+    add(season, "b")
+    assert {name: row.status for name, row in run(season).items()} == {"a": "skipped", "b": "done"}
+
+
+def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
+    add(season, "hang")
+    request = plan([season], season.parent / "out", BatchOptions())[0]
+    process = subprocess.Popen(
+        worker.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(request.encode() + b"\n")
+    process.stdin.flush()
+    assert b"reading" in process.stdout.readline()
+    process.stdin.close()
+    assert process.wait(20) == 1
+    process.stdout.close()
+
+
+def test_a_request_survives_its_journey_whatever_its_path(season: Path) -> None:
+    name = os.fsdecode(b"\xff\n.mcap")
+    (season / name).write_bytes(b"\x89MCAP0\r\n")
+    request = plan([season], season.parent / "out", BatchOptions(sets=("robot.track_width_m=0.5",)))[0]
+    from icrtool.fleet.one_log import decode_request
+
+    again = decode_request(request.encode())
+    assert again == request
+    assert again.config.effective() == request.config.effective()
+    assert os.fsdecode(again.path) == str(season / name)
+    assert b"\n" not in request.encode()
+    assert run(season).popitem()[1].status == "done"
+
+
+def test_the_manifest_gives_robot_group_and_tags(season: Path) -> None:
+    add(season, "a", "b")
+    (season / "own.toml").write_text('[robot]\nname = "mule"\ntrack_width_m = 0.9\n')
+    (season / "m.csv").write_text(
+        "log,robot,config,group,tags\na.mcap,husky-a200,,grass,wet\nb.mcap,mule,own.toml,ice,\n"
+    )
+    requests = plan([season / "m.csv"], season.parent / "out", BatchOptions())
+    first, second = requests
+    assert (first.row.robot, first.row.group, first.row.tags) == ("husky-a200", "grass", ("wet",))
+    assert first.config.robot.name == "husky-a200"
+    assert (second.row.robot, second.config.robot.track_width_m) == ("mule", 0.9)
+    (season / "m.csv").write_text("log,robot\na.mcap,husky-a20\n")
+    with pytest.raises(ConfigError, match="husky-a20"):
+        plan([season / "m.csv"], season.parent / "out", BatchOptions())
+
+
+def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="no recording"):
+        plan([season], tmp_path / "out", BatchOptions())
+    add(season, "a")
+    with pytest.raises(ConfigError, match="gate"):
+        plan([season], tmp_path / "out", BatchOptions(gates=("nonsense",)))
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a file is there"):
+        plan([season], tmp_path / "file", BatchOptions())
+    (tmp_path / "run.json").touch()
+    with pytest.raises(OutputError, match="is a run itself"):
+        plan([season], tmp_path, BatchOptions())
+
+
+def test_memory_bounds_how_many_logs_run_at_once(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add(season, *"abcdefgh")
+    requests = plan([season], season.parent / "out", BatchOptions())
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+    for free, jobs in ((None, 8), (100 << 30, 8), (2 << 30, 5), (1, 1)):
+        monkeypatch.setattr("icrtool.fleet.batch._free_bytes", lambda free=free: free)
+        assert default_jobs(requests) == jobs
+    assert default_jobs(requests[:3]) <= 3
+
+
+def test_tables_hold_a_row_per_log_and_null_where_nothing_is_known(season: Path, tmp_path: Path) -> None:
+    done = Row("a.mcap", "runs/a", "done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25}, icr={"x_icr_m": 0.1})
+    bad = Row("b\udcff.mcap".encode("utf-8", "backslashreplace").decode(), "runs/b", "failed", reason='a "why", here')
+    write_fleet([done, bad], tmp_path)
+    with (tmp_path / "fleet.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["done", "failed"]
+    assert rows[0]["icr_p95_10m_m"] == "0.25"
+    assert rows[1]["icr_p95_10m_m"] == rows[1]["distance_m"] == ""
+    with (tmp_path / "failures.csv").open(encoding="utf-8") as file:
+        assert [row["reason"] for row in csv.DictReader(file)] == ['a "why", here']
+    import pandas as pd
+
+    frame = pd.read_parquet(tmp_path / "fleet.parquet")
+    assert list(frame.columns) == list(rows[0])
+    assert frame["distance_m"].isna().tolist() == [False, True]
+    document = json.loads((tmp_path / "fleet.json").read_text())
+    assert document["counts"] == {"done": 1, "failed": 1, "skipped": 0}
+    contract = ("log", "status", "reason", "robot", "group", "start_utc", "duration_s", "distance_m", "y_icr_right_m",
+                "y_icr_left_m", "x_icr_m", "std_y_icr_right_m", "std_y_icr_left_m", "std_x_icr_m", "multiplier",
+                "multiplier_std", "events", "outages", "warnings", "tool_version")  # fmt: skip
+    assert set(contract) <= set(rows[0])
+
+
+def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_path: Path) -> None:
+    add(season, "a")
+    run(season)
+    moved = tmp_path / "moved"
+    season.rename(moved)
+    request = plan([moved], tmp_path / "out", BatchOptions())[0]
+    assert isinstance(request, Request)
+    found = finished(request)
+    assert found is not None
+    assert finished(replace(request, row=replace(request.row, key="other"))) is None

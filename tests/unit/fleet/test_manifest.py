@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from icrtool.errors import ConfigError
+from icrtool.fleet.manifest import About, about, read_manifest
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    for name in ("mon/a.mcap", "mon/b.mcap", "tue/c.mcap", "odd[1].mcap"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def test_csv_and_toml_state_the_same(logs: Path) -> None:
+    (logs / "m.csv").write_text(
+        "log,robot,config,group,tags\nmon/*.mcap,husky-a200,,grass,wet; dark\ntue,,t.toml,gravel,\n"
+    )
+    (logs / "m.toml").write_text(
+        '[[logs]]\nlog = "mon/*.mcap"\nrobot = "husky-a200"\ngroup = "grass"\ntags = ["wet", "dark"]\n'
+        '[[logs]]\nlog = "tue"\nconfig = "t.toml"\ngroup = "gravel"\n'
+    )
+    assert read_manifest(logs / "m.csv") == read_manifest(logs / "m.toml")
+    entries = read_manifest(logs / "m.csv")
+    assert about(logs / "mon" / "b.mcap", entries) == About("husky-a200", None, "grass", ("wet", "dark"))
+    assert about(logs / "tue" / "c.mcap", entries) == About("", logs / "t.toml", "gravel", ())
+
+
+def test_a_later_line_refines_an_earlier_one(logs: Path) -> None:
+    (logs / "m.csv").write_text("log,robot,group,tags\n**/*.mcap,jackal,grass,season\nmon/b.mcap,,ice,cold\n")
+    entries = read_manifest(logs / "m.csv")
+    assert about(logs / "mon" / "b.mcap", entries) == About("jackal", None, "ice", ("season", "cold"))
+    assert about(logs / "mon" / "a.mcap", entries) == About("jackal", None, "grass", ("season",))
+
+
+def test_a_name_with_brackets_is_a_name_where_it_is_there(logs: Path) -> None:
+    (logs / "m.csv").write_text("log\nodd[1].mcap\n")
+    assert read_manifest(logs / "m.csv")[0].places == (logs / "odd[1].mcap",)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("m.csv", "", "empty|log"),
+        ("m.csv", "file\na.mcap\n", "column log"),
+        ("m.csv", "log,robto\nmon,x\n", "robto"),
+        ("m.csv", "log,robot\nmon\n", "m.csv:2"),
+        ("m.csv", "log\nnowhere/*.mcap\n", "matches nothing"),
+        ("m.csv", 'log\n"mon', "not a manifest"),
+        ("m.toml", "logs = 3", r"\[\[logs\]\]"),
+        ("m.toml", "[[logs]]\nlog = 3", "log"),
+        ("m.toml", "[[logs]]\nlog = 'mon'\ntags = [3]", "log"),
+        ("m.toml", "[robot]\nname = 'x'", r"\[\[logs\]\]"),
+        ("m.toml", "a = " + "[" * 5000, "not a manifest"),
+        ("m.toml", "not toml", "not a manifest"),
+    ],
+)
+def test_what_is_no_manifest_is_one_line(logs: Path, name: str, content: str, what: str) -> None:
+    (logs / name).write_text(content)
+    with pytest.raises(ConfigError, match=what) as error:
+        read_manifest(logs / name)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,257 @@
+"""Logs made to take a reader's time or memory, or to write on a terminal: each costs only what it holds."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from icrtool.config import load_config
+from icrtool.errors import ConfigError, DefinitionError, LogError
+from icrtool.logs import survey_log
+from icrtool.logs.containers.channel import Channel, Cut
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.cut import moment
+from icrtool.logs.messages.decoder import walk_messages
+from icrtool.logs.messages.dynamic_joints import collector_for
+from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
+from icrtool.records.text import LogText
+
+SEPARATOR = "=" * 80 + "\n"
+START_NS = 1_760_000_000_000_000_000
+LONGEST_S = 5.0
+"""Of one hostile log."""
+
+IMU = "sensor_msgs/Imu"
+
+
+def types(**messages: str) -> str:
+    """A definition text: the fields of an Imu first, then those of the other types."""
+    first = messages.pop("first")
+    return first + "".join(f"\n{SEPARATOR}MSG: x/{name}\n{fields}" for name, fields in messages.items())
+
+
+DEFINITIONS = {
+    "refers to itself": types(first="x/A a\nfloat64 b", A="x/A a"),
+    "refers to itself by way of another": types(first="x/A a", A="x/B b", B="x/A a"),
+    "refers to itself in a sequence": types(first="x/A[] a", A="x/A[] a\nint8 b"),
+    "a chain of many types": types(first="x/T0 a", **{f"T{i}": f"x/T{i + 1} a" for i in range(200)}, T200="int8 a"),
+    "far too many types": types(first="x/T0 a", **{f"T{i}": f"x/T{i + 1} a" for i in range(3000)}, T3000="int8 a"),
+    "twice each in the next": types(
+        first="x/T0 a", **{f"T{i}": f"x/T{i + 1} a\nx/T{i + 1} b" for i in range(30)}, T30="int8 a"
+    ),
+    "an array longer than 64 bits": "float64[99999999999999999999] a",
+}
+
+
+@pytest.mark.parametrize("definition", DEFINITIONS.values(), ids=DEFINITIONS)
+def test_a_definition_without_end_is_refused_and_costs_only_its_topic(definition: str) -> None:
+    channel = Channel(0, LogText("/imu"), LogText(IMU), LogText("cdr"), definition)
+    begin = time.process_time()
+    with pytest.raises(DefinitionError):
+        collector_for(channel, ("orientation.x",))
+    assert time.process_time() - begin < LONGEST_S
+
+
+@pytest.mark.parametrize("kind", [SEQUENCE, ARRAY])
+def test_loops_over_elements_of_no_size_end(kind: int) -> None:
+    inner = {"x/msg/E": ([], [])}
+    for level in range(6):
+        name = f"x/msg/L{level}"
+        element = (NAME, "x/msg/E" if level == 0 else f"x/msg/L{level - 1}")
+        inner[name] = ([], [("e", (kind, (element, 1000)))])
+    fields = [("l", (NAME, "x/msg/L5")), ("v", (BASE, ("float64", 0)))]
+    layout = compile_layout({**inner, "x/msg/Top": ([], fields)}, "x/Top", ("v",), "ros1")
+    data = np.tile(np.array([200, 0, 0, 0], np.uint8), 250)
+    walk_messages(layout, data[:0], np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
+    begin = time.process_time()
+    _, readable = walk_messages(layout, data, np.array([0]), np.array([len(data)]))
+    assert not readable.any()
+    assert time.process_time() - begin < LONGEST_S
+
+
+def write_topics(path: Path, count: int, definition: str = "float64 data", name: str = "/t{}") -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "ros2msg", definition.encode())
+        for i in range(count):
+            channel = writer.register_channel(name.format(i), "cdr", schema)
+            writer.add_message(channel, START_NS + i, bytes(400), START_NS + i)
+        writer.finish()
+    return path
+
+
+def test_memory_grows_with_the_messages_not_with_the_topics(tmp_path: Path) -> None:
+    definition = "\n".join(f"float64[9] {name}_covariance" for name in ("orientation", "angular_velocity"))
+    path = write_topics(tmp_path / "log.mcap", 1000, definition)
+    survey_log(path)
+    tracemalloc.start()
+    try:
+        survey_log(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 100_000_000
+
+
+def test_a_log_inflates_no_more_than_so_many_times() -> None:
+    import zstandard
+
+    chunk = zstandard.compress(bytes(LARGEST_CHUNK_BYTES // 4))
+    inflation, done = Inflation(), 0
+    with pytest.raises(DecompressionError, match="inflates"):  # noqa: PT012 - how many chunks it takes is not fixed
+        for _ in range(20):
+            done += len(inflation.decompress(chunk, "zstd", LARGEST_CHUNK_BYTES // 4))
+    assert done <= 1.5 * LARGEST_CHUNK_BYTES
+    honest = np.random.default_rng(0).bytes(1000)
+    for _ in range(100):
+        Inflation().decompress(zstandard.compress(honest), "zstd", 1000)
+
+
+SCHEMAS = {
+    "a column named rowid": "CREATE TABLE messages(rowid TEXT, topic_id, timestamp, data)",
+    "a view": "CREATE TABLE m(id); CREATE VIEW messages AS SELECT 1 AS topic_id, 2 AS timestamp, x'00' AS data",
+    "an endless query": "CREATE VIEW messages AS WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r) "
+    "SELECT 1 AS topic_id, i AS timestamp, x'00' AS data FROM r",
+    "computed columns": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, "
+    "data BLOB AS (zeroblob(250000000)))",
+    "no row numbers": "CREATE TABLE messages(id TEXT PRIMARY KEY, topic_id, timestamp, data) WITHOUT ROWID",
+}
+
+
+@pytest.mark.parametrize("schema", SCHEMAS.values(), ids=SCHEMAS)
+def test_only_plain_tables_are_read(tmp_path: Path, schema: str) -> None:
+    path = tmp_path / "log.db3"
+    database = sqlite3.connect(path)
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        f"INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr'); {schema};"
+    )
+    if "rowid TEXT" in schema:
+        database.execute("INSERT INTO messages VALUES ('x', 1, 2, x'00')")
+    database.commit()
+    database.close()
+    begin = time.process_time()
+    with pytest.raises(LogError):
+        open_log(path)
+    assert time.process_time() - begin < LONGEST_S
+
+
+def good_db3(path: Path, count: int = 50) -> Path:
+    database = sqlite3.connect(path)
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+        "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr');"
+    )
+    rows = [(i + 1, 1, START_NS + i * 10**9, bytes([i])) for i in range(count)]
+    database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    database.commit()
+    database.close()
+    return path
+
+
+METADATA = "rosbag2_bagfile_information:\n  relative_file_paths: [log.db3]\n"
+POWERS = [(f"x{i}: &x{i}", ",".join(f"*x{i - 1}" for _ in range(9))) for i in range(1, 12)]
+BAD_METADATA = {
+    "aliases of aliases": "x0: &x0 [a,a]\n" + "".join(f"{name} [{many}]\n" for name, many in POWERS) + METADATA,
+    "merges of merges": "x0: &x0 {k: 1}\n" + "".join(f"{name} {{<<: [{many}]}}\n" for name, many in POWERS) + METADATA,
+    "far too long": METADATA + "#" * 10_000_000,
+    "nested deeply": "[" * 100_000,
+    "no mapping": "- a\n- b\n",
+    "a key that is a list": "? [a]\n: b\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", BAD_METADATA.values(), ids=BAD_METADATA)
+def test_metadata_that_explodes_is_left_aside(tmp_path: Path, text: str) -> None:
+    good_db3(tmp_path / "log.db3")
+    (tmp_path / "metadata.yaml").write_text(text)
+    begin = time.process_time()
+    container = open_log(tmp_path)
+    assert sum(len(block.start) for block in container.blocks(frozenset({0}))) == 50
+    assert any("metadata.yaml" in problem for problem in container.problems)
+    container.close()
+    assert time.process_time() - begin < LONGEST_S
+
+
+def test_a_file_that_is_named_twice_is_read_once(tmp_path: Path) -> None:
+    good_db3(tmp_path / "log.db3")
+    (tmp_path / "metadata.yaml").write_text(METADATA.replace("[log.db3]", "[log.db3, ./log.db3, x/../log.db3]"))
+    container = open_log(tmp_path)
+    assert sum(len(block.start) for block in container.blocks(frozenset({0}))) == 50
+    container.close()
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_cut_holds_the_messages_of_its_times(tmp_path: Path, kind: str) -> None:
+    if kind == "db3":
+        path = good_db3(tmp_path / "log.db3")
+    else:
+        path = tmp_path / "log.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream, chunk_size=200)
+            writer.start()
+            channel = writer.register_channel("/a", "cdr", writer.register_schema("x/A", "ros2msg", b"int8 a"))
+            for i in range(50):
+                writer.add_message(channel, START_NS + i * 10**9, bytes(40), START_NS + i * 10**9)
+            writer.finish()
+    container = open_log(path)
+    cut = Cut(START_NS + 10 * 10**9, START_NS + 20 * 10**9)
+    blocks = list(container.blocks(frozenset({1}), cut))
+    times = np.concatenate([cut.of(block).log_time_ns for block in blocks])
+    assert ((times - START_NS) // 10**9).tolist() == list(range(10, 20))
+    assert sum(len(block.start) for block in blocks) < 25
+    assert container.begin_ns() == START_NS
+    container.close()
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "noon", "2026-13-01", ""])
+def test_a_moment_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(LogError, match="--from"):
+        moment(text, "--from")
+
+
+def test_moments_are_seconds_or_times_with_a_zone() -> None:
+    assert moment("12.5", "--from") == 12.5
+    same = [
+        moment(text, "--from") for text in ("2026-05-04T09:30:00", "2026-05-04T09:30:00Z", "2026-05-04 11:30+02:00")
+    ]
+    assert same[0] == same[1] == same[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[frames]\nreference_delay_s = 1e300", "frames.reference_delay_s"),
+        ("[filter]\nprocess_icr_mps = 1e300", "filter.process_icr_mps"),
+        ("[filter]\ngnss_std_floor_m = 1e200", "filter.gnss_std_floor_m"),
+        ("[filter]\ninitial_y_icr_right_m = -1e308", "filter.initial_y_icr_right_m"),
+        ("[dropout]\nhorizons_m = [" + ",".join(map(str, range(1, 100_000))) + "]", "dropout.horizons_m"),
+        ("[robot]\nname = " + "[" * 100_000, "nested"),
+        ("[robot]\nname = 1" + " " * 2_000_000, "bytes"),
+    ],
+)
+def test_configuration_out_of_bounds_is_refused_with_its_key(tmp_path: Path, text: str, key: str) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as err:
+        load_config(path)
+    assert key in str(err.value)
+    assert len(str(err.value)) < 1000
+
+
+def test_a_configuration_that_is_a_pipe_or_a_device_is_refused(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ConfigError, match="not a file"):
+            load_config(place)
