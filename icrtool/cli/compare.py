@@ -37,7 +37,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
     from icrtool.errors import ConfigError
-    from icrtool.output.atomic_file import check_place, atomic_file
+    from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.run_directory import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 

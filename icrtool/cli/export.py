@@ -20,7 +20,8 @@ TARGETS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json", "ic
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=click.Path(path_type=Path))
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the text is for.")
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Write it here.")
-def command(source: Path | None, target: str, output: Path | None) -> None:
+@click.option("--force", is_flag=True, help="Also from a run whose ICRs are not usable.")
+def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration, ready to paste into a robot's controller or filter.
 
     CAL.json is a file that `icrtool calibrate -o` wrote. A RUN, a directory that `icrtool fit` wrote, is calibrated
@@ -32,12 +33,12 @@ def command(source: Path | None, target: str, output: Path | None) -> None:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for icr season.json -o twist.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import check_place, atomic_file
+    from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.exports.controllers import format_export
 
     if output is not None:
         check_place(output)
-    text = format_export(_calibration(source), cast("Target", target))
+    text = format_export(_calibration(source, force=force), cast("Target", target))
     if output is None:
         click.echo(text)
         return
@@ -45,8 +46,8 @@ def command(source: Path | None, target: str, output: Path | None) -> None:
         partial.write_text(f"{text}\n", encoding="utf-8")
 
 
-def _calibration(source: Path | None) -> Calibration:
-    """Read a calibration file, or calibrate from a run."""
+def _calibration(source: Path | None, *, force: bool) -> Calibration:
+    """Read a calibration file, or calibrate from a run that is usable."""
     from icrtool.output.stored_run import newest_run, open_run
 
     if source is not None and source.is_file() and source.suffix == ".json":
@@ -54,5 +55,10 @@ def _calibration(source: Path | None) -> Calibration:
 
         return open_calibration(source)
     from icrtool.calibration.from_runs import calibrate
+    from icrtool.errors import DataError
 
-    return calibrate(open_run(source if source is not None else newest_run(RUNS)))
+    run = open_run(source if source is not None else newest_run(RUNS))
+    if not (run.usable or force):
+        why = f"its ICRs are not usable: {run.summary['unusable_because']}"
+        raise DataError(run.name, why, "drive again, with turns to both sides; --force exports it all the same")
+    return calibrate(run)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +17,18 @@ from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
 from icrtool.records.tables import Bools, Floats, Ints
 
-PAPER_PROCESS_POSITION_MPS = 0.2
+
+class ProcessNoise(NamedTuple):
+    """Process noise of the pose: square roots of the first and third entry of Q (Pentzer 2014, Eq. 30)."""
+
+    position_mps: float
+    heading_degps: float
+
+
+PAPER_NOISE = ProcessNoise(0.2, 5.0)
 """Pentzer 2014, Eq. 30; its text says 0.1 m/s, its matrix prints 0.2 squared: the matrix is used."""
 
-PAPER_PROCESS_HEADING_DEGPS = 5.0
-"""Pentzer 2014, Eq. 30."""
-
-FIELD_PROCESS_POSITION_MPS = 0.3
-FIELD_PROCESS_HEADING_DEGPS = 7.0
+FIELD_NOISE = ProcessNoise(0.3, 7.0)
 """Preset ``field``: with the paper's 0.2 and 5 the 2-sigma bands hold only 83 % (position) and 86 % (heading) of the
 truth on rigid-body simulated robots, with these 90 % and more."""
 
@@ -103,7 +108,7 @@ def set_up_filter(
     sensors: SensorData,
     config: Config,
     *,
-    process_position_mps: float | None = None,
+    noise: ProcessNoise | None = None,
     changes_s: tuple[float, ...] = (),
     warm_start: WarmStart | None = None,
     outages_ns: tuple[tuple[int, int], ...] = (),
@@ -113,7 +118,7 @@ def set_up_filter(
     Parameters
     ----------
     sensors : the aligned streams
-    process_position_mps : in place of the configured one
+    noise : process noise of the pose, in place of the configured one
     changes_s : terrain changes, seconds since the first recorded state; the ICR covariance is inflated there
     warm_start : what another run ended with, in place of the configured start
     outages_ns : half-open spans in which GNSS and heading are taken away
@@ -144,7 +149,7 @@ def set_up_filter(
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), sensors.heading_correlation_s)
-    parameters = _parameters(config, data, sensors.antenna_m, process_position_mps, alike)
+    parameters = _parameters(config, data, sensors.antenna_m, noise or configured_noise(config), alike)
     x0, P0 = _start_state(data, t0, _initial_icrs(config, sensors.icr_start), parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
@@ -248,12 +253,15 @@ def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
 
 
-def configured_process_position_mps(config: Config) -> float:
-    """Return the position process noise a run starts with."""
-    given = config.filter.process_position_mps
-    if given != "auto":
-        return given
-    return PAPER_PROCESS_POSITION_MPS if config.filter.preset == "paper" else FIELD_PROCESS_POSITION_MPS
+def configured_noise(config: Config) -> ProcessNoise:
+    """Return the process noise of the pose that a run starts with: as configured, else the preset's."""
+    settings = config.filter
+    preset = PAPER_NOISE if settings.preset == "paper" else FIELD_NOISE
+    position, heading = settings.process_position_mps, settings.process_heading_degps
+    return ProcessNoise(
+        position if position != "auto" else preset.position_mps,
+        heading if heading is not None else preset.heading_degps,
+    )
 
 
 def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
@@ -272,18 +280,14 @@ def _parameters(
     config: Config,
     data: Measurements,
     antenna: tuple[float, float],
-    process_position_mps: float | None,
+    noise: ProcessNoise,
     headings_alike: float,
 ) -> FilterParameters:
     settings = config.filter
     paper = settings.preset == "paper"
-    speed = configured_process_position_mps(config) if process_position_mps is None else process_position_mps
-    position, icr = speed**2, settings.process_icr_mps**2
-    turn = PAPER_PROCESS_HEADING_DEGPS if paper else FIELD_PROCESS_HEADING_DEGPS
-    if settings.process_heading_degps is not None:
-        turn = settings.process_heading_degps
+    position, icr = noise.position_mps**2, settings.process_icr_mps**2
     return FilterParameters(
-        process_variance=(position, position, math.radians(turn) ** 2, icr, icr, icr),
+        process_variance=(position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr),
         rate_invariant=not paper,
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),

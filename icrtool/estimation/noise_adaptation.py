@@ -1,25 +1,37 @@
-"""Run the filter over the sensors of a log, and again while wheels and position reference contradict each other."""
+"""Run the filter over the sensors of a log, with the process noise of the pose that this log's innovations show."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import FilterSetup, configured_process_position_mps, set_up_filter
+from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.ekf import run_filter
 from icrtool.kernels.filter_records import UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
+from icrtool.records.tables import Floats
 
-TOLERATED_NIS = 2.5
-"""Mean NIS of the fixes: 2 is expected where the noises are right."""
+TOLERATED_NIS = 1.25
+"""Mean NIS of a stream, each counted up to its gate, per degree of freedom: 1 is expected where the noise is right."""
 
-PROCESS_POSITION_STEP = 2.0
-LARGEST_PROCESS_POSITION_MPS = 10.0
-WORTHWHILE_SHARE = 0.9
-"""Doubling the position noise is worth it when it brings the mean NIS below this part of what it was."""
+STEP = 2.0
+LARGEST_POSITION_MPS = 10.0
+LARGEST_HEADING_DEGPS = 120.0
+
+TAIL_DEGREES = 4.0
+"""Degrees of freedom of Student's t: Lange, Little and Taylor 1989 recommend it where outliers are few but gross."""
+
+FLAT = 0.1
+"""Costs that differ by less than this a measurement are alike: it is what 5 % of error in both deviations costs."""
+
+MOST_ROUNDS = 3
+
+MOST_SAMPLES = 60_000
+"""Wheel samples the search looks at: ten minutes at 100 Hz."""
 
 
 class AdaptedRun(NamedTuple):
@@ -28,36 +40,126 @@ class AdaptedRun(NamedTuple):
     sensors: SensorData
     setup: FilterSetup
     output: FilterOutput
-    process_position_mps: float
+    noise: ProcessNoise
     reference_delay_s: float
 
 
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
 ) -> AdaptedRun:
-    """Run the filter; look for a delay, then raise the position noise, where the fixes contradict the wheels.
+    """Run the filter; where fixes or headings contradict the wheels, with the process noise that they show.
 
-    A contradiction (NIS of fixes and headings, each counted up to its gate) that falls when the reference is shifted
-    comes from the clocks; one that falls as the noise grows, from the wheels (held samples, slip) or from fixes that
-    err together: the larger noise is the honest one. Bad fixes stay bad whatever is done. Preset ``field`` only.
-    A delay that is configured is corrected before (`icrtool.alignment.stream_delays`), and none is looked for.
+    The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
+    ``field`` only; what is configured is not searched for.
     """
 
-    def run(one: SensorData, speed: float) -> tuple[FilterSetup, FilterOutput, float, float]:
-        setup = set_up_filter(one, config, process_position_mps=speed, warm_start=warm_start, changes_s=changes_s)
-        output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
-        nis, heading_nis = output.gnss_nis[output.gnss_code > UNSEEN], output.heading_nis[output.heading_code > UNSEEN]
-        by_fixes = float(np.minimum(nis, setup.parameters.gnss_gate).mean()) if len(nis) else 0.0
-        capped = np.minimum(heading_nis, setup.parameters.heading_gate)
-        return setup, output, by_fixes, by_fixes + (float(capped.mean()) if len(capped) else 0.0)
+    def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
+        setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
+        return setup, run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
 
-    speed = configured_process_position_mps(config)
-    field = config.filter.preset == "field"
-    setup, output, contradiction, _ = run(sensors, speed)
-    adapts = field and config.filter.process_position_mps == "auto"
-    while adapts and contradiction > TOLERATED_NIS and speed < LARGEST_PROCESS_POSITION_MPS:
-        next_setup, next_output, next_one, _ = run(sensors, speed * PROCESS_POSITION_STEP)
-        if next_one > WORTHWHILE_SHARE * contradiction:
+    noise, settings = configured_noise(config), config.filter
+    setup, output = run(sensors, noise)
+    if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
+        return AdaptedRun(sensors, setup, output, noise, 0.0)
+    part = _busiest_part(sensors)
+    best = find_noise(
+        lambda tried: innovation_cost(run(part, tried)[1]),
+        noise,
+        positions=settings.process_position_mps == "auto",
+        headings=settings.process_heading_degps is None,
+    )
+    if best != noise:
+        noise = best
+        setup, output = run(sensors, noise)
+    return AdaptedRun(sensors, setup, output, noise, 0.0)
+
+
+def _busiest_part(sensors: SensorData) -> SensorData:
+    """Return the `MOST_SAMPLES` wheel samples in which the wheels travel most, all where there are no more."""
+    wheels = sensors.wheels
+    if len(wheels.stamp_ns) <= MOST_SAMPLES:
+        return sensors
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))])
+    first = int(np.argmax(travel[MOST_SAMPLES:] - travel[:-MOST_SAMPLES]))
+    return sensors.part(slice(first, first + MOST_SAMPLES))
+
+
+def find_noise(
+    cost: Callable[[ProcessNoise], float], start: ProcessNoise, *, positions: bool, headings: bool
+) -> ProcessNoise:
+    """Return the smallest process noise, from `start` up by doubling, whose cost is that of the best one.
+
+    Parameters
+    ----------
+    cost : by noise, see `innovation_cost`
+    positions, headings : whether the noise of the position, and of the heading, is searched for
+
+    Notes
+    -----
+    One coordinate after the other, each over all its doublings: too small a noise rejects nearly all measurements, and
+    the first doublings may change nothing. Smallest: every noise whose cost is within `FLAT` of the least is as good.
+    """
+    known: dict[ProcessNoise, float] = {}
+
+    def best_of(ladder: Iterable[ProcessNoise]) -> ProcessNoise:
+        tried = list(ladder)
+        for one in tried:
+            if one not in known:
+                known[one] = cost(one)
+        limit = min(known[one] for one in tried) + FLAT
+        return next(one for one in tried if known[one] <= limit)
+
+    best = start
+    for _ in range(MOST_ROUNDS if positions and headings else 1):
+        before = best
+        if positions:
+            steps = _doublings(start.position_mps, LARGEST_POSITION_MPS)
+            best = best_of(best._replace(position_mps=value) for value in steps)
+        if headings:
+            steps = _doublings(start.heading_degps, LARGEST_HEADING_DEGPS)
+            best = best_of(best._replace(heading_degps=value) for value in steps)
+        if best == before:
             break
-        speed, setup, output, contradiction = speed * PROCESS_POSITION_STEP, next_setup, next_output, next_one
-    return AdaptedRun(sensors, setup, output, speed, 0.0)
+    return best
+
+
+def innovation_cost(output: FilterOutput) -> float:
+    """Return what the innovations of a run cost: the mean over the fixes, and that over the headings, added.
+
+    Notes
+    -----
+    Twice the negative log-likelihood of innovations with covariance S under Student's t with nu = `TAIL_DEGREES`,
+    without its constant: (nu + d) ln(1 + NIS / nu) + ln det S, rejected ones included (Lange, Little and Taylor 1989).
+    A normal likelihood raises the noise for a few gross errors. One that ends at the gate is least where everything
+    is rejected. Means: samples of a fast stream err alike, so that their number is no weight.
+    """
+    fixes = output.gnss_code > UNSEEN
+    headings = (output.heading_code > UNSEEN) & (output.heading_nis > 0.0)
+    variance = output.heading_innovation[headings] ** 2 / output.heading_nis[headings]
+    return _student_cost(output.gnss_nis[fixes], output.gnss_det[fixes], 2) + _student_cost(
+        output.heading_nis[headings], variance, 1
+    )
+
+
+def _student_cost(nis: Floats, det: Floats, degrees: int) -> float:
+    if not len(nis):
+        return 0.0
+    return float(np.mean((TAIL_DEGREES + degrees) * np.log1p(nis / TAIL_DEGREES) + np.log(det)))
+
+
+def _doublings(start: float, largest: float) -> list[float]:
+    """Return start and its doublings up to the largest; of zero there are none."""
+    steps = [start]
+    while 0.0 < steps[-1] * STEP <= largest:
+        steps.append(steps[-1] * STEP)
+    return steps
+
+
+def _capped_nis(setup: FilterSetup, output: FilterOutput) -> tuple[float, float]:
+    """Return mean NIS of fixes and of headings per degree of freedom, each counted up to its gate; 0 for none."""
+    nis = output.gnss_nis[output.gnss_code > UNSEEN], output.heading_nis[output.heading_code > UNSEEN]
+    gates = setup.parameters.gnss_gate, setup.parameters.heading_gate
+    fixes, headings = (
+        float(np.minimum(one, gate).mean()) if len(one) else 0.0 for one, gate in zip(nis, gates, strict=True)
+    )
+    return fixes / 2.0, headings

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.estimation.icr_uncertainty import DriveWindows, cut_drive, prior_std
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL, displace, integrate
+from icrtool.kernels.window_errors import NEUTRAL
 from icrtool.records.run import ICR_COLUMNS, half_width_m
 from icrtool.records.tables import Floats, States
 
@@ -18,19 +19,17 @@ Excited = Literal["shown", "weak", "not shown"]
 
 WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
-WINDOW_M = 2.0
-"""Way of the wheels, spins included, over which displacement and turn are compared."""
-
 SLIP_SHARE = 0.03
 """Part of way and of turn that slips differently from one window to the next."""
 
-HEADING_BIAS_RAD = math.radians(1.0)
-SCALE_ERROR = 0.02
-"""What is never known better before a drive: the heading's offset, and the wheels' scales, both and their difference.
-A circle alone cannot tell the ICRs from these."""
-
 SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
 """Standard deviations in parts of y right - y left up to which an ICR is shown, and weakly."""
+
+AT_LIMIT = 1.1
+"""A y ICR within this many times the filter's limit is the limit, not an estimate."""
+
+UNLEARNED = 0.7
+"""An ICR whose standard deviation is still more than this share of the start's was not learned."""
 
 TURNS_NEEDED_RAD = math.pi
 ONE_WAY = 0.15
@@ -76,7 +75,9 @@ class Excitation:
         }
 
 
-def find_excitation(table: States, drive: Drive, track_width_m: float | None) -> Excitation:
+def find_excitation(
+    table: States, drive: Drive, track_width_m: float | None, windows: DriveWindows | None = None
+) -> Excitation:
     """Return which ICRs a drive could show.
 
     Parameters
@@ -84,6 +85,7 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None) ->
     table : the recorded states
     drive : the same for the kernels
     track_width_m : b, None where not known
+    windows : of the drive, with `nominal_parameters`, where they are there already
 
     Returns
     -------
@@ -95,26 +97,20 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None) ->
     own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are marginalised. It
     says what a drive could tell at best, not what the filter made of it.
     """
-    dt = np.where(drive.gap, 0.0, drive.dt_s)
-    p = _nominal(table, track_width_m)
+    p = nominal_parameters(table, track_width_m)
     width = float(p[0] - p[1])
-    way = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
-    rows = rows_at_steps(way, WINDOW_M)
-    start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
-    motion = integrate(table.t_s, dt, drive.v_left, drive.v_right, p, table.t_s[rows])
-    d, d_by, _ = displace(motion, start, end)
-    turn_by = motion.theta_by[end] - motion.theta_by[start]
-    turned = motion.theta[end] - motion.theta[start]
+    windows = cut_drive(table, drive, p) if windows is None else windows
     std = _posterior(
-        d, d_by, turn_by, turned, np.diff(way[rows]),
+        windows,
         position_std=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
-        heading_std=float(np.median(table.std_heading_rad)), width=width,
-    )  # fmt: skip
+        heading_std=float(np.median(table.std_heading_rad)),
+        width=width,
+    )
     omega = (drive.v_left - drive.v_right) / width
     spins = np.abs(drive.v_left - drive.v_right) > SPIN_RATIO * np.abs(drive.v_left + drive.v_right) / 2
     # noise of standing encoders is no turn
     moving = np.abs(drive.v_left) + np.abs(drive.v_right) > 0.02
-    turns = np.where(moving, dt * omega, 0.0)
+    turns = np.where(moving & ~drive.gap, drive.dt_s * omega, 0.0)
     right, left, spun_right, spun_left = (
         float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
         float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),
@@ -128,11 +124,43 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None) ->
         turned_left_rad=left,
         spun_right_rad=spun_right,
         spun_left_rad=spun_left,
-        sentences=_sentences(stds, verdicts, right, left, float(way[-1])),
+        sentences=_sentences(stds, verdicts, right, left, windows.distance_m),
     )
 
 
-def _nominal(table: States, track_width_m: float | None) -> Floats:
+def withhold_unlearned(
+    found: Excitation, table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float
+) -> Excitation:
+    """Return the excitation with each final ICR "not shown" that the filter did not learn from the drive.
+
+    Parameters
+    ----------
+    table : the recorded states
+    std_m : (3,) of the final ICRs, `icrtool.estimation.icr_uncertainty.final_covariance`
+    start_std_m : (3,) of the filter's start
+    least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
+    """
+    final = {name: float(getattr(table, name)[-1]) for name in ICR_COLUMNS}
+    filter_std = {name: float(getattr(table, f"std_{name}")[-1]) for name in ICR_COLUMNS}
+    width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
+    verdicts, sentences = dict(found.verdicts), list(found.sentences)
+    for name, std, start in zip(ICR_COLUMNS, std_m, start_std_m, strict=True):
+        side = -1.0 if name == "y_icr_left_m" else 1.0
+        if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
+            why = f"stopped at the limit of {side * least_icr_m:+.2f} m that the filter keeps"
+        elif filter_std[name] > UNLEARNED * start:
+            why = f"± {filter_std[name]:.2f} m, about as uncertain as at the start (± {start:.2f} m)"
+        elif std > WEAK_SHARE * width:
+            why = f"± {std:.2f} m, by how much stretches of the drive differ"
+        else:
+            continue
+        if verdicts[name] != "not shown":
+            sentences.append(f"{WORDS[name]} is not shown: {why}")
+        verdicts[name] = "not shown"
+    return replace(found, verdicts=verdicts, sentences=tuple(sentences))
+
+
+def nominal_parameters(table: States, track_width_m: float | None) -> Floats:
     """Return parameters (7,) near which to ask: the run's final ICRs where they can be, else those of the width."""
     right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     half = half_width_m(track_width_m)
@@ -141,23 +169,12 @@ def _nominal(table: States, track_width_m: float | None) -> Floats:
     return np.array([right, left, x, *NEUTRAL[3:]])
 
 
-def _posterior(
-    d: np.ndarray[Any, np.dtype[np.complex128]], d_by: np.ndarray[Any, np.dtype[np.complex128]], turn_by: Floats,
-    turned: Floats, way: Floats, *, position_std: float, heading_std: float, width: float,
-) -> Floats:  # fmt: skip
+def _posterior(windows: DriveWindows, *, position_std: float, heading_std: float, width: float) -> Floats:
     """Return standard deviations (3,) of the ICRs, heading offset and scales marginalised."""
-    # y_r, y_l, x | heading offset, both scales, their difference
-    both, difference = d_by[:, 3] + d_by[:, 4], (d_by[:, 3] - d_by[:, 4]) / 2
-    place = np.column_stack([d_by[:, :3], 1j * d, both, difference])
-    turn_both, turn_difference = turn_by[:, 3] + turn_by[:, 4], (turn_by[:, 3] - turn_by[:, 4]) / 2
-    turn = np.column_stack([turn_by[:, :3], np.zeros(len(turned)), turn_both, turn_difference])
-    place_noise = np.sqrt(2.0 * position_std**2 + (SLIP_SHARE * way) ** 2)
-    turn_noise = np.sqrt(2.0 * heading_std**2 + (SLIP_SHARE * turned) ** 2 + 1e-12)
-    rows = np.concatenate(
-        [place.real / place_noise[:, None], place.imag / place_noise[:, None], turn / turn_noise[:, None]]
-    )
-    prior = np.array([width, width, width, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
-    information = rows.T @ rows + np.diag(1.0 / prior**2)
+    place_noise = np.sqrt(2.0 * position_std**2 + (SLIP_SHARE * windows.length_m) ** 2)
+    turn_noise = np.sqrt(2.0 * heading_std**2 + (SLIP_SHARE * windows.turned_rad) ** 2 + 1e-12)
+    rows = windows.jacobian / np.concatenate([place_noise, place_noise, turn_noise])[:, None]
+    information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
     deviations: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     return deviations
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import FilterSetup, check_start, set_up_filter, wheel_gap_s
+from icrtool.errors import DataError
+from icrtool.estimation.filter_setup import (
+    FilterSetup,
+    ProcessNoise,
+    check_start,
+    set_up_filter,
+    wheel_gap_s,
+)
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.estimation.terrain_changes import TerrainTest, find_terrain_changes, given_changes
 from icrtool.kernels.filter_records import RECOVERED, UNSEEN, USED, Codes, FilterOutput
@@ -22,6 +30,13 @@ OUTAGE_IN_INTERVALS = 5.0
 """... and at least this many times the usual interval between fixes."""
 
 
+LEAST_WHEEL_TRAVEL_M = 0.1
+"""Wheels that travel less than this to and fro have not turned."""
+
+FAR_IN_SIGMAS = 6.0
+"""Positions that spread by more than this many of their standard deviations have moved."""
+
+
 class Filtered(NamedTuple):
     """What the filter made of the sensors; the names are those of `icrtool.records.run.Run`.
 
@@ -29,7 +44,9 @@ class Filtered(NamedTuple):
     ----------
     sensors : with `reference_delay_s` corrected, where such a delay was found
     covariance : (6, 6) at the end
-    process_position_mps : position process noise the run ended with
+    noise : process noise of the pose that the run was made with
+    start_std_m : (3,) of the ICRs at the start
+    least_icr_m : what the filter kept the y ICRs from the centre line; -inf: anywhere
     began_with : ICRs and covariance of the warm start, None without one
     terrain : changes of the ICRs, given and detected
     """
@@ -41,8 +58,10 @@ class Filtered(NamedTuple):
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
     covariance: Floats
-    process_position_mps: float
+    noise: ProcessNoise
     reference_delay_s: float
+    start_std_m: Floats
+    least_icr_m: float
     began_with: WarmStart | None
     terrain: TerrainTest
 
@@ -65,11 +84,12 @@ def run_filter(
     Raises
     ------
     DataError
-        No wheel sample after the first fix and the first heading.
+        No wheel sample after the first fix and the first heading; wheels that never turn.
     ConfigError
         A start that preset ``field`` does not take.
     """
     check_start(config)
+    _check_motion(sensors)
     filtered = _run_once(sensors, config, warm_start, given_changes(changes_s))
     if not find_changes:
         return filtered
@@ -79,16 +99,44 @@ def run_filter(
     return _run_once(sensors, config, warm_start, terrain)
 
 
+def _check_motion(sensors: SensorData) -> None:
+    """Refuse wheels that never turn: there is nothing to learn ICRs from."""
+    wheels, fixes = sensors.wheels, sensors.fixes
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    travelled = [
+        float(np.ptp(np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])))
+        for speed in (wheels.v_left_mps, wheels.v_right_mps)
+    ]
+    if max(travelled) >= LEAST_WHEEL_TRAVEL_M:
+        return
+    # a few fixes may be wrong
+    north, east = (float(np.subtract(*np.percentile(one, [95, 5]))) for one in (fixes.north_m, fixes.east_m))
+    moved, noise_m = math.hypot(north, east), float(np.sqrt(np.median(fixes.var_north_m2 + fixes.var_east_m2)))
+    if moved > max(LEAST_WHEEL_TRAVEL_M, FAR_IN_SIGMAS * noise_m):
+        why = f"the wheels never turn ({max(travelled):.2f} m), yet the position moves by {moved:.1f} m"
+        raise DataError(sensors.name, why, "check the wheels' topic and joints (icrtool info)")
+    why = f"the robot never moved: the wheels turned by {max(travelled):.2f} m, the position stays within {moved:.2f} m"
+    raise DataError(sensors.name, why, "use a log in which it drives and turns")
+
+
 def set_up_again(run: Run | Filtered, config: Config, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
     """Prepare the filter run that gave `run`, to smooth it, or to take GNSS and heading away in some spans."""
     return set_up_filter(
         run.sensors,
         config,
-        process_position_mps=run.process_position_mps,
+        noise=noise_of(run),
         changes_s=run.changes_s,
         warm_start=run.began_with,
         outages_ns=outages_ns,
     )
+
+
+def noise_of(run: Run | Filtered) -> ProcessNoise:
+    """Return the process noise of the pose that a run was made with."""
+    if isinstance(run, Filtered):
+        return run.noise
+    facts = run.summary["filter"]
+    return ProcessNoise(float(facts["process_position_mps"]), float(facts["process_heading_degps"]))
 
 
 def _run_once(sensors: SensorData, config: Config, warm_start: WarmStart | None, terrain: TerrainTest) -> Filtered:
@@ -111,8 +159,10 @@ def _run_once(sensors: SensorData, config: Config, warm_start: WarmStart | None,
         gnss=gnss,
         heading=heading,
         covariance=_square(output.P),
-        process_position_mps=adapted.process_position_mps,
+        noise=adapted.noise,
         reference_delay_s=adapted.reference_delay_s,
+        start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
+        least_icr_m=setup.parameters.least_icr,
         began_with=warm_start,
         terrain=terrain,
     )

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import configured_process_position_mps
+from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
+from icrtool.estimation.observability import WORDS, Excitation
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.run import MeasurementOutcome
@@ -23,7 +24,29 @@ LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not taken for even ones."""
 
 
-def noise_warnings(name: str, config: Config, reference_delay_s: float, process_position_mps: float) -> list[str]:
+WORTH_WARNING_SHARE = 0.1
+UNUSABLE_SHARE = 0.3
+"""With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
+
+
+def unusable_reasons(excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome) -> list[str]:
+    """Return why the ICRs of a run must not be used; empty where they can be."""
+    hidden = [WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
+    reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
+    for word, outcome in (("fixes", gnss), ("headings", heading)):
+        share = rejected_share(outcome)
+        if share > UNUSABLE_SHARE:
+            reasons.append(f"{100 * share:.0f} % of the {word} rejected")
+    return reasons
+
+
+def rejected_share(outcome: MeasurementOutcome) -> float:
+    """Return the share of the measurements within the run that the innovation gate rejected; 0 for none."""
+    seen = int(np.count_nonzero(outcome.code > UNSEEN))
+    return int(np.count_nonzero(outcome.code == GATED)) / seen if seen else 0.0
+
+
+def noise_warnings(name: str, config: Config, reference_delay_s: float, noise: ProcessNoise) -> list[str]:
     """Return what was done about clocks and wheels that contradict the position reference."""
     found = []
     if config.frames.reference_delay_s == "auto" and reference_delay_s:
@@ -32,15 +55,23 @@ def noise_warnings(name: str, config: Config, reference_delay_s: float, process_
             f"{name}: the position reference {relation} the wheels by {abs(reference_delay_s):.2f} s: "
             "corrected; frames.reference_delay_s sets it"
         )
-    if process_position_mps != configured_process_position_mps(config):
+    configured = configured_noise(config)
+    if noise.position_mps != configured.position_mps:
         found.append(
             f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
-            f"position noise raised to {process_position_mps:.1f} m/s; filter.process_position_mps sets it"
+            f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
+        )
+    if noise.heading_degps != configured.heading_degps:
+        found.append(
+            f"{name}: the wheels contradict the heading (held samples, clock offsets, slip): "
+            f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
         )
     return found
 
 
-def run_warnings(name: str, table: States, gnss: MeasurementOutcome, multiplier: float | None) -> list[str]:
+def run_warnings(
+    name: str, table: States, gnss: MeasurementOutcome, heading: MeasurementOutcome, multiplier: float | None
+) -> list[str]:
     """Return what a user should know before trusting the numbers; `multiplier` is (y_r - y_l) / b where b is known."""
     found = []
     distance, turns = float(table.distance_m[-1]), _turns(table)
@@ -57,13 +88,12 @@ def run_warnings(name: str, table: States, gnss: MeasurementOutcome, multiplier:
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
-    seen = int(np.count_nonzero(gnss.code > UNSEEN))
-    gated = int(np.count_nonzero(gnss.code == GATED))
-    if seen and gated > 0.1 * seen:
-        found.append(
-            f"{100 * gated / seen:.0f} % of the fixes were rejected: "
-            "clocks, antenna place or fix quality do not fit the wheels"
-        )
+    for word, outcome, why in (
+        ("fixes", gnss, "clocks, antenna place or fix quality do not fit the wheels"),
+        ("headings", heading, "clocks, mounting or quality of the heading do not fit the wheels"),
+    ):
+        if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
+            found.append(f"{100 * share:.0f} % of the {word} were rejected: {why}")
     return [f"{name}: {warning}" for warning in found]
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
-from icrtool.estimation.observability import find_excitation
+from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
+from icrtool.estimation.observability import Excitation, find_excitation, nominal_parameters, withhold_unlearned
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
-from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings
+from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import EVENT_COLUMNS, SlipEvent
@@ -46,14 +47,15 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     terrain, beyond = filtered.terrain.within(float(table.t_s[-1]))
     convergence = converge(table, min(terrain.times_s, default=None))
-    excitation = find_excitation(table, make_drive(table, filtered.in_gap, filtered.outages_ns), width)
+    covariance, excitation = learned(filtered, config)
     multiplier = separation_multiplier(table, width) if width is not None else None
+    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading)
     warnings = [
         *measurements.warnings,
-        *run_warnings(log.name, table, filtered.gnss, multiplier),
+        *run_warnings(log.name, table, filtered.gnss, filtered.heading, multiplier),
         *([] if measurements.antenna_is_known else antenna_warning(log.name, table, filtered.covariance)),
         *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
-        *noise_warnings(log.name, config, filtered.reference_delay_s, filtered.process_position_mps),
+        *noise_warnings(log.name, config, filtered.reference_delay_s, filtered.noise),
         *(f"{log.name}: {sentence}" for sentence in excitation.sentences),
     ]
     document: dict[str, Any] = plain(
@@ -67,15 +69,21 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "warnings": warnings,
             "alignment": {name: asdict(finding) for name, finding in measurements.findings.items()},
             "drive": drive_summary(table),
-            "icr": icr_summary(table, convergence)
-            | {"separation_multiplier": multiplier, "final_covariance_m2": filtered.covariance[3:, 3:]},
+            "usable": not unusable,
+            "unusable_because": "; ".join(unusable) if unusable else None,
+            "icr": icr_summary(table, convergence, covariance)
+            | {
+                "separation_multiplier": multiplier,
+                "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
+                "final_covariance_m2": filtered.covariance[3:, 3:],
+            },
             "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
             "terrain": terrain.summary(),
             "segments": segment_summary(table, terrain.times_s),
             "gnss": gnss_summary(log, filtered.gnss, sensors.fixes.down_weighted)
             | measurements.sections["gnss"]
             | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss, filtered.reference_delay_s),
-            "heading": measurements.sections["heading"],
+            "heading": measurements.sections["heading"] | counts(filtered.heading),
             "wheels": measurements.sections["wheels"],
             "events": event_summary(sensors.events, int(table.stamp_ns[0])),
             "outages_ns": filtered.outages_ns,
@@ -83,7 +91,8 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
             "filter": {
                 "preset": config.filter.preset,
-                "process_position_mps": filtered.process_position_mps,
+                "process_position_mps": filtered.noise.position_mps,
+                "process_heading_degps": filtered.noise.heading_degps,
                 "reference_delay_s": measurements.position_delay_s + filtered.reference_delay_s,
                 "heading_correlation_s": sensors.heading_correlation_s,
                 "heading_from_position": sensors.heading_from_position,
@@ -96,7 +105,42 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "excitation": excitation.summary(),
         }
     )
-    return document
+    return document if config.filter.preset == "paper" else without_unlearned(document)
+
+
+def learned(filtered: Filtered, config: Config) -> tuple[Floats, Excitation]:
+    """Return the covariance (3, 3) of the final ICRs [m^2], and which of them the drive showed.
+
+    Preset ``paper``: the filter's own covariance, and what the drive could show.
+    """
+    table, width = filtered.table, config.robot.track_width_m
+    drive = make_drive(table, filtered.in_gap, filtered.outages_ns)
+    p = nominal_parameters(table, width)
+    windows, own = cut_drive(table, drive, p), filtered.covariance[3:, 3:]
+    excitation = find_excitation(table, drive, width, windows)
+    if config.filter.preset == "paper":
+        return own, excitation
+    covariance = final_covariance(
+        windows, own, width_m=float(p[0] - p[1]), process_icr_mps=config.filter.process_icr_mps
+    )
+    return covariance, withhold_unlearned(
+        excitation,
+        table,
+        std_m=np.sqrt(np.diag(covariance)),
+        start_std_m=filtered.start_std_m,
+        least_icr_m=filtered.least_icr_m,
+    )
+
+
+def without_unlearned(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the summary with null in place of the ICRs that are not shown, and of a multiplier made of one."""
+    icr: dict[str, Any] = dict(document["icr"])
+    hidden = [name for name, verdict in document["excitation"]["verdict"].items() if verdict == "not shown"]
+    for key in ("final", "final_std", "mean", "std"):
+        icr[key] = {name: None if name in hidden else value for name, value in icr[key].items()}
+    if "y_icr_right_m" in hidden or "y_icr_left_m" in hidden:
+        icr |= {"separation_multiplier": None, "separation_multiplier_std": None}
+    return document | {"icr": icr}
 
 
 def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
@@ -199,14 +243,19 @@ def drive_summary(table: States) -> dict[str, float]:
     return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
 
 
-def icr_summary(table: States, convergence: dict[str, tuple[float, float] | None]) -> dict[str, Any]:
-    """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did."""
+def icr_summary(
+    table: States, convergence: dict[str, tuple[float, float] | None], covariance: Floats
+) -> dict[str, Any]:
+    """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
+
+    `covariance` (3, 3) is that of the final ICRs.
+    """
     settled = max((rise[1] for rise in convergence.values() if rise is not None), default=0.0)
     after = table.t_s >= settled
     columns: dict[str, Floats] = {column: getattr(table, column) for column in ICR_COLUMNS}
     return {
         "final": {column: float(values[-1]) for column, values in columns.items()},
-        "final_std": {column: float(getattr(table, f"std_{column}")[-1]) for column in columns},
+        "final_std": dict(zip(columns, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         "mean": {column: float(values[after].mean()) for column, values in columns.items()},
         "std": {column: float(values[after].std()) for column, values in columns.items()},
         "convergence_s": {
@@ -246,6 +295,12 @@ def used_and_rejected(outcome: MeasurementOutcome) -> tuple[Bools, Bools]:
     """Return which measurements (m,) moved the filter, and which its gate refused."""
     rejected = outcome.code == GATED
     return (outcome.code > UNSEEN) & ~rejected, rejected
+
+
+def counts(outcome: MeasurementOutcome) -> dict[str, int]:
+    """Return how many measurements were used, and rejected by the innovation gate."""
+    used, rejected = used_and_rejected(outcome)
+    return {"used": int(np.count_nonzero(used)), "rejected": int(np.count_nonzero(rejected))}
 
 
 def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: Bools) -> dict[str, Any]:

@@ -81,6 +81,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
     n_gnss, n_heading = len(batch.gnss_t), len(batch.heading_t)
     gnss_code, heading_code = np.zeros(n_gnss, np.uint8), np.zeros(n_heading, np.uint8)
     residual, innovation, distance = np.zeros((n_gnss, 2)), np.zeros(n_heading), np.zeros(len(batch.wheel_t))
+    det = np.zeros(n_gnss)
     for run in range(len(batch.x0)):
         data = Measurements(
             batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
@@ -97,7 +98,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
             end = batch.stops[s] + 1
             rows = FilterOutput(
                 out.x[run, begin - first : end - first], out.variance[run, begin - first : end - first], distance,
-                out.gnss_nis[run], gnss_code, residual, out.heading_nis[run], heading_code, innovation, state.P,
+                out.gnss_nis[run], det, gnss_code, residual, out.heading_nis[run], heading_code, innovation, state.P,
             )  # fmt: skip
             filter_rows(data, begin, end, state, parameters, rows, None)
             out.P[run, s] = state.P

@@ -66,8 +66,8 @@ def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
 def take_fix(
     t: float, z_n: float, z_e: float, r_n: float, r_e: float, x: Floats, P: Floats, PH: Floats, run: Floats,
     parameters: FilterParameters, residual: Floats,
-) -> tuple[int, float, float, float]:  # fmt: skip
-    """Gate and apply one fix z [m] of variances r [m^2]; return its code, its NIS and its innovation [m].
+) -> tuple[int, float, float, float, float]:  # fmt: skip
+    """Gate and apply one fix z [m] of variances r [m^2]; return its code, its NIS, det S [m^4] and its innovation [m].
 
     North and east are applied one after the other, which equals the joint update since their noises are independent.
     """
@@ -76,7 +76,8 @@ def take_fix(
     S_ee = measured_column(P, EAST, a_n, PH) + r_e
     S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
     S_ne = PH[1] + a_n * PH[2]
-    nis = (S_ee * nu_n * nu_n - 2.0 * S_ne * nu_n * nu_e + S_nn * nu_e * nu_e) / (S_nn * S_ee - S_ne * S_ne)
+    det = S_nn * S_ee - S_ne * S_ne
+    nis = (S_ee * nu_n * nu_n - 2.0 * S_ne * nu_n * nu_e + S_nn * nu_e * nu_e) / det
     code = USED
     if nis > parameters.gnss_gate:
         if rejected_run(run, t, nu_n, nu_e, parameters.gnss_gate * 2.0 * (r_n + r_e), parameters):
@@ -96,7 +97,7 @@ def take_fix(
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
     residual[0] = z_n - x[0] - a_n
     residual[1] = z_e - x[1] - a_e
-    return code, nis, nu_n, nu_e
+    return code, nis, det, nu_n, nu_e
 
 
 @njit
@@ -198,7 +199,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 nodes.step[count] = dt, data.v_left[held], data.v_right[held], 1.0 if in_gap or slips else 0.0
                 nodes.x_predicted[count], nodes.P_predicted[count] = x, P
             while j < n_gnss and data.gnss_t[j] <= t:
-                out.gnss_code[j], out.gnss_nis[j], nu_n, nu_e = take_fix(
+                out.gnss_code[j], out.gnss_nis[j], out.gnss_det[j], nu_n, nu_e = take_fix(
                     t, data.gnss_z[j, 0], data.gnss_z[j, 1], data.gnss_r[j, 0], data.gnss_r[j, 1],
                     x, P, PH, gnss_run, parameters, out.gnss_residual[j],
                 )  # fmt: skip
@@ -263,6 +264,7 @@ def empty_output(data: Measurements, rows: int) -> FilterOutput:
         variance=np.empty((rows, 6)),
         distance=np.empty(rows),
         gnss_nis=np.full(n_gnss, np.nan),
+        gnss_det=np.full(n_gnss, np.nan),
         gnss_code=np.zeros(n_gnss, np.uint8),
         gnss_residual=np.full((n_gnss, 2), np.nan),
         heading_nis=np.full(n_heading, np.nan),

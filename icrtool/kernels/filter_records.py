@@ -88,6 +88,7 @@ class FilterOutput(NamedTuple):
     x : (k, 6) states after all updates at the stamps of the last k wheel samples; variance : (k, 6) diagonal of P
     distance : (k,) path length [m]
     gnss_nis, heading_nis : (m,), (h,) normalised innovation squared, NaN where unseen
+    gnss_det : (m,) determinant of the innovation covariance S [m^4], NaN where unseen
     gnss_code, heading_code : UNSEEN, USED, GATED or RECOVERED
     gnss_residual : (m, 2) fix minus estimate after the update [m]
     heading_innovation : (h,) [rad]
@@ -98,6 +99,7 @@ class FilterOutput(NamedTuple):
     variance: Floats
     distance: Floats
     gnss_nis: Floats
+    gnss_det: Floats
     gnss_code: Codes
     gnss_residual: Floats
     heading_nis: Floats

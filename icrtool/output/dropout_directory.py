@@ -133,6 +133,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "schema": DROPOUT_SCHEMA,
         "tool_version": __version__,
         "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
+        "usable": run["usable"],
+        "unusable_because": run["unusable_because"],
         "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
         "starts": report.states,
         "starts_counted": report.starts,

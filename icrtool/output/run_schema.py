@@ -14,14 +14,6 @@ Triple = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Matrix = Annotated[list[Triple], msgspec.Meta(min_length=3, max_length=3)]
 
 
-class ByIcr(TypedDict):
-    """A number of each ICR [m]."""
-
-    y_icr_right_m: float
-    y_icr_left_m: float
-    x_icr_m: float
-
-
 class MaybeByIcr(TypedDict):
     """A number of each ICR, null where there is none."""
 
@@ -70,13 +62,14 @@ class DriveDocument(TypedDict):
 class IcrDocument(TypedDict):
     """The ICRs and how they converged."""
 
-    final: ByIcr
-    final_std: ByIcr
-    mean: ByIcr
-    std: ByIcr
+    final: MaybeByIcr
+    final_std: MaybeByIcr
+    mean: MaybeByIcr
+    std: MaybeByIcr
     convergence_s: MaybeByIcr
     convergence_span_s: SpansByIcr
     separation_multiplier: float | None
+    separation_multiplier_std: float | None
     final_covariance_m2: Matrix
 
 
@@ -169,6 +162,8 @@ class HeadingDocument(TypedDict):
     delay_s: float | None
     delay_std_s: float | None
     applied_delay_s: float
+    used: int
+    rejected: int
 
 
 class WarmStartDocument(TypedDict):
@@ -189,6 +184,7 @@ class FilterDocument(TypedDict):
     """What the filter was run with."""
 
     process_position_mps: float
+    process_heading_degps: float
     reference_delay_s: float
     heading_correlation_s: float
     heading_from_position: bool
@@ -224,6 +220,8 @@ class RunDocument(TypedDict):
     config: dict[str, Any]
     streams: list[StreamDocument]
     warnings: list[str]
+    usable: bool
+    unusable_because: str | None
     drive: DriveDocument
     icr: IcrDocument
     odometry: OdometryDocument
@@ -240,6 +238,7 @@ class RunDocument(TypedDict):
 
 
 TOGETHER = (
+    ("icr", "separation_multiplier", "separation_multiplier_std"),
     ("gnss", "mean_difference_m", "max_difference_m"),
     ("gnss", "delay_s", "delay_std_s"),
     ("heading", "delay_s", "delay_std_s"),
@@ -263,3 +262,9 @@ def check_run_document(document: dict[str, Any]) -> None:
     for section, one, other in TOGETHER:
         if (document[section][one] is None) != (document[section][other] is None):
             raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")
+    icr = document["icr"]
+    for column in icr["final"]:
+        if len({icr[key][column] is None for key in ("final", "final_std", "mean", "std")}) > 1:
+            raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
+    if document["usable"] != (document["unusable_because"] is None):
+        raise ValueError("usable and unusable_because contradict each other - at `$`")

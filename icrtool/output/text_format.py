@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,13 @@ def run_title(summary: Mapping[str, Any]) -> str:
     """Return the log's name, and the robot's where it has one; `summary` is that of a run."""
     log, robot = summary["log"], summary["config"]["robot"]["name"]
     return f"{log}  ({robot})" if robot else str(log)
+
+
+def unusable_lines(summary: Mapping[str, Any]) -> list[str]:
+    """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
+    if summary["usable"]:
+        return []
+    return textwrap.wrap(f"NOT USABLE: {summary['unusable_because']}", TABLE_WIDTH, subsequent_indent="  ")
 
 
 def position_word(summary: Mapping[str, Any]) -> str:

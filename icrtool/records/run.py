@@ -135,10 +135,15 @@ class Run:
 
     @property
     def ended_with(self) -> WarmStart:
-        """The final ICRs and their covariance, to start another run from."""
-        icr = self.summary["icr"]
-        icrs = np.array([icr["final"][column] for column in ICR_COLUMNS], np.float64)
-        return WarmStart(icrs, np.array(icr["final_covariance_m2"], np.float64), self.track_width_m)
+        """The filter's last ICRs and their covariance, to start another run from; wide where they are not shown."""
+        icrs = np.array([getattr(self.table, column)[-1] for column in ICR_COLUMNS], np.float64)
+        covariance = np.array(self.summary["icr"]["final_covariance_m2"], np.float64)
+        return WarmStart(icrs, covariance, self.track_width_m)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the ICRs may be used; `summary` says why not (``unusable_because``)."""
+        return bool(self.summary["usable"])
 
     def write(
         self,
@@ -164,9 +169,7 @@ class Run:
 
     def __repr__(self) -> str:
         drive, icr = self.summary["drive"], self.summary["icr"]
-        icrs = ", ".join(
-            f"{column} {icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}" for column in ICR_COLUMNS
-        )
+        icrs = ", ".join(f"{column} {icr_text(icr, column)}" for column in ICR_COLUMNS)
         return (
             f"<Run {self.name!r}: {drive['distance_m']:.1f} m in {drive['duration_s']:.1f} s, "
             f"{len(self.table):,} states, {icrs}, {len(self.warnings)} warnings>"
@@ -178,6 +181,12 @@ class Run:
         return f"<pre>{text}</pre>" + (
             f"<details><summary>Warnings</summary><ul>{warnings}</ul></details>" if warnings else ""
         )
+
+
+def icr_text(icr: dict[str, Any], column: str) -> str:
+    """Return a final ICR with its standard deviation, of the summary's section ``icr``."""
+    final, std = icr["final"][column], icr["final_std"][column]
+    return f"{final:+.3f} ± {std:.3f}" if final is not None else "not shown"
 
 
 def half_width_m(track_width_m: float | None) -> float:

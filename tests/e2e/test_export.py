@@ -56,3 +56,20 @@ def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
     status, _, err = icrtool("export", "--for", "moveit", "icrtool-runs/mower")
     assert status == 2
     assert "diff_drive_controller" in err
+
+
+def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path) -> None:
+    from dataclasses import replace
+
+    from icrtool.output.stored_run import open_run
+
+    run = open_run(runs / "icrtool-runs" / "mower")
+    spoilt = {"usable": False, "unusable_because": "42 % of the headings rejected"}
+    replace(run, summary=run.summary | spoilt).write(runs / "unusable", plots=())
+    status, out, err = icrtool("export", "--for", "clearpath", "unusable")
+    assert (status, out) == (1, "")
+    assert "42 % of the headings rejected" in err
+    assert "--force" in err
+    status, out, _ = icrtool("export", "--for", "clearpath", "--force", "unusable")
+    assert status == 0
+    assert "# WARNING: not usable: 42 % of the headings rejected" in out

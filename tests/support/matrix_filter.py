@@ -135,6 +135,7 @@ def _measure(
         )
     S = H @ P @ H.T + R
     nis, code = float(nu @ np.linalg.solve(S, nu)), USED
+    innovation_det = float(np.linalg.det(S))
     if nis > gate:
         alike = run[0] > 0 and float(((nu - run[2]) ** 2).sum()) <= gate * 2.0 * float(np.trace(R))
         run[0], run[1] = (run[0] + 1, run[1]) if alike else (1, t)
@@ -152,6 +153,7 @@ def _measure(
         x = _keep_sides(x, P, parameters.least_icr)
     if kind == 1:
         out.gnss_nis[i], out.gnss_code[i] = nis, code
+        out.gnss_det[i] = innovation_det
         out.gnss_residual[i] = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)
     else:
         out.heading_nis[i], out.heading_code[i], out.heading_innovation[i] = nis, code, nu[0]

@@ -168,8 +168,8 @@ def _convergence_text(run: Run, column: str) -> str:
 
 
 def _final_text(run: Run, column: str) -> str:
-    icr = run.summary["icr"]
-    return f"final {signed(icr['final'][column])} ± {icr['final_std'][column]:.3f} m"
+    final, std = (run.summary["icr"][key][column] for key in ("final", "final_std"))
+    return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
 
 
 def _estimate_keys(run: Run) -> list[Line2D | Patch]:
@@ -199,8 +199,10 @@ def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Fl
     fill_bins(axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR)
     axes.set_xlim(low, high)
     mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
-    axes.axvline(mean, **MEAN.keywords())
-    title = f"{signed(mean)} ± {std:.3f} m"
+    title = "not shown"
+    if mean is not None:
+        axes.axvline(mean, **MEAN.keywords())
+        title = f"{signed(mean)} ± {std:.3f} m"
     if (track := run.track_width_m) is not None:
         axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
         title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.tables.model_comparison import format_ladder
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title
+from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title, unusable_lines
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
 
 LABEL = 26
@@ -37,7 +37,12 @@ def format_dropout(report: DropoutReport) -> str:
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
-    lines = [run_title(report.run_summary), f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}", ""]
+    lines = [
+        *unusable_lines(report.run_summary),
+        run_title(report.run_summary),
+        f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}",
+        "",
+    ]
     if sentences := headline(report):
         lines += [*wrap(" ".join(sentences), TABLE_WIDTH), ""]
     lines += _error_lines(report)

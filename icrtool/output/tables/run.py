@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
-from icrtool.estimation.filter_setup import configured_process_position_mps
+from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, length_text, position_word, run_title
-from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.output.text_format import (
+    TABLE_WIDTH,
+    distance_text,
+    duration_text,
+    length_text,
+    position_word,
+    run_title,
+    unusable_lines,
+)
+from icrtool.records.run import ICR_COLUMNS, Run, icr_text
 
 LABEL = 12
 """Columns of the left margin: what a line is about."""
@@ -33,6 +42,7 @@ def format_run(run: Run) -> str:
     Warnings are not in it: they belong to stderr.
     """
     lines = [
+        *unusable_lines(run.summary),
         run_title(run.summary),
         "",
         *_stream_lines(run),
@@ -101,12 +111,15 @@ def _icr_lines(run: Run) -> list[str]:
     icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
     rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise", "")]
     for column in ICR_COLUMNS:
-        rise = icr["convergence_s"][column]
+        mean, std, rise = (icr[key][column] for key in ("mean", "std", "convergence_s"))
+        if icr["final"][column] is None:
+            rows.append((ICR_LABELS[column], icr_text(icr, column), "", "", ""))
+            continue
         rows.append(
             (
                 ICR_LABELS[column],
-                f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}",
-                f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}",
+                icr_text(icr, column),
+                f"{mean:+.3f} ± {std:.3f}",
                 f"{rise:.1f} s" if rise is not None else "hardly moved",
                 SHOWN_WORDS.get(verdicts[column], ""),
             )
@@ -115,13 +128,17 @@ def _icr_lines(run: Run) -> list[str]:
 
 
 def _multiplier_lines(run: Run) -> list[str]:
-    width, multiplier = run.track_width_m, run.summary["icr"]["separation_multiplier"]
-    if width is None or multiplier is None:
+    width, icr = run.track_width_m, run.summary["icr"]
+    if width is None:
         return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
+    multiplier, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
+    if multiplier is None:
+        return [_line("multiplier", "not shown: it is made of y right and y left")]
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     doubt = "" if shown else ": not shown well enough to be used"
-    return [_line("multiplier", f"{multiplier:.2f} = (y right - y left) / b, with b = {width:g} m{doubt}")]
+    said = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
+    return [_line("multiplier", f"{said} = (y right - y left) / b, with b = {width:g} m{doubt}")]
 
 
 def _terrain_lines(run: Run) -> list[str]:
@@ -165,7 +182,7 @@ def _position_lines(run: Run) -> list[str]:
     lines = []
     if gnss["mean_difference_m"] is not None:
         mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
-        raised = run.process_position_mps != configured_process_position_mps(run.config)
+        raised = run.process_position_mps != configured_noise(run.config).position_mps
         why = "; follows them closely, for its position noise was raised" if raised else ""
         lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}{why}"))
     reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
@@ -204,13 +221,20 @@ def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
 def _heading_lines(run: Run) -> list[str]:
     heading = run.summary["heading"]
     if heading["offset_deg"] is None:
-        return [_line("heading", "could not be compared with the course: too little straight driving")]
+        said = "could not be compared with the course: too little straight driving"
+        return [_line("heading", said), *_heading_counts(heading)]
     # Adding zero takes the sign off a rounded -0.0.
     offset = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg off the course"
     if heading["offset_name"]:
         offset += f" ({heading['offset_name']})"
     applied = heading["applied_offset_deg"]
-    return [_line("heading", f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")]
+    said = f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected"
+    return [_line("heading", said), *_heading_counts(heading)]
+
+
+def _heading_counts(heading: Mapping[str, Any]) -> list[str]:
+    used, rejected = heading["used"], heading["rejected"]
+    return [_line("headings", f"{used:,} used, {rejected:,} rejected{f' (gate {rejected:,})' if rejected else ''}")]
 
 
 def _delay_lines(run: Run) -> list[str]:

@@ -265,7 +265,8 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
 
 def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
     assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
-    parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False)
+    run = make_run(duration_s=20.0, speed_mps=0.01, troubles=False)
+    parked = replace(run, table=replace(run.table, distance_m=0.0 * run.table.distance_m))
     assert dropout(parked, [1.0]).standing == len(parked.table) - 1
 
 

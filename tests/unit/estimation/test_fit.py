@@ -156,16 +156,24 @@ def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() 
     assert fixed.process_position_mps == 0.3
 
 
-def test_a_parked_robot_is_said_to_have_learned_nothing() -> None:
-    log = make_log()
-    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
+def still(log: RobotLog) -> RobotLog:
+    """The same log with wheels that never turn."""
+    return replace(log, wheels=replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps))
+
+
+def test_a_robot_that_never_moved_is_refused() -> None:
+    log = still(make_log())
     n = len(log.gnss.stamp_ns)
-    gnss = PositionFixes(
-        log.gnss.stamp_ns, np.zeros(n), np.zeros(n), *(np.full(n, 1e-4) for _ in range(2)), np.zeros(n)
-    )
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (2, n))
+    gnss = PositionFixes(log.gnss.stamp_ns, *noise, *(np.full(n, 1e-4) for _ in range(2)), np.zeros(n))
     heading = replace(log.heading, heading_rad=0 * log.heading.heading_rad)
-    run = fit(replace(log, wheels=still, gnss=gnss, heading=heading), load_config(sets=[WIDTH]))
-    assert any("nothing was learned" in warning for warning in run.warnings)
+    with pytest.raises(DataError, match="never moved"):
+        fit(replace(log, gnss=gnss, heading=heading), load_config(sets=[WIDTH]))
+
+
+def test_wheels_that_never_turn_while_the_position_moves_are_refused_for_that() -> None:
+    with pytest.raises(DataError, match=r"wheels never turn .* yet the position moves by"):
+        fit(still(make_log()), load_config(sets=[WIDTH]))
 
 
 def spun(seconds: float, speed_mps: float = 0.3) -> RobotLog:
@@ -184,11 +192,19 @@ def test_a_robot_that_spun_on_the_spot_has_learned_its_icrs_and_is_told_no_less(
     assert not any("learned" in warning for warning in run.warnings)
 
 
-def test_a_parked_robot_whose_heading_drifts_has_learned_nothing() -> None:
-    log = spun(60.0)
-    still = replace(log.wheels, left=0 * log.wheels.v_left_mps, right=0 * log.wheels.v_right_mps)
-    run = fit(replace(log, wheels=still), load_config(sets=[WIDTH]))
+def test_a_parked_robot_whose_heading_drifts_is_refused() -> None:
+    with pytest.raises(DataError, match="never moved"):
+        fit(still(spun(60.0)), load_config(sets=[WIDTH]))
+
+
+def test_a_robot_that_hardly_moved_has_nothing_to_show() -> None:
+    log = make_log(faster=0.01)
+    run = fit(log, load_config(sets=[WIDTH]))
     assert any("nothing was learned" in warning for warning in run.warnings)
+    assert not run.usable
+    assert "not shown" in run.summary["unusable_because"]
+    assert set(run.summary["icr"]["final"].values()) == {None}
+    assert run.summary["icr"]["separation_multiplier"] is None
 
 
 def cut(log: RobotLog, rows: slice) -> RobotLog:

@@ -49,7 +49,7 @@ def test_every_axis_has_a_name_and_a_unit(name: str, run: Run) -> None:
     [
         {},
         {"troubles": False, "track_width_m": None, "datum": False},
-        {"speed_mps": 0.0, "duration_s": 20.0},
+        {"speed_mps": 0.01, "duration_s": 20.0},
         {"duration_s": 1.0, "troubles": False},
         {"duration_s": 700.0},
     ],

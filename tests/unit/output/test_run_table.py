@@ -35,14 +35,25 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
         line = line_of(text, label)
         assert f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}" in line
         assert f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}" in line
-        assert f"{icr['convergence_s'][column]:.1f} s" in line
-    assert f"{separation_multiplier(run.table, 0.6):.2f} = (y right - y left) / b, with b = 0.6 m" in line_of(
-        text, "multiplier"
+        rise = icr["convergence_s"][column]
+        assert (f"{rise:.1f} s" if rise is not None else "hardly moved") in line
+    multiplier = line_of(text, "multiplier")
+    assert (
+        f"{separation_multiplier(run.table, 0.6):.2f} ± {icr['separation_multiplier_std']:.2f} = (y right" in multiplier
     )
+    assert multiplier.endswith("with b = 0.6 m")
     assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
     assert "1 outage, " in text
     assert "filter to GNSS fixes: mean " in line_of(text, "position")
-    assert "off the course" in text.splitlines()[-2]
+    assert any(line.startswith("heading ") and "off the course" in line for line in text.splitlines())
+    heading = run.summary["heading"]
+    assert heading["used"] > 1000
+    assert line_of(text, "headings").split()[1:5] == [
+        f"{heading['used']:,}",
+        "used,",
+        f"{heading['rejected']:,}",
+        "rejected",
+    ]
 
 
 def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: Run) -> None:
@@ -70,8 +81,10 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
 
 
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
-    text = format_run(make_run(speed_mps=0.0, duration_s=20.0))
-    assert line_of(text, "y right").count("hardly moved") == 1
+    text = format_run(make_run(speed_mps=0.01, duration_s=20.0))
+    assert line_of(text, "y right").split() == ["y", "right", "not", "shown"]
+    assert line_of(text, "multiplier").split()[1:3] == ["not", "shown:"]
+    assert text.startswith("NOT USABLE: y right, y left, x not shown")
     assert "too little straight driving" in text
 
 

@@ -1,0 +1,124 @@
+"""Standard deviations of the final ICRs that hold: from the spread between stretches of the drive."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.kernels.ekf import REFERENCE_STEP_S
+from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
+from icrtool.kernels.trials import Drive
+from icrtool.kernels.window_errors import displace, integrate
+from icrtool.records.tables import Floats, Ints, States
+
+WINDOW_M = 2.0
+"""Distance of the wheels, spins included, over which displacement and turn are compared."""
+
+STRETCH_M = 20.0
+"""Windows of one stretch err alike: slip, ground and heading errors last for some metres."""
+
+HEADING_BIAS_RAD = math.radians(1.0)
+SCALE_ERROR = 0.02
+"""What is never known better before a drive: the heading's offset, and the wheels' scales, both and their difference.
+A circle alone cannot separate the ICRs from these."""
+
+
+class DriveWindows(NamedTuple):
+    """Displacement and turn over windows of distance, linear in what may be unknown.
+
+    Attributes
+    ----------
+    residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion less that of the states
+    jacobian : (3 w, 6) by y_icr_right, y_icr_left, x_icr [m], heading offset [rad], scale of both wheels, difference
+    length_m : (w,) distance of the wheels; turned_rad : (w,) turn by the wheels
+    end_s : (w,) time at the end; stretch : (w,) number of its stretch
+    distance_m : of the wheels, whole drive
+    """
+
+    residuals: Floats
+    jacobian: Floats
+    length_m: Floats
+    turned_rad: Floats
+    end_s: Floats
+    stretch: Ints
+    distance_m: float
+
+
+def cut_drive(table: States, drive: Drive, parameters: Floats) -> DriveWindows:
+    """Return the windows of a drive, with the motion by parameters (7,) of `icrtool.kernels.window_errors`."""
+    dt = np.where(drive.gap, 0.0, drive.dt_s)
+    distance = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
+    rows = rows_at_steps(distance, WINDOW_M)
+    start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
+    motion = integrate(table.t_s, dt, drive.v_left, drive.v_right, parameters, table.t_s[rows])
+    d, d_by, _ = displace(motion, start, end)
+    turn_by = motion.theta_by[end] - motion.theta_by[start]
+    turned = motion.theta[end] - motion.theta[start]
+    place, heading = (table.north_m + 1j * table.east_m)[rows], table.heading_rad[rows]
+    missed = d - (place[end] - place[start]) * np.exp(-1j * heading[start])
+    both, difference = d_by[:, 3] + d_by[:, 4], (d_by[:, 3] - d_by[:, 4]) / 2
+    d_slopes = np.column_stack([d_by[:, :3], 1j * d, both, difference])
+    turn_both, turn_difference = turn_by[:, 3] + turn_by[:, 4], (turn_by[:, 3] - turn_by[:, 4]) / 2
+    turn_slopes = np.column_stack([turn_by[:, :3], np.zeros(len(turned)), turn_both, turn_difference])
+    return DriveWindows(
+        residuals=np.concatenate([missed.real, missed.imag, turned - (heading[end] - heading[start])]),
+        jacobian=np.concatenate([d_slopes.real, d_slopes.imag, turn_slopes]),
+        length_m=np.diff(distance[rows]),
+        turned_rad=turned,
+        end_s=table.t_s[rows[1:]],
+        stretch=(distance[rows[:-1]] // STRETCH_M).astype(np.int64),
+        distance_m=float(distance[-1]),
+    )
+
+
+def prior_std(width_m: float) -> Floats:
+    """Return the standard deviations (6,) of what `DriveWindows.jacobian` is by, before a drive."""
+    return np.array([width_m, width_m, width_m, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
+
+
+def final_covariance(
+    windows: DriveWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
+) -> Floats:
+    """Return the covariance (3, 3) of the final ICRs [m^2]: the filter's, and that of its drive's stretches, added.
+
+    Parameters
+    ----------
+    windows : with the final ICRs
+    filter_covariance : (3, 3) of the ICRs at the end
+    width_m : y right - y left, the prior's standard deviation
+    process_icr_mps : of the filter: how fast it forgets
+
+    Notes
+    -----
+    The filter's variance is that of constant ICRs in white noise. Slip that varies from one stretch to the next, a
+    heading offset and a wrong wheel scale are not in it. They are in the sandwich covariance (Liang and Zeger 1986) of
+    a fit over the windows, clustered by stretches of `STRETCH_M`, heading offset and wheel scales marginalised. Its
+    residuals are those of the final ICRs, so that a fit that would end elsewhere counts too. A window weighs
+    exp(-age / T): T = P / q is what a Kalman filter with variance P and random walk q remembers.
+
+    Coverage of 2 standard deviations of the difference, per ICR. Four recorded Warthog drives on grass, wheel scale
+    corrected: 18 of 18 pairs of logs (61 % with the filter's own), 88 % of 72 pairs of halves of different logs (58 %).
+    Halves of ten logs, recorded and simulated: 27 of 30 (77 %). With the wheel scale 5 % wrong the pairs of logs are
+    14 of 18 (2 of 18). Twelve 100 s drives of simulated contact physics: the error against the same filter on true
+    poses is 0.3 of it (rms), 0.4 of the filter's own: sensor noise is the smaller part, so there it is conservative.
+    """
+    if len(windows.length_m) < 2:
+        return filter_covariance + np.eye(3) * width_m**2
+    forgets = process_icr_mps**2 * REFERENCE_STEP_S
+    memory_s = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
+    weight = np.tile(np.exp((windows.end_s - windows.end_s[-1]) / memory_s), 3)
+    scale = scale_by_kind(windows.residuals, np.repeat(np.arange(3), len(windows.length_m))) / np.sqrt(weight)
+    covariance, _, _ = sandwich_covariance(
+        windows.residuals, windows.jacobian, scale, np.tile(windows.stretch, 3), prior_std(width_m) ** -2.0
+    )
+    added: Floats = filter_covariance + covariance[:3, :3]
+    return added
+
+
+def multiplier_std(covariance: Floats, track_width_m: float) -> float:
+    """Return the standard deviation of (y right - y left) / b from the covariance (3, 3) of the ICRs."""
+    gradient: np.ndarray[Any, np.dtype[np.float64]] = np.array([1.0, -1.0, 0.0])
+    return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0)) / track_width_m

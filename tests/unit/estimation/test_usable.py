@@ -1,0 +1,66 @@
+"""Usable or not, and why: in the summary, on stdout, in the dropout report, and for controllers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.config import load_config
+from icrtool.dropout_analysis.trials import dropout
+from icrtool.estimation.fit import fit
+from icrtool.estimation.run_warnings import rejected_share
+from icrtool.kernels.filter_records import GATED, UNSEEN, USED
+from icrtool.output.dropout_directory import report_document
+from icrtool.output.tables.dropout import format_dropout
+from icrtool.output.tables.run import format_run
+from icrtool.records.run import MeasurementOutcome, Run
+from support.drives import make_log
+
+WIDTH = "robot.track_width_m=0.6"
+
+
+def with_wrong(share: float, stream: str) -> Run:
+    """A run of a drive with so many gross errors in a stream."""
+    log, rng = make_log(seed=1), np.random.default_rng(2)
+    if stream == "fixes":
+        # in blocks of 20 s: single ones would show in the scatter from fix to fix, and be taken as the fixes' noise
+        wrong = (np.arange(len(log.gnss.stamp_ns)) / 400) % 1.0 < share
+        log = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + wrong * rng.normal(0.0, 50.0, len(wrong))))
+    else:
+        wrong = rng.random(len(log.heading.stamp_ns)) < share
+        turned = log.heading.heading_rad + wrong * rng.uniform(0.5, 2.5, len(wrong))
+        log = replace(log, heading=replace(log.heading, heading_rad=turned))
+    return fit(log, load_config(sets=[WIDTH, "frames.heading_offset_deg=0"]))
+
+
+@pytest.mark.parametrize("stream", ["fixes", "headings"])
+def test_a_run_that_rejected_a_third_of_a_stream_is_not_usable(stream: str) -> None:
+    run = with_wrong(0.4, stream)
+    outcome = run.gnss if stream == "fixes" else run.heading
+    assert rejected_share(outcome) > 0.3
+    assert not run.usable
+    assert f"% of the {stream} rejected" in run.summary["unusable_because"]
+    assert format_run(run).startswith("NOT USABLE: ")
+    assert any(f"of the {stream} were rejected" in warning for warning in run.warnings)
+    report = dropout(run, [5.0])
+    assert format_dropout(report).startswith("NOT USABLE: ")
+    document = report_document(report)
+    assert document["usable"] is False
+    assert document["unusable_because"] == run.summary["unusable_because"]
+
+
+@pytest.mark.parametrize("stream", ["fixes", "headings"])
+def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
+    run = with_wrong(0.12, stream)
+    assert run.usable
+    assert run.summary["unusable_because"] is None
+    assert "NOT USABLE" not in format_run(run) + format_dropout(dropout(run, [5.0]))
+
+
+def test_the_rejected_share_counts_what_the_filter_saw() -> None:
+    code = np.array([UNSEEN, UNSEEN, USED, GATED], np.uint8)
+    none = np.zeros(4)
+    assert rejected_share(MeasurementOutcome(np.arange(4), none, none, code, none)) == 0.5
+    assert rejected_share(MeasurementOutcome(np.arange(4), none, none, 0 * code, none)) == 0.0
