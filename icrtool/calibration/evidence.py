@@ -10,6 +10,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import wheel_gap_s
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.records.tables import Complexes, Floats, Ints, RobotLog
 
 SHORT_WINDOW_M = 1.0
@@ -95,7 +96,7 @@ def gather(log: RobotLog, config: Config) -> Evidence:
     inside = (fix_t > max(wheel_t[0], heading_t[0]) + 1.0) & (fix_t < min(wheel_t[-1], heading_t[-1]) - 1.0)
     begins, ends, long = [], [], []
     for kind, size in enumerate((length, LONG_WINDOW * length)):
-        begin = np.unique(np.searchsorted(at_fix, np.arange(at_fix[0], at_fix[-1], size / STARTS_A_WINDOW)))
+        begin = rows_at_steps(at_fix - at_fix[0], size / STARTS_A_WINDOW)
         end = np.searchsorted(at_fix, at_fix[np.minimum(begin, len(fix_t) - 1)] + size)
         fine = (begin < len(fix_t)) & (end < len(fix_t))
         begin, end = begin[fine], end[fine]

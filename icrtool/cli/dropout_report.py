@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -41,6 +41,7 @@ class Request:
     outage_at_s: tuple[float, ...]
     budgets_m: tuple[float, ...]
     gates: tuple[Gate, ...]
+    starts: Literal["moving", "all"]
     trials: bool
     seed: int
     formats: tuple[str, ...]
@@ -69,6 +70,8 @@ class Request:
               help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+@click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
+              help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -81,10 +84,11 @@ class Request:
 def command(
     sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, trials: bool, junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
+    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Report how far a robot can go without GNSS: open loop from every recorded state, over 1 to 20 m.
+    """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
 
     RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
     icrtool-runs/. The report is written into the run directory, as dropout/.
@@ -103,7 +107,7 @@ def command(
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
-        gates=tuple(parse_gate(text) for text in gates), trials=trials,
+        gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
         smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
@@ -277,6 +281,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             gates=request.gates,
             outage_s=outages,
             outage_at_s=request.outage_at_s,
+            starts=request.starts,
             comparison=request.ladder,
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from icrtool.calibration.model_comparison import Ladder, judge_ladder
+from icrtool.calibration import model_comparison
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
 from icrtool.dropout_analysis.trials import ErrorSink, ReportWatch, configured_horizons_m, dropout
 from icrtool.errors import ConfigError, DataError
@@ -30,6 +31,7 @@ def dropout_report(
     gates: Sequence[str | Gate] = (),
     outage_s: Sequence[float] | None = None,
     outage_at_s: Sequence[float] = (),
+    starts: Starts = "moving",
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
     seed: int = DEFAULT_SEED,
@@ -46,6 +48,7 @@ def dropout_report(
     gates : acceptance limits, for example ``"icr.p95@10m <= 3.8"``
     outage_s : lengths of outages to force on the filter; default those of the run's configuration
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
+    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     comparison : also compare all models on distance they were not fitted to
     reference : what trials are compared with: the filter's states or the smoother's
     seed : of the bootstrap
@@ -65,7 +68,7 @@ def dropout_report(
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     # Single trials come first: whoever watches can draw them while the many are driven.
-    examples, worst = example_trials(compared), worst_trials(compared)
+    examples, worst = example_trials(compared), worst_trials(compared, starts=starts)
     outages = (*forced, *real_outages(compared))
 
     def with_single(report: DropoutReport) -> DropoutReport:
@@ -77,13 +80,13 @@ def dropout_report(
             watch(with_single(report))
 
     horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
-    report = with_single(dropout(compared, horizons, seed=seed, sink=sink, watch=grown))
+    report = with_single(dropout(compared, horizons, starts=starts, seed=seed, sink=sink, watch=grown))
     table, why = _compare(compared, run) if comparison else (None, "")
     return replace(
         report,
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report) for gate in limits),
-        by_turning=split_by_turning(compared),
+        by_turning=split_by_turning(compared, starts=starts),
         comparison=table,
         no_comparison=why,
     )
@@ -111,9 +114,9 @@ def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]
     return horizons
 
 
-def _compare(compared: Run, run: Run) -> tuple[Ladder | None, str]:
+def _compare(compared: Run, run: Run) -> tuple[model_comparison.Ladder | None, str]:
     """Compare the models of a run; where that cannot be, None and why."""
     try:
-        return judge_ladder(compared, measured_headings(run)), ""
+        return model_comparison.judge_ladder(compared, measured_headings(run)), ""
     except DataError as err:
         return None, f"{err.why}, {err.advice}"

@@ -84,7 +84,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
     for run in range(len(batch.x0)):
         data = Measurements(
             batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
-            batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t,
+            batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t, np.zeros(0, np.bool_),
         )  # fmt: skip
         place = np.empty(3, np.int64)
         place[0] = np.searchsorted(batch.gnss_t, batch.t0, side="right")

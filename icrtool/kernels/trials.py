@@ -72,6 +72,7 @@ class TrialCounts(NamedTuple):
     short: Ints
     gap: Ints
     outage: Ints
+    standing: Ints
 
 
 class Summary(NamedTuple):

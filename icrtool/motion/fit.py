@@ -145,7 +145,7 @@ class Pool:
         self._windows = windows
         groups, offset = [], 0
         for w in windows:
-            stretch = (w.start_m / STRETCH_M).astype(np.int64)
+            stretch = np.unique(np.floor(w.start_m / STRETCH_M), return_inverse=True)[1]
             groups.append(np.tile(stretch + offset, 2))
             offset += int(stretch.max()) + 1
         self.group = np.concatenate(groups)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Complexes, Floats, Ints
@@ -48,7 +49,7 @@ class Recording:
     gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro counts turns the other way, and its sign was turned
+    gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     """
 
     name: str
@@ -118,12 +119,11 @@ def cut_windows(
         There are fewer than `FEWEST_WINDOWS`.
     """
     drive = recording.drive
-    total = float(drive.distance[-1])
     place = drive.north + 1j * drive.east
     together = pooled or (recording,)
     pooled_m = sum(float(one.drive.distance[-1]) for one in together)
     every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
-    begins = np.unique(np.searchsorted(drive.distance, np.arange(0.0, total, every)))
+    begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
     ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
     row, column = np.nonzero(ends.T >= 0)[::-1]

@@ -97,6 +97,36 @@ class Rung:
     summary: Summary
 
 
+class ReferenceErrors(NamedTuple):
+    """The error that the reference itself puts into trials, by horizon; (h,) [m] each, NaN where there is no trial.
+
+    Attributes
+    ----------
+    std : root mean square
+    expected, p95 : mean and 95th percentile: what a perfect motion model would show
+    """
+
+    std: Floats
+    expected: Floats
+    p95: Floats
+
+
+class LearnedSplit(NamedTuple):
+    """Trials of the momentary ICRs that start before and after the ICRs were first learned.
+
+    Attributes
+    ----------
+    learned_s, distance_m : when and where they were learned, seconds and metres since the first recorded state; None
+        where they never were: all trials are before
+    before, after : by horizon
+    """
+
+    learned_s: float | None
+    distance_m: float | None
+    before: Summary
+    after: Summary
+
+
 class BudgetDistance(NamedTuple):
     """How far a model's 95th percentile stays within a budget.
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,12 @@ PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
 """Pentzer 2014, Section 5."""
 
 GYRO_STD_RADPS = 0.003
+
+MOST_SAMPLES = 20_000_000
+"""Of a sensor, and steps of the truth: five and a half hours at the default step."""
+
+LARGEST, SMALLEST = 1e6, 1e-9
+"""Magnitudes of the numbers of a drive and its sensors, in their units; 0 is allowed where it has a meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +166,7 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     ConfigError
         It names the impossible value.
     """
+    _check_numbers(plan, sensors)
     for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
         if not right > left:
             raise ConfigError(
@@ -182,6 +190,31 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
         raise ConfigError(
             "duration", f"{plan.duration_s:g} s holds fewer than two samples at {slowest:g} Hz", "drive longer"
         )
+
+
+def _check_numbers(plan: DrivePlan, sensors: Sensors) -> None:
+    """Refuse numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive."""
+    for part in (plan, sensors, plan.path):
+        for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
+            for number in _numbers_in(getattr(part, name)):
+                if number and not SMALLEST <= abs(number) <= LARGEST:
+                    why = f"{number:g} is not of a magnitude from {SMALLEST:g} to {LARGEST:g}"
+                    raise ConfigError(name, why, "give a number in the unit of its name")
+    rates = (1.0 / plan.step_s, sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
+    if not 0.0 < (samples := plan.duration_s * max(rates)) <= MOST_SAMPLES:
+        raise ConfigError(
+            "duration", f"{plan.duration_s:g} s at {max(rates):g} Hz are {samples:.3g} samples",
+            f"at most {MOST_SAMPLES:,} are simulated",
+        )  # fmt: skip
+
+
+def _numbers_in(value: object) -> Iterator[float]:
+    """Yield the numbers of a field: itself, or those of the tuples in it."""
+    if isinstance(value, tuple):
+        for each in value:
+            yield from _numbers_in(each)
+    elif isinstance(value, int | float):
+        yield float(value)
 
 
 def drive_plan(plan: DrivePlan, tail_s: float) -> Truth:

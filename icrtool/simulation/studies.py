@@ -40,6 +40,9 @@ PAPER_TRACK_WIDTH_M = 0.51
 STUDY_STEP_S = 0.005
 """Track speeds of a path are held this long in a study: no longer than any wheel interval."""
 
+MOST_RUNS = 100_000
+"""Runs of a setting."""
+
 
 @dataclass(frozen=True, slots=True)
 class StudyNumber:
@@ -225,8 +228,8 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     ConfigError
         A request that cannot be driven.
     """
-    if request.runs < 1:
-        raise ConfigError("runs", f"{request.runs} is not a positive number")
+    if not 1 <= request.runs <= MOST_RUNS:
+        raise ConfigError("runs", f"{request.runs} is not a number from 1 to {MOST_RUNS:,}")
     if not all(math.isfinite(value) for value in request.values):
         raise ConfigError("values", f"{request.values} holds a value that is not finite")
     check_drive(request.plan, request.sensors)

@@ -16,7 +16,7 @@ from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.batch_filter import Batch, BatchOutput, run_batch
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
-from icrtool.simulation.drives import DrivePlan, Icrs, Readings, Sensors, Truth, drive_plan, sense
+from icrtool.simulation.drives import DrivePlan, Icrs, Readings, Sensors, Truth, check_drive, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 
 Progress = Callable[[float], None]
@@ -110,6 +110,8 @@ def run_scenarios(
     -------
     list of the columns of `measure`, (runs, ...), a scenario each
     """
+    for scenario in scenarios:
+        check_drive(scenario.plan, scenario.sensors)
     jobs = [
         (number, part)
         for number, scenario in enumerate(scenarios)

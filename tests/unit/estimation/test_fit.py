@@ -226,7 +226,7 @@ def spoilt(log: RobotLog, stream: str, column: str, value: float) -> RobotLog:
     ("stream", "column", "value", "why"),
     [
         ("wheels", "left", math.nan, "1 wheel samples are not finite numbers, the first at row 500"),
-        ("wheels", "v_right_mps", 1e160, r"a wheel speed of 1e\+160 m/s"),
+        ("wheels", "right", 1e160, r"a wheel speed of 1e\+160 m/s"),
         ("gnss", "east_m", math.inf, "1 position samples are not finite"),
         ("heading", "heading_rad", math.nan, "1 heading samples are not finite"),
         ("gnss", "var_north_m2", -1.0, "a position variance is negative, the first at row 500"),
