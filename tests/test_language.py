@@ -23,6 +23,7 @@ DONE: tuple[str, ...] = (
     "figures",
     "kernels",
     "logs",
+    "motion",
     "simulation",
     "dropout_analysis",
     "output/exports",
@@ -41,9 +42,13 @@ DONE: tuple[str, ...] = (
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PUBLISHED = (
-    "too_little_way_left", "blind_icr_10m_p95_m", "blind_no_slip_10m_p95_m", "change{n}_rise_{icr}_s", "rise_{name}_s",
+    "too_little_way_left",
+    "blind_icr_10m_p95_m",
+    "blind_no_slip_10m_p95_m",
+    "change{n}_rise_{icr}_s",
+    "rise_{name}_s",
     '"way_m"',
-)  # fmt: skip
+)
 """Keys of files that users read: they never change."""
 
 PAGES = (

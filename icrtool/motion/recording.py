@@ -49,7 +49,7 @@ class Recording:
     gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro counts turns the other way, and its sign was turned
+    gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
     """
 
