@@ -6,6 +6,7 @@ DEMO_LOG     ?= sample_logs/wheeled_lawnmower.mcap
 DEMO_OPTIONS ?= --robot segway-rmp400
 DEMO_RUN      = icrtool-runs/$(basename $(notdir $(DEMO_LOG)))
 BENCH        ?= benchmarks/run.py
+FUZZ         ?=
 SAMPLES      ?= sample_logs/generate.py
 JOBS         ?= 2
 
@@ -14,7 +15,7 @@ READY := $(VENV)/.ready
 PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo format format-check lint words types test stress bench samples wheel-check check constraints clean
+.PHONY: help setup demo format format-check lint words types test stress fuzz bench samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -59,6 +60,9 @@ test: $(READY)  ## the tests, without the stress tests; JOBS=0 runs them in one 
 
 stress: $(READY)  ## the long and large tests alone
 	$(BIN)/python -m pytest -q -m stress
+
+fuzz: $(READY)  ## read, fit and report damaged logs; FUZZ="--logs 100000 --fitted 20" sets how many
+	$(BIN)/python scripts/fuzz.py $(FUZZ)
 
 bench: $(READY)  ## speed and memory, as ratios to other tools
 	$(BIN)/python $(BENCH)

@@ -68,6 +68,7 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
                 "give it, or --robot NAME",
             )
         speed, turn = motion.twist.T
+        with np.errstate(over="ignore", invalid="ignore"):
         return speed - turn * width / 2, speed + turn * width / 2, "m", False
     wanted = config.wheels.quantity
     positions = _both(motion.position_left, motion.position_right)

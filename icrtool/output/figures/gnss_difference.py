@@ -37,7 +37,7 @@ def draw_gnss_difference(run: Run) -> Figure:
     figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
     axes = figure.subplots()
     figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
-    duration = float(run.table.t_s[-1])
+    duration = float(run.table.t_s[-1]) or 1.0
     percent, difference, code = 100 * run.gnss.t_s / duration, run.gnss.difference, run.gnss.code
     used, gated = (code > UNSEEN) & (code != GATED), code == GATED
     top = _top(difference[used])
@@ -63,7 +63,8 @@ def draw_gnss_difference(run: Run) -> Figure:
     axes.set_ylabel("Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
     ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
-    figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 

@@ -1,0 +1,326 @@
+"""Fuzz icrtool with logs of damaged structure: read, align, fit and report each within bounds of time and memory.
+
+``make fuzz`` runs it; ``python scripts/fuzz.py --help`` lists the options. A finding is a traceback or a limit that
+is exceeded; its log is kept below ``--keep`` with the traceback beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import shutil
+import signal
+import sqlite3
+import struct
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+Random = np.random.Generator
+EXTREMES = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, 1 << 40, (1 << 63) - 1]
+FLOATS = [0.0, -0.0, 1e-300, 1e300, -1e300, float("inf"), float("nan"), 1e9, -1.0, 3.0e8, 1e-9]
+HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
+
+
+def values(columns: dict[str, np.ndarray], rng: Random) -> str:
+    """Spoil values of a column before the log is written."""
+    name = str(rng.choice([n for n, c in columns.items() if c.dtype == np.float64 and len(c)]))
+    column = columns[name] = columns[name].copy()
+    first = int(rng.integers(len(column)))
+    last = min(len(column), first + int(rng.choice([1, 5, len(column)])))
+    column[first:last] = rng.choice(FLOATS)
+    return f"values of {name}"
+
+
+def clocks(columns: dict[str, np.ndarray], rng: Random) -> str:
+    """Have the stamps of a stream jump, stand still, go back or scatter, from a row on."""
+    name = str(rng.choice([n for n in columns if n.endswith("stamp_ns")]))
+    column = columns[name] = columns[name].copy()
+    row = int(rng.integers(len(column)))
+    column[row:] += rng.choice([HOUR_NS, -HOUR_NS, YEAR_NS, -YEAR_NS, 1, -1_000_000_000])
+    if rng.random() < 0.3:
+        column[row:] = column[row]
+    return f"clock of {name}"
+
+
+def shorter(columns: dict[str, np.ndarray], rng: Random) -> str:
+    """Leave a stream with 0, 1, 2 or a few samples."""
+    stream = str(rng.choice(["wheel", "gnss", "heading"]))
+    count = int(rng.choice([0, 1, 2, 3, 10]))
+    names = {"gnss": ("gnss", "latitude", "longitude", "height"), "heading": ("heading", "yaw")}.get(stream, (stream,))
+    for name in [n for n in columns if n.startswith(names)]:
+        columns[name] = columns[name][:count]
+    return f"{count} samples of {stream}"
+
+
+COLUMN_MUTATIONS: tuple[Callable[[dict[str, np.ndarray], Random], str], ...] = (values, clocks, shorter)
+
+
+def numbers(content: bytearray, rng: Random) -> str:
+    """Overwrite a length, count, size, CRC or index: any little-endian number of 1 to 8 bytes."""
+    width = int(rng.choice([1, 2, 4, 8]))
+    at = place(content, rng)
+    content[at : at + width] = (int(rng.choice(EXTREMES)) % (1 << 8 * width)).to_bytes(width, "little")
+    return "number"
+
+
+def doubles(content: bytearray, rng: Random) -> str:
+    """Overwrite an aligned double."""
+    at = place(content, rng) & ~3
+    content[at : at + 8] = struct.pack("<d", rng.choice(FLOATS))
+    return "double"
+
+
+def stretches(content: bytearray, rng: Random) -> str:
+    """Delete, repeat or move a stretch, or cut the file off."""
+    at, size = place(content, rng), int(rng.choice([1, 4, 16, 300, 5000]))
+    kind = str(rng.choice(["delete", "repeat", "cut"], p=[0.45, 0.45, 0.1]))
+    if kind == "delete":
+        del content[at : at + size]
+    elif kind == "repeat":
+        content[at:at] = content[at : at + size]
+    else:
+        del content[at:]
+    return kind
+
+
+def definitions(content: bytearray, rng: Random) -> str:
+    """Change a message definition: types, array lengths, recursion."""
+    words = (b"float64", b"uint32", b"string", b"geometry_msgs/Vector3", b"[36]", b"[]", b"Header", b"time")
+    found = [at for word in words if (at := content.find(word, int(rng.integers(max(len(content) // 2, 1))))) >= 0]
+    if not found:
+        return numbers(content, rng)
+    at = int(rng.choice(found))
+    new = bytes(
+        rng.choice([b"float64[99999999]", b"Imu", b"sensor_msgs/Imu[]", b"", b"string[]", b"\n\n\x00", b"uint8"])
+    )
+    old = len(bytes(content[at : at + 40]).split(b" ")[0]) if rng.random() < 0.5 else len(new)
+    content[at : at + old] = new
+    return "definition"
+
+
+BYTE_MUTATIONS: tuple[Callable[[bytearray, Random], str], ...] = (numbers, numbers, doubles, stretches, definitions)
+
+SQL = (
+    "UPDATE messages SET timestamp = timestamp + {big} WHERE rowid > {row}",
+    "UPDATE messages SET data = CAST('{text}' AS TEXT) WHERE rowid % 7 = 1",
+    "UPDATE messages SET data = zeroblob({row} * 1000) WHERE rowid = {row}",
+    "UPDATE messages SET topic_id = {big}",
+    "UPDATE messages SET timestamp = '{text}' WHERE rowid = {row}",
+    "UPDATE topics SET name = '{text}' || name",
+    "UPDATE topics SET type = '{text}', serialization_format = NULL WHERE id = 1",
+    "DROP TABLE topics",
+    "ALTER TABLE messages RENAME COLUMN data TO rowid",
+    "ALTER TABLE messages ADD COLUMN log_time TEXT",
+    "ALTER TABLE messages RENAME TO old; CREATE VIEW messages AS SELECT * FROM old",
+    "CREATE INDEX hostile ON messages (data)",
+)
+YAML = (b": [&a [*a]]", b"\n- - - -", b": 99999999999999999999", b": {<<: *b}", b"../../etc/passwd", b"\x00", b": ~")
+
+
+def place(content: bytearray, rng: Random) -> int:
+    """Return a place in a file: the first and the last bytes, headers and indexes, get more than their share."""
+    low, high = [(0.0, 1.0), (0.0, 0.02), (0.93, 1.0)][int(rng.integers(3))]
+    return min(int(rng.uniform(low, high) * len(content)), max(len(content) - 1, 0))
+
+
+def database(path: Path, rng: Random) -> str:
+    """Change the content or the schema of a SQLite file by SQL, so that its pages stay sound."""
+    statement = str(rng.choice(SQL)).format(
+        big=int(rng.choice([HOUR_NS, YEAR_NS, -YEAR_NS])), row=int(rng.integers(1, 300)), text="/x\x1b[2J\nError: x"
+    )
+    try:
+        with sqlite3.connect(path) as connection:
+            connection.executescript(statement)
+    except sqlite3.Error:
+        return "SQL refused"
+    finally:
+        connection.close()
+    return f"SQL {statement.split()[0]}"
+
+
+def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
+    """Write a short drive in a random container and damage it; return it with what was done."""
+    from dataclasses import asdict
+
+    from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+    from tests.property.test_fuzz_logs import WHEELS, drive
+
+    columns = asdict(drive(int(rng.choice([2, 30, 100, 100, 400]))))
+    done = []
+    if rng.random() < 0.5:
+        done = [COLUMN_MUTATIONS[int(rng.integers(3))](columns, rng) for _ in range(int(rng.integers(1, 4)))]
+    container, compression = (
+        ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"), ("db3", "zstd")
+    )[int(rng.integers(6))]  # fmt: skip
+    options = WriteOptions(
+        container=container, compression=compression, wheels=str(rng.choice(WHEELS)),
+        wheel_radius_m=0.165, track_width_m=0.55,
+    )  # fmt: skip
+    path = write_log(
+        folder / ("log" + {"mcap": ".mcap", "bag": ".bag", "db3": ""}[container]), SensorColumns(**columns), options
+    )
+    if not done or rng.random() < 0.3:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        target = files[int(rng.integers(len(files)))]
+        if target.suffix == ".db3" and rng.random() < 0.6:
+            done.append(database(target, rng))
+        else:
+            content = bytearray(target.read_bytes())
+            for _ in range(int(rng.integers(1, 6))):
+                if target.suffix == ".yaml":
+                    at = place(content, rng)
+                    content[at:at] = YAML[int(rng.integers(len(YAML)))]
+                    done.append("YAML")
+                else:
+                    done.append(BYTE_MUTATIONS[int(rng.integers(len(BYTE_MUTATIONS)))](content, rng))
+            target.write_bytes(content)
+    return path, [container, *done]
+
+
+def use(path: Path, *, whole: bool) -> str:
+    """Read, align, fit and report a log; return how far it came."""
+    import icrtool
+    from icrtool.errors import IcrToolError
+    from icrtool.output.tables.dropout import format_dropout
+    from icrtool.output.tables.run import format_run
+    from tests.property.test_fuzz_logs import CONFIG
+
+    stage = "read"
+    try:
+        log = icrtool.read_log(path, CONFIG)
+        if not whole:
+            return "read"
+        stage = "fitted"
+        run = icrtool.fit(log, CONFIG)
+        format_run(run)
+        stage = "stored"
+        run.write(path.parent / "run", plots=())
+        stored = icrtool.open_run(path.parent / "run")
+        stage = "reported"
+        format_dropout(icrtool.dropout_report(stored, horizons_m=[1.0, 5.0]))
+    except IcrToolError as err:
+        if len(str(err).splitlines()) != 1 or not str(err).isprintable():
+            raise AssertionError(f"not one printable line: {str(err)!r}") from err
+        return f"refused before {stage}"
+    return stage
+
+
+def work(job: tuple[int, bool, float, int, str, bool]) -> tuple[int, str, list[str], str, float, set[str]]:
+    """Make and use one log in this process; return seed, outcome, mutations, traceback, CPU seconds and functions."""
+    seed, whole, seconds, megabytes, keep, measure = job
+    folder = Path(tempfile.mkdtemp(prefix="icrtool-fuzz-"))
+    reached: set[str] = set()
+    done: list[str] = []
+    outcome, text = "", ""
+    began = time.process_time()
+    try:
+        path, done = make_log(folder, np.random.default_rng(seed))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        began = time.process_time()
+        signal.signal(signal.SIGPROF, too_long)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+        if measure:
+            sys.setprofile(lambda frame, event, _: reached.add(where(frame)) if event == "call" else None)
+        outcome = use(path, whole=whole)
+        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        if grown > megabytes:
+            outcome, text = "FOUND", f"{grown:.0f} MB"
+    except ValueError as err:
+        # The writer refuses some columns: no finding.
+        outcome, text = ("not written", "") if not done else ("FOUND", traceback.format_exc() + str(err))
+    except BaseException:  # noqa: BLE001 - a fuzzer reports whatever comes
+        outcome, text = "FOUND", traceback.format_exc()
+    finally:
+        sys.setprofile(None)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+    used = time.process_time() - began
+    if outcome == "FOUND" and keep:
+        place = Path(keep) / str(seed)
+        shutil.copytree(folder, place, dirs_exist_ok=True)
+        (place / "finding.txt").write_text(f"{done}\n{text}", encoding="utf-8", errors="replace")
+    shutil.rmtree(folder, ignore_errors=True)
+    return seed, outcome, done, text, used, reached
+
+
+def too_long(*_: object) -> None:
+    """End a log that takes too long."""
+    raise TimeoutError("CPU time limit")
+
+
+def where(frame: object) -> str:
+    """Return the function of a frame, as module:name, empty outside of icrtool."""
+    code = frame.f_code  # type: ignore[attr-defined]
+    file: str = code.co_filename
+    return f"{file[len(str(ROOT)) + 1 :]}:{code.co_qualname}" if file.startswith(str(ROOT / "icrtool")) else ""
+
+
+def functions() -> Iterator[str]:
+    """Yield every function of the packages under test, as `where` names them."""
+    for package in ("logs", "alignment", "motion", "estimation", "dropout_analysis", "records"):
+        for file in (ROOT / "icrtool" / package).rglob("*.py"):
+            pending = [compile(file.read_text(encoding="utf-8"), str(file), "exec")]
+            while pending:
+                code = pending.pop()
+                inner = [each for each in code.co_consts if hasattr(each, "co_qualname")]
+                pending += inner
+                yield from (f"{file.relative_to(ROOT)}:{each.co_qualname}" for each in inner if "<" not in each.co_name)
+
+
+def limit(megabytes: int) -> None:
+    """Bound the memory of a worker, beyond what its libraries take."""
+    resource.setrlimit(resource.RLIMIT_AS, ((megabytes + 3000) << 20,) * 2)
+
+
+def main() -> int:
+    """Fuzz, print counts and coverage; 1 where there is a finding."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--logs", type=int, default=2000, help="logs that are made and read")
+    parser.add_argument("--fitted", type=int, default=10, help="one of so many is also fitted and reported")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=5.0, help="CPU time a log may take")
+    parser.add_argument("--megabytes", type=int, default=1000, help="memory a log may take")
+    parser.add_argument("--coverage", type=int, default=50, help="functions reached are recorded for one of so many")
+    parser.add_argument("--keep", default="", help="directory for the logs of findings")
+    given = parser.parse_args()
+    seeds = range(given.first, given.first + given.logs)
+    jobs = [
+        (seed, seed % given.fitted == 0, given.seconds, given.megabytes, given.keep, seed % given.coverage == 0)
+        for seed in seeds
+    ]
+    # The kernels are loaded once, outside the limits.
+    work((0, True, 600.0, 4000, "", False))
+    counts: Counter[str] = Counter()
+    kinds: Counter[str] = Counter()
+    reached: set[str] = set()
+    slowest = (0.0, 0)
+    # Forked workers share the kernels that are loaded; each is renewed now and then, so that what leaks is seen.
+    with get_context("fork").Pool(given.jobs, limit, (given.megabytes,), maxtasksperchild=500) as pool:
+        for seed, outcome, done, text, used, names in pool.imap_unordered(work, jobs, chunksize=5):
+            counts[outcome] += 1
+            kinds.update(done)
+            reached |= names
+            slowest = max(slowest, (used, seed))
+            if outcome == "FOUND":
+                print(f"seed {seed}: {done}: {text.strip().splitlines()[-1]}", flush=True)
+    every = set(functions())
+    print("outcomes:", ", ".join(f"{count} {name}" for name, count in counts.most_common()))
+    print("mutations:", ", ".join(f"{count} {name}" for name, count in kinds.most_common(30)))
+    print(f"slowest: {slowest[0]:.1f} s CPU, seed {slowest[1]}")
+    print(f"coverage: {len(reached & every)} of {len(every)} functions of the packages under test")
+    return 1 if counts["FOUND"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
