@@ -16,7 +16,7 @@ Time
 Tables
     ``RobotLog``: what was measured (wheels, position, heading), in this frame, by stamp.
     ``Run``: what the filter made of it, one recorded state per wheel sample; equal when read back from its directory.
-    ``DropoutReport``: open-loop errors over distance, from every recorded state.
+    ``DropoutReport``: open-loop errors over distance, from recorded states.
     ``Calibration``: constant parameters from one run or many, for the robot and for predicting other logs.
 Source of the method
     Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of

@@ -15,6 +15,7 @@ from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_o
 from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import GYRO_TERMS
@@ -100,7 +101,7 @@ def scaled_gyro(recording: Recording) -> Floats:
 def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
     """Return scale and bias [rad/s] with which a turn rate (n,) makes the turns of the reference over seconds."""
     t, held = recording.t_s, recording.held_s
-    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], GYRO_STEP_S)))
+    every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan")
     sums = np.concatenate([[0.0], np.cumsum(held * rate)[:-1]])

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     "--x-icr",
     metavar="METRES",
     type=float,
-    help="Where the ICRs are known to lie, forward: gives the antenna's place. One log.",
+    help="Known forward position of the ICRs; gives the antenna's position. One log.",
 )
 @click.option(
     "--plot",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Draw the misses before and after: png, svg, pdf. One log.",
+    help="Draw the residuals before and after the calibration: png, svg, pdf. One log.",
 )
 @options.configuration
 @options.verbosity

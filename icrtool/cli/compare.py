@@ -37,7 +37,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
     from icrtool.errors import ConfigError
-    from icrtool.output.atomic_file import check_place, whole_file
+    from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.run_directory import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
@@ -62,7 +62,7 @@ def command(
     document = json_bytes(transfer_document(transfer))
     for file, content in ((csv_file, transfer_csv(transfer)), (output, document)):
         if file is not None:
-            with whole_file(file) as partial:
+            with atomic_file(file) as partial:
                 partial.write_bytes(content)
     if as_json:
         click.echo(document, nl=False)

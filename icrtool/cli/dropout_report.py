@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -28,12 +28,12 @@ EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is asked of every run.
+    """The options, the same for every run.
 
     Attributes
     ----------
     horizons_m, outage_s : empty: those of the run's configuration
-    config : what the options say; logs are fitted with it
+    config : that of the options; logs are fitted with it
     """
 
     config: Config
@@ -43,6 +43,7 @@ class Request:
     budgets_m: tuple[float, ...]
     calibrations: tuple[Calibration, ...]
     gates: tuple[Gate, ...]
+    starts: Literal["moving", "all"]
     trials: bool
     seed: int
     formats: tuple[str, ...]
@@ -73,6 +74,8 @@ class Request:
               help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+@click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
+              help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -85,10 +88,11 @@ class Request:
 def command(
     sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, trials: bool, junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
+    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Report how far a robot can go without GNSS: open loop from every recorded state, over 1 to 20 m.
+    """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
 
     RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
     icrtool-runs/. The report is written into the run directory, as dropout/.
@@ -110,7 +114,7 @@ def command(
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         calibrations=tuple(open_calibration(file) for file in calibrations),
-        gates=tuple(parse_gate(text) for text in gates), trials=trials,
+        gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
         smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
@@ -145,7 +149,7 @@ def plan_sources(
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
-    Whatever can be refused at once is refused here, before any work.
+    Everything that can be refused without reading a log is refused here.
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
@@ -285,6 +289,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             calibrations=request.calibrations,
             outage_s=outages,
             outage_at_s=request.outage_at_s,
+            starts=request.starts,
             comparison=request.ladder,
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,

@@ -32,7 +32,7 @@ def command(source: Path | None, target: str, output: Path | None) -> None:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for icr season.json -o twist.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import check_place, whole_file
+    from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.exports.controllers import format_export
 
     if output is not None:
@@ -41,7 +41,7 @@ def command(source: Path | None, target: str, output: Path | None) -> None:
     if output is None:
         click.echo(text)
         return
-    with whole_file(output) as partial:
+    with atomic_file(output) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
 
 

@@ -159,7 +159,7 @@ def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...
 
 
 def _beside(request: FitRequest) -> str:
-    """Return what else the options did."""
+    """Return a text about further options that had an effect."""
     done = [f"started from {request.warm_start}"] if request.warm_start is not None else []
     done += ["with the smoother's states"] if request.smooths else []
     return f" ({', '.join(done)})" if done else ""

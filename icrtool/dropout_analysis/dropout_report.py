@@ -16,6 +16,7 @@ from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, ReportWatch, configured_horizons_m, dropout
 from icrtool.errors import ConfigError, DataError
@@ -33,6 +34,7 @@ def dropout_report(
     outage_s: Sequence[float] | None = None,
     outage_at_s: Sequence[float] = (),
     calibrations: Sequence[Calibration] = (),
+    starts: Starts = "moving",
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
     seed: int = DEFAULT_SEED,
@@ -51,6 +53,7 @@ def dropout_report(
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several
+    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
     reference : what trials are compared with: the filter's states or the smoother's
     seed : of the bootstrap
@@ -70,7 +73,7 @@ def dropout_report(
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     # Single trials come first: whoever watches can draw them while the many are driven.
-    examples, worst = example_trials(compared), worst_trials(compared)
+    examples, worst = example_trials(compared), worst_trials(compared, starts=starts)
     outages = (*forced, *real_outages(compared))
     used, further = _calibration_rows(compared, calibrations)
     found, why = _compare(compared, run) if comparison else (None, "")
@@ -89,13 +92,13 @@ def dropout_report(
             watch(with_single(report))
 
     horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
-    report = with_single(dropout(compared, horizons, further=further, seed=seed, sink=sink, watch=grown))
+    report = with_single(dropout(compared, horizons, starts=starts, further=further, seed=seed, sink=sink, watch=grown))
     report = replace(report, comparison=found.table if found is not None else None, calibrations=used)
     return replace(
         report,
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report) for gate in limits),
-        by_turning=split_by_turning(compared),
+        by_turning=split_by_turning(compared, starts=starts),
         no_comparison=why,
     )
 

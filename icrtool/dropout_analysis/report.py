@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,8 +18,10 @@ from icrtool.kernels.trials import TrialCounts
 from icrtool.records.dropout import (
     BudgetDistance,
     ExampleTrial,
+    LearnedSplit,
     ModelResult,
     Outage,
+    ReferenceErrors,
     TurningSplit,
     UsedCalibration,
     Verdict,
@@ -45,11 +47,14 @@ class DropoutReport:
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts that were none, by horizon; the same for every model
-    states : recorded states, each a start
-    standing : of them, those at which the robot stood: their trials are near copies of one another
+    states : recorded states
+    standing : of them, those after which the robot stood: their trials are near copies of one another
     seed : of the bootstrap
     run_summary : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
+    starts : ``moving``: each standstill is one start; ``all``: every state is one
+    reference_error : what a perfect model would show, None until the trials are driven
+    by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
     smoothed : the reference is the smoother's trajectory, not the filter's
     budgets : by budget and model
@@ -58,7 +63,7 @@ class DropoutReport:
     examples : a cornering and a straight trial; empty where no trial is that long
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
-    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` says why
+    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     calibrations : those with a row of their own
     expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
@@ -74,6 +79,9 @@ class DropoutReport:
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
+    starts: Literal["moving", "all"] = "moving"
+    reference_error: ReferenceErrors | None = None
+    by_learning: LearnedSplit | None = None
     smoothed: bool = False
     budgets: tuple[BudgetDistance, ...] = ()
     verdicts: tuple[Verdict, ...] = ()

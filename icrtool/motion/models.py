@@ -24,7 +24,7 @@ VX, VY, OMEGA = 0, 1, 2
 
 
 class WheelMotion(NamedTuple):
-    """What terms are made of, (n,) each.
+    """Inputs of the terms, (n,) each.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ TERMS: dict[str, Term] = {
 """Every term by name."""
 
 GYRO_TERMS = ("gyro_scale", "wheels_weight")
-"""Terms of a model with a gyro: the turn rate is the gyro's where a drive shows nothing of the wheels' turning."""
+"""Terms of a model with a gyro: without evidence about the wheels, its turn rate is the gyro's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats
 
 
 class TrackGeometry(NamedTuple):
-    """What a twist that is linear in V_l and V_r amounts to as track ICRs and controller numbers.
+    """Track ICRs and controller numbers of a twist that is linear in V_l and V_r.
 
     Attributes
     ----------

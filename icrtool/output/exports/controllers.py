@@ -22,7 +22,7 @@ TARGETS: tuple[Target, ...] = get_args(Target)
 EXPORT_SCHEMA = "icrtool/export/1"
 
 NOT_PLANAR = 0.001
-"""Variance of z, roll and pitch, of which a plane says nothing: the value the controller's own documentation gives."""
+"""Variance of z, roll and pitch, which a plane does not show: the value the controller's own documentation gives."""
 
 ODOMETRY_USED = (6, 11)
 """Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
@@ -90,7 +90,7 @@ def _nav2(numbers: ExportNumbers) -> str:
         f"    odom0_config: [{', '.join('true' if used in ODOMETRY_USED else 'false' for used in range(15))}]",
         "    odom0_differential: false",
         "    odom0_relative: false",
-        "# AMCL: shares of variance of turn by turn, turn by way, way by way, way by turn",
+        "# AMCL: shares of variance of turn by turn, turn by distance, distance by distance, distance by turn",
         "amcl:",
         "  ros__parameters:",
         '    robot_model_type: "nav2_amcl::DifferentialMotionModel"',
@@ -114,16 +114,16 @@ def _controller(numbers: ExportNumbers, indent: int) -> list[str]:
     ):
         lines.append(f"{key}: {value:.4f}  # ± {std:.4f}")
     lines += [
-        f"# after {POSE_AFTER_M:g} m of way; x forward, y left, z, roll, pitch, yaw",
+        f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {_diagonal(numbers.pose_variance)}",
-        f"# of velocities over {TWIST_OVER_M:g} m of way",
+        f"# of velocities over {TWIST_OVER_M:g} m",
         f"twist_covariance_diagonal: {_diagonal(numbers.twist_variance)}",
     ]
     return [" " * indent + line for line in lines]
 
 
 def _header(numbers: ExportNumbers) -> list[str]:
-    """Return the comments above: where the numbers come from, and what they cannot say."""
+    """Return the comments above: where the numbers come from, and what they cannot express."""
     right, left, x = numbers.icrs_m
     std_right, std_left, std_x = numbers.icr_std_m
     robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
@@ -143,7 +143,8 @@ def _header(numbers: ExportNumbers) -> list[str]:
         f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
     )
-    sentences = [origin, icrs, held_out, lost, *(f"WARNING: {_one_line(doubt)}" for doubt in numbers.doubts)]
+    sentences = [origin, icrs, held_out, lost]
+    sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.doubts]
     return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
 
 

@@ -35,7 +35,7 @@ P95 = Pen("black", width=1.2)
 DASH = (0, (4.0, 2.0))
 FLATTENING = 2.5
 HISTOGRAM_IN_P95 = 2.0
-"""A histogram is shown up to this many times p95; what lies beyond is said in words."""
+"""A histogram is shown up to this many times p95; what lies beyond is stated in words."""
 
 
 def draw_summary(title: str, report: DropoutReport) -> Figure:
@@ -113,7 +113,7 @@ def _look(report: DropoutReport, name: str) -> tuple[str, str, str]:
 
 
 def _flattened(report: DropoutReport) -> bool:
-    """Say whether no slip is so much worse that the ICR curves need a panel of their own."""
+    """Return whether no slip is so much worse that the ICR curves need a panel of their own."""
     icr, no_slip = report.result("icr"), report.result("no_slip")
     if icr is None or no_slip is None or not np.isfinite(no_slip.summary.p95).any():
         return False
