@@ -19,7 +19,7 @@ from icrtool.calibration.pooled import ErrorsOf, block_predictor, calibration_fr
 from icrtool.calibration.record import Calibration, FittedModel
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import FrozenIcrs
+from icrtool.kernels.trials import FrozenIcrs, Summary
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, Rung
@@ -71,6 +71,11 @@ class Ladder:
     heading: str
     notes: tuple[str, ...]
     calibration: Calibration | None
+
+    @property
+    def summaries(self) -> dict[str, Summary]:
+        """The errors of each row, by its name."""
+        return {rung.name: rung.summary for rung in self.rungs}
 
     def rung(self, name: str) -> Rung:
         """Return a rung by name."""

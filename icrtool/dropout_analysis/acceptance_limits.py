@@ -76,10 +76,10 @@ def check_gate(gate: Gate, report: DropoutReport) -> Verdict:
     result = report.result(gate.model)
     if result is None:
         table = report.comparison
-        rungs = {rung.name: rung.summary for rung in table.rungs} if table is not None else {}
-        if table is not None and gate.model in rungs:
-            return _verdict(gate, rungs[gate.model], np.array(table.horizons_m))
-        known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *rungs]))
+        compared = table.summaries if table is not None else {}
+        if table is not None and gate.model in compared:
+            return _verdict(gate, compared[gate.model], np.array(table.horizons_m))
+        known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *compared]))
         advice = f"this run has {known}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
     return _verdict(gate, result.summary, report.horizons_m)

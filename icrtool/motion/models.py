@@ -251,7 +251,7 @@ def track_geometry(
 
 
 CONTROLLER = MotionModel(
-    "controller", "separation and radii alone", ("vx_v", "vx_w", "omega_w", "omega_v"),
+    "controller", "separation and radii", ("vx_v", "vx_w", "omega_w", "omega_v"),
     "diff_drive_controller of ros2_controllers",
 )  # fmt: skip
 """What a differential-drive controller can express; it follows from another model's geometry and is never fitted."""

@@ -46,7 +46,7 @@ def report(drive: Run, own: Calibration, tmp_path_factory: pytest.TempPathFactor
     files = [own.write(folder / "own.json"), other.write(folder / "last.season.json")]
     calibrations = [icrtool.open_calibration(file) for file in files]
     gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "extended.p95@10m <= 9"]
-    return dropout_report(drive, horizons_m=HORIZONS, calibrations=calibrations, gates=gates)
+    return dropout_report(drive, horizons_m=HORIZONS, calibrations=calibrations, gates=gates, starts="all")
 
 
 def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
