@@ -69,7 +69,7 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
             )
         speed, turn = motion.twist.T
         with np.errstate(over="ignore", invalid="ignore"):
-        return speed - turn * width / 2, speed + turn * width / 2, "m", False
+            return speed - turn * width / 2, speed + turn * width / 2, "m", False
     wanted = config.wheels.quantity
     positions = _both(motion.position_left, motion.position_right)
     speeds = _both(motion.speed_left, motion.speed_right)
