@@ -66,7 +66,8 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
                 "robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME"
             )
         speed, turn = motion.twist.T
-        return speed - turn * width / 2, speed + turn * width / 2, "m", False
+        with np.errstate(over="ignore", invalid="ignore"):
+            return speed - turn * width / 2, speed + turn * width / 2, "m", False
     wanted = config.wheels.quantity
     positions = _both(motion.position_left, motion.position_right)
     speeds = _both(motion.speed_left, motion.speed_right)

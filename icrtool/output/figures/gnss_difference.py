@@ -63,7 +63,8 @@ def draw_gnss_difference(run: Run) -> Figure:
     axes.set_ylabel("Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
     ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
-    figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 

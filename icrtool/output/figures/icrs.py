@@ -139,7 +139,7 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     else:
         spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
     middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
-    axes.set_xlim(span_s[0] / unit, span_s[1] / unit)
+    axes.set_xlim(span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3))
     axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
     axes.locator_params(axis="y", nbins=5)
 
