@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from icrtool.records.run import WarmStart
 
 RUNS = Path("icrtool-runs")
-AUTO = "auto"
 
 
 class FitRequest(NamedTuple):
@@ -28,7 +27,6 @@ class FitRequest(NamedTuple):
     formats: tuple[str, ...]
     warm_start: Path | None
     changes_s: tuple[float, ...]
-    finds_changes: bool
     smooths: bool
     quiet: bool
     verbose: bool
@@ -54,9 +52,10 @@ class FitRequest(NamedTuple):
 @click.option(
     "--terrain-change",
     "changes",
-    metavar="T|auto",
+    metavar="T",
+    type=float,
     multiple=True,
-    help="Inflate the ICR covariance T seconds after the start; auto: where the ICRs are found to change. Repeatable.",
+    help="Inflate the ICR covariance T seconds after the start. Repeatable.",
 )
 @click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
 @options.cut
@@ -64,7 +63,7 @@ class FitRequest(NamedTuple):
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[str, ...], smooths: bool, start: str | None, end: str | None,
+    warm_start: Path | None, changes: tuple[float, ...], smooths: bool, start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -82,7 +81,7 @@ def command(
     config = options.load(config_file, robot, sets)
     request = FitRequest(
         config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
-        change_times(changes), AUTO in changes, smooths, quiet, verbose, start, end,
+        check_times(changes), smooths, quiet, verbose, start, end,
     )  # fmt: skip
     directories = run_directories(logs, output)
     failed: list[IcrToolError] = []
@@ -99,19 +98,11 @@ def command(
         raise options.not_all_used(len(failed), len(logs), "logs")
 
 
-def change_times(given: tuple[str, ...]) -> tuple[float, ...]:
-    """Return the times [s] of ``--terrain-change``; its word ``auto`` is none."""
-    times = []
-    for text in given:
-        if text != AUTO:
-            try:
-                times.append(float(text))
-            except ValueError as err:
-                why = f"{text!r} is neither; give seconds or {AUTO}"
-                raise click.BadParameter(why, param_hint="--terrain-change") from err
+def check_times(times: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the times [s] of ``--terrain-change``, all finite."""
     if not all(math.isfinite(time) for time in times):
         raise click.BadParameter("give finite seconds", param_hint="--terrain-change")
-    return tuple(times)
+    return times
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
@@ -194,7 +185,6 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         request.config,
         warm_start=start,
         changes_s=request.changes_s,
-        find_changes=request.finds_changes,
         smooth=request.smooths,
     )
     notes: list[str] = []

@@ -17,7 +17,6 @@ def fit(
     *,
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
-    find_changes: bool = False,
     smooth: bool = False,
 ) -> Run:
     """Learn a robot's track ICRs from a log.
@@ -28,7 +27,6 @@ def fit(
     config : default: all defaults
     warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
     changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
-    find_changes : look for more of them, and run the filter again with those found
     smooth : also make the states of the RTS smoother
 
     Returns
@@ -50,9 +48,7 @@ def fit(
     """
     config = config if config is not None else Config()
     measurements = align(log, config)
-    filtered = run_filter(
-        measurements.sensors, config, warm_start=warm_start, changes_s=changes_s, find_changes=find_changes
-    )
+    filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
     return Run(
         name=log.name,
         config=config,

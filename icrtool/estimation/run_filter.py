@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import (
     FilterSetup,
     ProcessNoise,
@@ -17,8 +15,7 @@ from icrtool.estimation.filter_setup import (
     wheel_gap_s,
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
-from icrtool.estimation.terrain_changes import TerrainTest, find_terrain_changes, given_changes
-from icrtool.kernels.filter_records import RECOVERED, UNSEEN, USED, Codes, FilterOutput
+from icrtool.kernels.filter_records import RECOVERED, USED, Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples
@@ -48,7 +45,7 @@ class Filtered(NamedTuple):
     start_std_m : (3,) of the ICRs at the start
     least_icr_m : what the filter kept the y ICRs from the centre line; -inf: anywhere
     began_with : ICRs and covariance of the warm start, None without one
-    terrain : changes of the ICRs, given and detected
+    changes_s : terrain changes, seconds since the first recorded state, in order
     """
 
     sensors: SensorData
@@ -63,12 +60,7 @@ class Filtered(NamedTuple):
     start_std_m: Floats
     least_icr_m: float
     began_with: WarmStart | None
-    terrain: TerrainTest
-
-    @property
-    def changes_s(self) -> tuple[float, ...]:
-        """Terrain changes within the drive, seconds since the first recorded state."""
-        return self.terrain.within(float(self.table.t_s[-1]))[0].times_s
+    changes_s: tuple[float, ...]
 
 
 def run_filter(
@@ -77,7 +69,6 @@ def run_filter(
     *,
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
-    find_changes: bool = False,
 ) -> Filtered:
     """Run the filter over the sensors of a log; parameters as in `icrtool.estimation.fit.fit`.
 
@@ -90,13 +81,33 @@ def run_filter(
     """
     check_start(config)
     _check_motion(sensors)
-    filtered = _run_once(sensors, config, warm_start, given_changes(changes_s))
-    if not find_changes:
-        return filtered
-    terrain = _find_changes(filtered)
-    if len(terrain.changes) == len(filtered.terrain.changes):
-        return filtered._replace(terrain=terrain)
-    return _run_once(sensors, config, warm_start, terrain)
+    changes_s = tuple(sorted(set(changes_s)))
+    adapted = run_adaptively(sensors, config, warm_start, changes_s)
+    sensors, setup, output = adapted.sensors, adapted.setup, adapted.output
+    table = _states(sensors.wheels, output)
+    gnss = _outcome(
+        sensors.fixes.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code,
+        np.hypot(*output.gnss_residual.T),
+    )  # fmt: skip
+    heading = _outcome(
+        sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
+        output.heading_innovation,
+    )  # fmt: skip
+    return Filtered(
+        sensors=sensors,
+        table=table,
+        in_gap=np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False),
+        outages_ns=_outages(table, gnss, sensors.losses_ns),
+        gnss=gnss,
+        heading=heading,
+        covariance=_square(output.P),
+        noise=adapted.noise,
+        reference_delay_s=adapted.reference_delay_s,
+        start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
+        least_icr_m=setup.parameters.least_icr,
+        began_with=warm_start,
+        changes_s=changes_s,
+    )
 
 
 def _check_motion(sensors: SensorData) -> None:
@@ -137,43 +148,6 @@ def noise_of(run: Run | Filtered) -> ProcessNoise:
         return run.noise
     facts = run.summary["filter"]
     return ProcessNoise(float(facts["process_position_mps"]), float(facts["process_heading_degps"]))
-
-
-def _run_once(sensors: SensorData, config: Config, warm_start: WarmStart | None, terrain: TerrainTest) -> Filtered:
-    adapted = run_adaptively(sensors, config, warm_start, terrain.times_s)
-    sensors, setup, output = adapted.sensors, adapted.setup, adapted.output
-    table = _states(sensors.wheels, output)
-    gnss = _outcome(
-        sensors.fixes.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code,
-        np.hypot(*output.gnss_residual.T),
-    )  # fmt: skip
-    heading = _outcome(
-        sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
-        output.heading_innovation,
-    )  # fmt: skip
-    return Filtered(
-        sensors=sensors,
-        table=table,
-        in_gap=np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False),
-        outages_ns=_outages(table, gnss, sensors.losses_ns),
-        gnss=gnss,
-        heading=heading,
-        covariance=_square(output.P),
-        noise=adapted.noise,
-        reference_delay_s=adapted.reference_delay_s,
-        start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
-        least_icr_m=setup.parameters.least_icr,
-        began_with=warm_start,
-        terrain=terrain,
-    )
-
-
-def _find_changes(filtered: Filtered) -> TerrainTest:
-    seen = filtered.heading.code > UNSEEN
-    innovations = filtered.heading.t_s[seen], filtered.heading.difference[seen]
-    return find_terrain_changes(
-        filtered.table, filtered.in_gap, filtered.outages_ns, innovations, filtered.terrain.times_s
-    )
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:

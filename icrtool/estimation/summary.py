@@ -45,8 +45,8 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     config : the effective configuration
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
-    terrain, beyond = filtered.terrain.within(float(table.t_s[-1]))
-    convergence = converge(table, min(terrain.times_s, default=None))
+    changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
+    convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config)
     multiplier = separation_multiplier(table, width) if width is not None else None
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading)
@@ -54,7 +54,11 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
         *measurements.warnings,
         *run_warnings(log.name, table, filtered.gnss, filtered.heading, multiplier),
         *([] if measurements.antenna_is_known else antenna_warning(log.name, table, filtered.covariance)),
-        *(f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s" for t in beyond),
+        *(
+            f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s"
+            for t in filtered.changes_s
+            if t not in changes_s
+        ),
         *noise_warnings(log.name, config, filtered.reference_delay_s, filtered.noise),
         *(f"{log.name}: {sentence}" for sentence in excitation.sentences),
     ]
@@ -78,8 +82,8 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
             "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
-            "terrain": terrain.summary(),
-            "segments": segment_summary(table, terrain.times_s),
+            "terrain": {"changes": [{"t_s": t} for t in changes_s]},
+            "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(log, filtered.gnss, sensors.fixes.down_weighted)
             | measurements.sections["gnss"]
             | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss, filtered.reference_delay_s),

@@ -87,19 +87,14 @@ class OdometryDocument(TypedDict):
 
 
 class ChangeDocument(TypedDict):
-    """A change of the ICRs."""
+    """A terrain change."""
 
     t_s: float
-    source: str
-    statistic: float | None
 
 
 class TerrainDocument(TypedDict):
-    """Changes of the ICRs, given and found."""
+    """Terrain changes at which the ICR covariance was inflated."""
 
-    searched: bool
-    threshold: float | None
-    driven_h: float
     changes: list[ChangeDocument]
 
 

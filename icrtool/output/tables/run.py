@@ -7,7 +7,6 @@ from typing import Any
 
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
-from icrtool.estimation.terrain_changes import FALSE_ALARMS_PER_HOUR
 from icrtool.output.text_format import (
     TABLE_WIDTH,
     distance_text,
@@ -142,38 +141,15 @@ def _multiplier_lines(run: Run) -> list[str]:
 
 
 def _terrain_lines(run: Run) -> list[str]:
-    """Return the terrain changes, given and found, and the ICRs between them."""
-    terrain = run.summary["terrain"]
-    changes, threshold = terrain["changes"], terrain["threshold"]
-    if not (changes or terrain["searched"]):
+    """Return the ICRs between the terrain changes."""
+    if not run.summary["segments"]:
         return []
-    lines = [""]
-    if terrain["searched"]:
-        found = sum(change["source"] == "detected" for change in changes)
-        driven = duration_text(3600 * terrain["driven_h"])
-        if threshold is not None:
-            said = (
-                f"{found} {'change' if found == 1 else 'changes'} of the ICRs found in {driven} of driving; "
-                f"by chance: {FALSE_ALARMS_PER_HOUR:g} an hour at most"
-            )
-        else:
-            said = "too few turns, or too rough a position, to look for changes of the ICRs"
-        lines.append(_line("terrain", said))
-    if not changes:
-        return lines
-    rows: list[Row] = [("segment", "begins", "", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
-    begun = ["", *(_found_text(change, threshold) for change in changes)]
-    for number, (segment, why) in enumerate(zip(run.summary["segments"], begun, strict=True), start=1):
+    rows: list[Row] = [("segment", "begins", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
+    for number, segment in enumerate(run.summary["segments"], start=1):
         mean, std = segment["mean"], segment["std"]
         icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
-        rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", why, *icrs))
-    return lines + [f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<22}{row[3]:<20}{row[4]:<20}{row[5]}" for row in rows]
-
-
-def _found_text(change: dict[str, Any], threshold: float | None) -> str:
-    if change["statistic"] is None or threshold is None:
-        return "given"
-    return f"found, {change['statistic']:.1f} σ > {threshold:.1f} σ"
+        rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", *icrs))
+    return ["", *(f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<20}{row[3]:<20}{row[4]}" for row in rows)]
 
 
 def _position_lines(run: Run) -> list[str]:
