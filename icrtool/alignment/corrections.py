@@ -22,7 +22,7 @@ from icrtool.alignment.heading_alignment import (
     refuse_stuck,
     refuse_unexplained,
 )
-from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, derive_heading, rate_of_heading
+from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, as_turn_rate, derive_heading
 from icrtool.alignment.heading_offset_cause import NO_NAME, name_offset
 from icrtool.alignment.reference_delay import delayed
 from icrtool.alignment.stream_checks import check_streams
@@ -149,8 +149,8 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     fit = estimate_alignment(drive, windows, width)
     if free and derived is None:
         refuse_stuck(log)
-        bare = None if fit is None else _as_turn_rate(as_sent, fit, width)
-        if bare is not None:
+        scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
+        if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
             return align_streams(bare, config)
         refuse_unexplained(log, course)
     scale, scale_note = _scale(fit, config, sound=sound, corrects=corrects)
@@ -169,31 +169,6 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         log, wheels, heading, delays, fit, derived,
         (*wheels.warnings, *heading.warnings, *delays.warnings),
     )  # fmt: skip
-
-
-def _as_turn_rate(log: RobotLog, fit: AlignmentFit, width_m: float) -> RobotLog | None:
-    """Return a log whose heading is a turn rate only, where it drifts and its rate gives a better one; else None.
-
-    An orientation without a magnetometer is an integrated gyro: its offset wanders with the bias.
-    """
-    if fit.heading_scatter < NOISY_SCATTER_RAD:
-        return None
-    rate = rate_of_heading(log)
-    if rate is None:
-        return None
-    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
-    streams = tuple(one for one in log.streams if one.role != "heading")
-    note = (
-        f"{log.name}: the heading drifts ({math.degrees(fit.heading_scatter):.0f}° about the course): "
-        "only turn rates are used"
-    )
-    bare = replace(log, heading=nothing, gyros=(*log.gyros, rate), streams=streams, warnings=(*log.warnings, note))
-    try:
-        found = derive_heading(bare, width_m)
-    except DataError:
-        return None
-    std = float(np.median(np.sqrt(found.smoothed.var_rad2)))
-    return bare if found.source != "wheels" and std < min(fit.heading_scatter / 2, NOISY_SCATTER_RAD) else None
 
 
 def _decide(

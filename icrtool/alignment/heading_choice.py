@@ -10,6 +10,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, drive_arrays, fix_std_m
 from icrtool.alignment.gyro_heading import HeadingEstimate, TurnRate, estimate_heading, measure_courses
+from icrtool.alignment.heading_alignment import NOISY_SCATTER_RAD
 from icrtool.errors import DataError
 from icrtool.records.tables import Floats, GyroAxes, HeadingSamples, PositionFixes, RobotLog, StreamChoice
 
@@ -138,6 +139,35 @@ def _samples(found: HeadingEstimate, epoch: int) -> tuple[HeadingSamples, Headin
 
 def _median_std(found: HeadingEstimate) -> float:
     return float(np.median(found.smoothed_std))
+
+
+def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:
+    """Return a log whose heading is a turn rate only, where it drifts and its rate gives a better one; else None.
+
+    An orientation without a magnetometer is an integrated gyro: its offset wanders with the bias.
+
+    Parameters
+    ----------
+    scatter_rad : of the heading about the course over ground
+    width_m : the track width b
+    """
+    if scatter_rad < NOISY_SCATTER_RAD:
+        return None
+    rate = rate_of_heading(log)
+    if rate is None:
+        return None
+    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    streams = tuple(one for one in log.streams if one.role != "heading")
+    note = (
+        f"{log.name}: the heading drifts ({math.degrees(scatter_rad):.0f}° about the course): only turn rates are used"
+    )
+    bare = replace(log, heading=nothing, gyros=(*log.gyros, rate), streams=streams, warnings=(*log.warnings, note))
+    try:
+        found = derive_heading(bare, width_m)
+    except DataError:
+        return None
+    std = _median_std(found.estimate)
+    return bare if found.source != "wheels" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
 
 
 def rate_of_heading(log: RobotLog) -> GyroAxes | None:
