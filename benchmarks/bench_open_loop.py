@@ -25,7 +25,7 @@ NO_SLIP = FrozenIcrs.constant(0.305, -0.305, 0.0)
 
 
 def drive_around(hours: float) -> tuple[Drive, FrozenIcrs]:
-    """Make a winding drive at 1 m/s whose ICRs are learned in the first seconds and wander slowly from then on."""
+    """Return a winding drive at 1 m/s whose ICRs converge in the first seconds and then change slowly."""
     rng = np.random.default_rng(0)
     n = int(hours * 3600 * RATE_HZ)
     t = np.arange(n) / RATE_HZ
@@ -69,7 +69,7 @@ def by_ranges(drive: Drive, icrs: FrozenIcrs) -> None:
 
 
 def compare(hours: float) -> None:
-    """Print fast against direct, and what the statistics of one model take."""
+    """Print the times of the fast and the direct integration, and of the statistics of one model."""
     drive, icrs = drive_around(hours)
     ends = trial_ends(drive, HORIZONS_M)
     print(f"{hours * 60:.0f} min at {RATE_HZ} Hz, {len(drive.dt_s)} starts x {len(HORIZONS_M)} horizons, one core")

@@ -15,7 +15,7 @@ CONTAINERS = {"hour.mcap": ("mcap", "zstd"), "hour.bag": ("bag", "lz4"), "hour_d
 
 
 def drive(seconds: float, seed: int = 1) -> SensorColumns:
-    """Drive curves for some seconds with known ICRs."""
+    """Return the measurements of a curved drive of some seconds with known ICRs."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.01)
     v_left = 0.6 + 0.2 * np.sin(t / 7) + 0.1 * np.sin(t / 3.1)
@@ -67,7 +67,7 @@ def make_logs(folder: Path, seconds: float) -> dict[str, Path]:
 
 
 def add_images(log: Path, target: Path, gigabytes: float) -> Path:
-    """Copy an MCAP log with chunks of images among its own: 640 x 480 rgb8, compressible like a real one by half."""
+    """Copy an MCAP log and add chunks of images: 640 x 480 rgb8, compressible by half like real ones."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 

@@ -1,6 +1,6 @@
-"""Speed and memory of icrtool, as ratios to other tools where there are any. `make bench`, or with options below.
+"""Speed and memory of icrtool, and ratios to other tools where there are any. `make bench`, or with options below.
 
-Nothing here passes or fails: machines are noisy, so medians over repeats and ratios within one run are printed.
+There is no pass or fail: timings vary, so medians over repeats and ratios within one run are printed.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ _, status, usage = os.wait4(process.pid, 0)
 print(time.perf_counter() - begin, usage.ru_maxrss / 1e3)
 sys.exit(os.waitstatus_to_exitcode(status))
 """
-"""A small process between: a new process begins with the peak memory of the one that starts it."""
+"""Started through a small process: a new process inherits the peak memory of the process that starts it."""
 
 
 def command(arguments: list[str], folder: Path, **environment: str) -> tuple[float, float]:
@@ -129,7 +129,7 @@ def whole_commands(logs: dict[str, Path], folder: Path, repeats: int) -> None:
 
 
 def images(logs: dict[str, Path], folder: Path, gigabytes: float, repeats: int) -> None:
-    """Put images into the log: time and memory must not follow."""
+    """Measure a log with images added: time and memory must stay the same."""
     big = add_images(logs["hour.mcap"], folder / "images.mcap", gigabytes)
     fit = ["fit", str(big), *ROBOT, "-q", "-o", "run-images", "--plots", "none"]
     runs = [command(fit, folder) for _ in range(repeats)]
@@ -139,13 +139,13 @@ def images(logs: dict[str, Path], folder: Path, gigabytes: float, repeats: int) 
 
 
 def dropout_kernels() -> None:
-    """Run the analysis against compiled brute force (a script of its own)."""
+    """Run the comparison of the analysis with compiled brute force (a separate script)."""
     print("\nDropout analysis against compiled brute force:\n", flush=True)
     subprocess.run([sys.executable, str(Path(__file__).with_name("bench_open_loop.py"))], check=True)
 
 
 def against_evo(logs: dict[str, Path], folder: Path) -> None:
-    """Compare with evo_rpe --all_pairs, the nearest thing there is: one horizon of it, on two minutes of the log."""
+    """Compare with evo_rpe --all_pairs, the most similar tool: one horizon, on two minutes of the log."""
     import icrtool
 
     if shutil.which("evo_rpe") is None:

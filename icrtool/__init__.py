@@ -16,7 +16,8 @@ Time
 Tables
     ``RobotLog``: what was measured (wheels, position, heading), in this frame, by stamp.
     ``Run``: what the filter made of it, one recorded state per wheel sample; equal when read back from its directory.
-    ``DropoutReport``: open-loop errors over distance, from every recorded state.
+    ``DropoutReport``: open-loop errors over distance, from recorded states.
+    ``Calibration``: constant parameters from one run or many, for the robot and for predicting other logs.
 Source of the method
     Pentzer, Brennan, Reichard: "Model-based Prediction of Skid-steer Robot Kinematics Using Online Estimation of
     Track Instantaneous Centers of Rotation", J. Field Robotics 31(3), 2014. Equation numbers in the code are its.
@@ -29,6 +30,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from icrtool import figures
+    from icrtool.calibration.from_runs import calibrate
+    from icrtool.calibration.record import Calibration
     from icrtool.config import Config, load_config
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.dropout_analysis.report import DropoutReport
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from icrtool.errors import IcrToolError
     from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
+    from icrtool.output.calibration_file import open_calibration
     from icrtool.output.stored_run import open_run
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Calibration",
     "Config",
     "DropoutReport",
     "IcrToolError",
@@ -50,26 +55,31 @@ __all__ = [
     "Run",
     "WarmStart",
     "__version__",
+    "calibrate",
     "dropout",
     "dropout_report",
     "figures",
     "fit",
     "load_config",
+    "open_calibration",
     "open_run",
     "read_log",
 ]
 
 _HOMES = {
+    "Calibration": "icrtool.calibration.record",
     "Config": "icrtool.config",
     "DropoutReport": "icrtool.dropout_analysis.report",
     "IcrToolError": "icrtool.errors",
     "RobotLog": "icrtool.records.tables",
     "Run": "icrtool.records.run",
     "WarmStart": "icrtool.records.run",
+    "calibrate": "icrtool.calibration.from_runs",
     "dropout": "icrtool.dropout_analysis.trials",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.estimation.fit",
     "load_config": "icrtool.config",
+    "open_calibration": "icrtool.output.calibration_file",
     "open_run": "icrtool.output.stored_run",
     "read_log": "icrtool.logs",
 }

@@ -68,10 +68,10 @@ class TopicsConfig:
 class WheelsConfig:
     """How wheel messages become speeds.
 
-    Scales multiply the travel of a side (1.02: the wheel is 2 % larger); ``auto`` is 1, or what the position reference
-    says of both sides where that is clear (preset ``field``).
-    `twist_width_m` is the width with which a body twist was made of the wheels' speeds: the wheel separation of the
-    controller times its multiplier. Left out: `RobotConfig.track_width_m`.
+    Scales multiply the travel of a side (1.02: the wheel is 2 % larger). ``auto`` is 1, or with preset ``field`` the
+    common scale of both sides by the position reference, where it is significant.
+    `twist_width_m` is the width that the controller used to compute a body twist from wheel speeds: its wheel
+    separation times its multiplier. Default: `RobotConfig.track_width_m`.
     """
 
     left_joints: tuple[str, ...] = ()
@@ -89,11 +89,11 @@ class WheelsConfig:
 
 @dataclass(frozen=True, slots=True)
 class FramesConfig:
-    """Where sensors sit and what their yaw means.
+    """Positions of sensors on the robot, and the convention, offset and delay of the heading.
 
-    `antenna_*`: the antenna from the body origin; ``auto`` is what the log's own ``/tf_static`` says, else 0.
-    `reference_delay_s`, `heading_delay_s`: how late position reference and heading are against the wheels; ``auto``
-    takes out what is clear (preset ``field``).
+    `antenna_*`: the antenna from the body origin; ``auto`` takes it from the log's own ``/tf_static``, else 0.
+    `reference_delay_s`, `heading_delay_s`: how much the position reference and the heading lag behind the wheels;
+    ``auto`` corrects a significant delay (preset ``field``).
     """
 
     heading: Literal["auto", "enu", "ned"] = "auto"
@@ -110,12 +110,13 @@ class FilterConfig:
     """The EKF of Section 3. A value left out is the preset's.
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
-    `heading_std_deg` those of R (Eq. 31), used where the messages do not say. `process_position_mps` is 0.2 (Eq. 30);
+    `heading_std_deg` those of R (Eq. 31), used where the messages state none. `process_position_mps` is 0.2 (Eq. 30);
     in preset ``field``, ``auto`` starts at 0.3 and raises it when the fixes contradict wheels this good.
     `process_heading_degps` is 5 (Eq. 30), in preset ``field`` 7.
     `terrain_icr_std_m` is how uncertain the ICRs are after a terrain change: 10 (Section 5.2), in preset ``field`` the
     robot's width.
-    `heading_correlation_s` is how long an AHRS errs alike: closer samples are not independent (``field`` only).
+    `heading_correlation_s`: errors of an AHRS are correlated over this time, so closer samples are not independent
+    (``field`` only).
     """
 
     preset: Literal["field", "paper"] = "field"
@@ -155,7 +156,7 @@ class DropoutConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Everything a scientist would change. Frozen; `effective` is what run.json records.
+    """All settings of a run. Frozen; run.json records `effective`.
 
     Attributes
     ----------
@@ -264,7 +265,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            # A pipe would be waited for, and a device may have no end.
+            # Reading a pipe would block, and a device may have no end.
             raise ConfigError(path, "not a file", "a configuration is a TOML file")
         if status.st_size > LARGEST_FILE_BYTES:
             raise ConfigError(path, f"{status.st_size} bytes long", f"a configuration has at most {LARGEST_FILE_BYTES}")
@@ -321,7 +322,7 @@ def _flaw(value: object) -> str | None:
     return None
 
 
-def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - the section's own type
+def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - the type of the section
     try:
         return msgspec.convert(dict(values), SECTIONS[name])
     except msgspec.ValidationError as err:

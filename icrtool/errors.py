@@ -36,7 +36,7 @@ class DefinitionError(LogError):
 
 
 class MissingStreamError(LogError):
-    """A log without wheels, position or heading; `needs` says, by what is missing, what could have been it."""
+    """A log without wheels, position or heading; `needs`: for each missing role, what could fill it."""
 
     def __init__(self, log: Path | str, needs: Mapping[str, str], holds: Sequence[str]) -> None:
         self.roles = tuple(needs)
@@ -56,4 +56,4 @@ class OutputError(IcrToolError):
 
 
 class RunError(IcrToolError):
-    """A run directory that is not ours, was edited, or is of another schema."""
+    """A run directory that icrtool did not write, that was edited, or that has another schema."""

@@ -1,7 +1,7 @@
-"""Make the sample logs: drive physics-simulated robots, let the sensors of Pentzer 2014, Section 4, look, and record.
+"""Make the sample logs: drives of physics-simulated robots, measured with the sensors of Pentzer 2014, Section 4.
 
 Run as ``python sample_logs/generate.py`` from the project's root (``make samples``) with icrtool installed.
-What comes out beside each log (``*.truth.csv``, ``*.json``) is described in README.md.
+README.md describes the files beside each log (``*.truth.csv``, ``*.json``).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ COUNTS_PER_REV = 8192
 GNSS_EVERY = 5
 GNSS_STD_M = 0.01
 HEIGHT_STD_M = 0.02
-# The paper's AHRS is 1 degree rms. A real one errs slowly (magnetic surroundings) and quickly: 1 degree together.
+# The paper's AHRS has 1 degree rms. A real one has slow errors (magnetic) and white noise: 1 degree together.
 HEADING_SLOW_STD_RAD = np.radians(0.85)
 HEADING_SLOW_TIME_S = 30.0
 HEADING_WHITE_STD_RAD = np.radians(0.5)
@@ -52,7 +52,7 @@ GYRO_STD_RADPS = 0.003
 
 @dataclass(frozen=True)
 class Sample:
-    """One log: who drives where, and how it is recorded."""
+    """One log: robot, path, and how it is recorded."""
 
     name: str
     robot: Robot
@@ -65,7 +65,7 @@ class Sample:
 
 
 def list_samples() -> tuple[Sample, ...]:
-    """Return the three logs: one of each container, wheel message and heading convention people meet first."""
+    """Return the three logs: one for each of the most common containers, wheel messages and heading conventions."""
     wheeled, tracked = (
         WriteOptions(
             wheel_radius_m=robot.wheel_radius_m, track_width_m=2 * robot.half_track_m, counts_per_rev=COUNTS_PER_REV
@@ -96,7 +96,7 @@ def make_sample(sample: Sample, folder: Path) -> dict[str, object]:
     """Drive, sense, and write the log, its truth and its description into `folder`."""
     drive_rng, sensor_rng = (np.random.default_rng([sample.seed, stream]) for stream in (0, 1))
     path = sample.plan(2.0 * sample.speed_mps * sample.duration_s, sample.start_heading_rad)
-    # Skid-steering takes about twice the difference of speeds that a no-slip turn would; drivers learn that first.
+    # Skid-steering needs about twice the difference of speeds of a no-slip turn.
     driver = Driver(path, sample.speed_mps, 4 * sample.robot.half_track_m, drive_rng)
     # One sample more than is recorded: the last wheel speed is the displacement to it.
     motion = drive(sample.robot, driver, sample.start_heading_rad, round(sample.duration_s / SAMPLE_S) + 1)
@@ -113,9 +113,9 @@ def make_sample(sample: Sample, folder: Path) -> dict[str, object]:
 
 
 def sense(motion: Motion, robot: Robot, rng: np.random.Generator) -> SensorColumns:
-    """Return what the sensors say: encoders and AHRS at 100 Hz, RTK GNSS at 20 Hz, all stamped at sampling.
+    """Return the measurements of encoders and AHRS at 100 Hz and RTK GNSS at 20 Hz, all stamped at sampling.
 
-    The antenna stands over the body origin. A wheel speed stamped k is the encoder's displacement from k to k + 1.
+    The antenna is above the body origin. A wheel speed stamped k is the encoder's displacement from k to k + 1.
     """
     n = len(motion.t_s) - 1
     stamp_ns = START_NS + np.rint(motion.t_s[:n] * 1e9).astype(np.int64)
@@ -191,7 +191,7 @@ def fit_constant_icrs(motion: Motion, robot: Robot) -> tuple[float, float, float
 
 
 def open_loop_errors(motion: Motion, columns: SensorColumns, icrs: tuple[float, float, float]) -> dict[str, float]:
-    """Return how far Eqs. 32-34, fed with the recorded wheel speeds alone, end up from the truth [m].
+    """Return the distance [m] between the truth and Eqs. 32-34 with the recorded wheel speeds alone.
 
     ``p95_10m`` and ``expected_10m``: from every true pose until 10 m have been driven. ``end`` and ``max``: from the
     first pose over the whole drive.
@@ -221,7 +221,7 @@ def open_loop_errors(motion: Motion, columns: SensorColumns, icrs: tuple[float, 
 
 
 def describe(sample: Sample, motion: Motion, columns: SensorColumns) -> dict[str, object]:
-    """Return what stands in the log's .json."""
+    """Return the content of the log's .json."""
     import mujoco
 
     robot = sample.robot

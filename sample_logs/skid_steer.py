@@ -1,6 +1,6 @@
 """Rigid-body skid-steer robots on flat ground with friction contact (MuJoCo), and a driver who follows a path.
 
-Nothing here knows of instantaneous centers of rotation: they come out of the contact forces, if they come out at all.
+Nothing here uses instantaneous centres of rotation: they are a result of the contact forces.
 MuJoCo's world is x forward, y left, z up; north is its x and east its -y, so heading (clockwise) is minus its yaw.
 """
 
@@ -32,7 +32,7 @@ class Robot:
     ----------
     mass_kg : with wheels
     half_track_m : centre plane of a side's wheels from the middle
-    wheel_forward_m : where the wheels of a side stand; a track is a row of road wheels turning as one
+    wheel_forward_m : positions of the wheels of a side; a track is a row of road wheels with equal speed
     mass_forward_m : centre of mass in front of the body origin, which is the geometric centre between the wheels
     wheel_shape : ``ellipsoid`` (a crowned tyre, one contact point) or ``cylinder`` (a flat shoe, two edges)
     friction : Coulomb, the same in every direction
@@ -85,7 +85,7 @@ TRACKED = Robot(
 
 @dataclass(frozen=True)
 class Motion:
-    """What the robot really did, every `SAMPLE_S` from t = 0; all of shape (n,).
+    """True motion of the robot, every `SAMPLE_S` from t = 0; all of shape (n,).
 
     Attributes
     ----------
@@ -149,10 +149,10 @@ def _describe_wheel(robot: Robot, name: str, forward_m: float, left_m: float) ->
 
 
 class Driver:
-    """Someone who steers after a point ahead on the path, with an unsteady hand.
+    """Steers to a point ahead on the path, with noise.
 
-    Pure pursuit gives a curvature; the sides get speeds for it as if the robot were `assumed_width_m` wide. The hand
-    wobbles: first-order noise on curvature (0.06 1/m, 2 s) and on speed (10 %, 5 s).
+    Pure pursuit gives a curvature; the speeds of the sides follow for a robot without slip and `assumed_width_m` wide.
+    First-order noise is added to curvature (0.06 1/m, 2 s) and speed (10 %, 5 s).
     """
 
     def __init__(self, path: Floats, speed_mps: float, assumed_width_m: float, rng: np.random.Generator) -> None:
@@ -171,7 +171,7 @@ class Driver:
             return self.sides
         window = self.path[self.ahead : self.ahead + 400] - (north_m, east_m)
         distance = np.hypot(window[:, 0], window[:, 1])
-        # The point to steer for only moves forward, or crossing paths would be mixed up.
+        # The target point only moves forward: a path that crosses itself has several nearest points.
         self.ahead += int(np.argmax(distance >= LOOKAHEAD_M))
         target_north, target_east = self.path[self.ahead] - (north_m, east_m)
         bearing = np.arctan2(target_east, target_north) - heading_rad
@@ -218,7 +218,7 @@ def bend_path(heading_rad: Floats, step_m: float) -> Floats:
 
 
 def plan_lawnmower(length_m: float, start_heading_rad: float, step_m: float = 0.01) -> Floats:
-    """Plan legs of 9 m joined by half circles of 1 m radius, to the right and to the left in turn."""
+    """Return a path of 9 m legs joined by half circles of 1 m radius, alternately to the right and to the left."""
     leg, radius = 9.0, 1.0
     turn = np.pi * radius
     s = np.arange(0.0, length_m, step_m)
@@ -228,13 +228,13 @@ def plan_lawnmower(length_m: float, start_heading_rad: float, step_m: float = 0.
 
 
 def plan_curved(length_m: float, start_heading_rad: float, step_m: float = 0.01) -> Floats:
-    """Plan a winding road: heading swings by up to 1.7 rad in two incommensurable rhythms."""
+    """Return a winding path: the heading varies by up to 1.7 rad, in two oscillations without a common period."""
     s = np.arange(0.0, length_m, step_m)
     return bend_path(start_heading_rad + 1.1 * np.sin(s / 2.3) + 0.6 * np.sin(s / 5.9), step_m)
 
 
 def plan_figure_eight(length_m: float, start_heading_rad: float, step_m: float = 0.01) -> Floats:
-    """Plan circles of 2.5 m radius, clockwise and counter-clockwise in turn."""
+    """Return a path of circles of 2.5 m radius, alternately clockwise and counter-clockwise."""
     radius = 2.5
     lap, within = np.divmod(np.arange(0.0, length_m, step_m), 2 * np.pi * radius)
     return bend_path(start_heading_rad + np.where(lap % 2 == 0, within, -within) / radius, step_m)

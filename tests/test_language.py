@@ -15,8 +15,36 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("## Words not to use")[2]
 
-DONE: tuple[str, ...] = ("__init__", "figures")
+DONE: tuple[str, ...] = (
+    "__init__",
+    "cli",
+    "config",
+    "errors",
+    "figures",
+    "kernels",
+    "logs",
+    "simulation",
+    "dropout_analysis",
+    "output/exports",
+    *(
+        f"output/{module.stem}"
+        for module in sorted((ROOT / "icrtool/output").glob("*.py"))
+        if module.stem != "run_schema"
+    ),
+    *(
+        f"output/{kind}/{module.stem}"
+        for kind in ("figures", "tables")
+        for module in sorted((ROOT / "icrtool/output" / kind).glob("*.py"))
+        if module.stem not in {"calibration", "calibration_picture", "model_comparison", "run"}
+    ),
+)
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
+
+PUBLISHED = (
+    "too_little_way_left", "blind_icr_10m_p95_m", "blind_no_slip_10m_p95_m", "change{n}_rise_{icr}_s", "rise_{name}_s",
+    '"way_m"',
+)  # fmt: skip
+"""Keys of files that users read: they never change."""
 
 PAGES = (
     "CHANGELOG.md",
@@ -42,6 +70,8 @@ INSTEAD = re.compile(
 
 def found_in_text(text: str) -> list[str]:
     """List the words not to use in a text, each with what to use instead."""
+    for key in PUBLISHED:
+        text = text.replace(key, "")
     text = re.sub(r"\s+", " ", text.replace("_", " "))
     rest = INSTEAD.sub(lambda hit: " " * len(hit.group()), text)
     return [f"{hit.group()}: write {WORDS[hit.group().lower()]}" for hit in PATTERN.finditer(rest)]

@@ -1,4 +1,4 @@
-"""A log cut into windows of way between fixes, for calibration."""
+"""A log cut into windows of driven distance between fixes, for calibration."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import wheel_gap_s
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.records.tables import Complexes, Floats, Ints, RobotLog
 
 SHORT_WINDOW_M = 1.0
 SHORT_WINDOW_IN_GNSS_STD = 12.0
 SHORT_WINDOW_IN_VALUES = 12.0
-"""Wheel values held over much of a window would end it early where they are too large, and make the wheels small."""
+"""A window spans at least so many wheel values. One value held over much of a window would bias the wheel scales."""
 
 LONG_WINDOW = 4.0
-"""Short windows tell delays and the antenna, long ones scales, W and the heading's offset."""
+"""Long windows are this many times longer. Short ones determine delays and antenna; long ones scales, W and offset."""
 
 LONGEST_WINDOW_S = 40.0
 STARTS_A_WINDOW = 3
-"""Windows overlap: so many start in one length."""
+"""Windows overlap: so many start within one window length."""
 
 HEADING_SMOOTHED_S = 0.2
 """The measured heading is averaged over this time about each sample: its slope is needed."""
@@ -39,7 +40,7 @@ class Evidence(NamedTuple):
     heading_t, heading : (h,) smoothed, unwrapped [rad]
     fix_t, fix : (m,) [s], complex north + j east [m]
     begin, end : (w,) rows of the fixes; long : (w,) 1 for long windows
-    way_m : (w,) way of the faster measure up to the window's start
+    distance_m : (w,) driven distance by the wheels at the window's start
     """
 
     wheel_t: Floats
@@ -53,18 +54,18 @@ class Evidence(NamedTuple):
     begin: Ints
     end: Ints
     long: Ints
-    way_m: Floats
+    distance_m: Floats
 
 
 class DriveFacts(NamedTuple):
-    """What a drive did, for a reader.
+    """Turns, speeds and distance of a drive.
 
     Attributes
     ----------
-    turned_right_rad, turned_left_rad : sum of heading changes either way
+    turned_right_rad, turned_left_rad : sum of heading changes in each direction
     fastest_turn_radps : 95th percentile of the turn rate while turning
     speed_mps, speed_std_mps : mean and spread of the speed while moving
-    way_m : sum of the mean wheel travel
+    distance_m : mean travel of both sides
     """
 
     turned_right_rad: float
@@ -72,11 +73,11 @@ class DriveFacts(NamedTuple):
     fastest_turn_radps: float
     speed_mps: float
     speed_std_mps: float
-    way_m: float
+    distance_m: float
 
 
 def gather(log: RobotLog, config: Config) -> Evidence:
-    """Cut a log into windows of way between fixes, short ones and long ones, clear of gaps in the wheel data."""
+    """Return a log cut into short and long windows of driven distance between fixes, without gaps in the wheel data."""
     streams = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
     epoch = int(log.wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = ((stamps - epoch) / 1e9 for stamps in streams.values())
@@ -91,11 +92,11 @@ def gather(log: RobotLog, config: Config) -> Evidence:
     known = np.sqrt((log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2)
     known = known[np.isfinite(known) & (known < 100.0)]
     noise = float(np.median(known)) if len(known) else config.filter.gnss_std_m
-    length = max(SHORT_WINDOW_M, SHORT_WINDOW_IN_GNSS_STD * noise, SHORT_WINDOW_IN_VALUES * _way_of_a_value(log, dt))
+    length = max(SHORT_WINDOW_M, SHORT_WINDOW_IN_GNSS_STD * noise, SHORT_WINDOW_IN_VALUES * _metres_per_value(log, dt))
     inside = (fix_t > max(wheel_t[0], heading_t[0]) + 1.0) & (fix_t < min(wheel_t[-1], heading_t[-1]) - 1.0)
     begins, ends, long = [], [], []
     for kind, size in enumerate((length, LONG_WINDOW * length)):
-        begin = np.unique(np.searchsorted(at_fix, np.arange(at_fix[0], at_fix[-1], size / STARTS_A_WINDOW)))
+        begin = rows_at_steps(at_fix - at_fix[0], size / STARTS_A_WINDOW)
         end = np.searchsorted(at_fix, at_fix[np.minimum(begin, len(fix_t) - 1)] + size)
         fine = (begin < len(fix_t)) & (end < len(fix_t))
         begin, end = begin[fine], end[fine]
@@ -108,7 +109,7 @@ def gather(log: RobotLog, config: Config) -> Evidence:
     if np.count_nonzero(kinds == 0) < FEWEST_WINDOWS:
         raise DataError(
             log.name,
-            f"only {np.count_nonzero(kinds == 0)} windows of {length:.1f} m of way",
+            f"only {np.count_nonzero(kinds == 0)} windows of {length:.1f} m of driven distance",
             "drive longer to calibrate",
         )
     heading = _smoothed(np.unwrap(log.heading.heading_rad), heading_t)
@@ -118,17 +119,17 @@ def gather(log: RobotLog, config: Config) -> Evidence:
     )  # fmt: skip
 
 
-def _way_of_a_value(log: RobotLog, dt: Floats) -> float:
-    """Return the way [m] on which one wheel value lasts while the robot moves, however often it is repeated."""
+def _metres_per_value(log: RobotLog, dt: Floats) -> float:
+    """Return the mean distance [m] driven while one wheel value lasts; repeated values count once."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
-    way = dt * (np.abs(left) + np.abs(right)) / 2
-    values = sum(int(np.count_nonzero((np.diff(speed) != 0) & (way[1:] > 0))) for speed in (left, right)) / 2
-    return float(way.sum()) / max(values, 1.0)
+    travel = dt * (np.abs(left) + np.abs(right)) / 2
+    values = sum(int(np.count_nonzero((np.diff(speed) != 0) & (travel[1:] > 0))) for speed in (left, right)) / 2
+    return float(travel.sum()) / max(values, 1.0)
 
 
 def summarise_drive(evidence: Evidence) -> DriveFacts:
-    """Summarise the drive from wheels and heading."""
-    # The whole seconds that have samples, not all between first and last: a stray stamp may be decades away.
+    """Return turns, speeds and distance of the drive, from wheels and heading."""
+    # Only seconds with samples, not all between the first and the last: a wrong stamp may be decades away.
     t, heading = evidence.heading_t, evidence.heading
     begins = t[0] + np.unique(np.floor(t - t[0]))
     begins = begins[begins + 1.0 <= t[-1]]
@@ -142,15 +143,15 @@ def summarise_drive(evidence: Evidence) -> DriveFacts:
         fastest_turn_radps=float(np.percentile(turning, 95)) if len(turning) else 0.0,
         speed_mps=float(np.abs(mean[moving]).mean()) if moving.any() else 0.0,
         speed_std_mps=float(mean[moving].std()) if moving.any() else 0.0,
-        way_m=float((evidence.wheel_dt * np.abs(mean)).sum()),
+        distance_m=float((evidence.wheel_dt * np.abs(mean)).sum()),
     )
 
 
 def _smoothed(heading: Floats, times: Floats) -> Floats:
-    """Return a heading averaged over `HEADING_SMOOTHED_S` about each sample, as far as there are samples there."""
+    """Return a heading averaged over `HEADING_SMOOTHED_S` about each sample; over less at the ends and at gaps."""
     low = np.searchsorted(times, times - HEADING_SMOOTHED_S / 2)
     high = np.searchsorted(times, times + HEADING_SMOOTHED_S / 2, side="right")
-    # equally many before and after, or the mean would belong to another time
+    # as many samples before as after, or the mean would belong to another time
     here = np.arange(len(times))
     reach = np.minimum(here - low, high - 1 - here)
     total = np.concatenate([[0.0], np.cumsum(heading - heading[0])])

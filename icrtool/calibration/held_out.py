@@ -18,7 +18,16 @@ from icrtool.errors import DataError
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.trials import Summary
 from icrtool.motion.fit import Pool, PooledFit
-from icrtool.motion.models import MODELS, MotionModel
+from icrtool.motion.models import (
+    CONTROLLER,
+    MODELS,
+    MotionModel,
+    TypicalDrive,
+    controller_parameters,
+    track_geometry,
+    typical_drive,
+    wheel_motion,
+)
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, trial_errors, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -87,8 +96,11 @@ class HeldOut:
 
     Attributes
     ----------
-    scores : by model, in the order of the family, then what was recommended without each fold
+    scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
+        what a controller makes of that
     fits : of everything, by model name
+    without : by fold, the model chosen without it and fitted without it
+    typical : curvature and speed at which ICRs and multiplier are stated
     recommended : name of the model chosen with all folds
     chosen : by fold, the model chosen without it
     why : the reason, one sentence
@@ -98,6 +110,8 @@ class HeldOut:
     folds: tuple[Fold, ...]
     scores: tuple[ModelScores, ...]
     fits: dict[str, PooledFit]
+    without: tuple[PooledFit, ...]
+    typical: TypicalDrive
     recommended: str
     chosen: tuple[str, ...]
     why: str
@@ -161,24 +175,26 @@ def hold_out(
 
     with ThreadPoolExecutor(AT_ONCE) as threads:
         tested = list(threads.map(job, tuple(MODELS.values()) if models is None else models))
-    wheels = _table(folds, horizons_m, [one[0] for one in tested], _nested_choice([one[0] for one in tested], folds))
+    alone = [one[0] for one in tested]
+    wheels = _table(tester, folds, horizons_m, alone, _nested_choice(alone, folds))
     if not gyro:
         return wheels, None
     # the same models: a choice of its own for the gyro would only add noise
     names = _Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
-    return wheels, _table(folds, horizons_m, [one[1] for one in tested], names)
+    return wheels, _table(tester, folds, horizons_m, [one[1] for one in tested], names)
 
 
 class _Tested(NamedTuple):
-    """A model's fits, to everything and without each fold; its trial errors by fold; window errors (folds, folds).
+    """A model's fits, whole and without each fold; by fold trial errors and the wheels' delay [s]; window errors.
 
-    ``inner[f, g]``: expected error of fold g, fitted without f and g; ``inner[f, f]`` without f alone.
+    ``inner[f, g]`` (folds, folds): expected error of fold g, fitted without f and g; ``inner[f, f]`` without f alone.
     """
 
     model: MotionModel
     whole: PooledFit
     fits: list[PooledFit]
     errors: list[Floats]
+    delays: list[float]
     inner: Floats
 
 
@@ -196,23 +212,28 @@ class _Tester:
                 raise DataError(fold.name, "too few windows beside it", why)
         trials = [cut_trials(one, horizons_m) for one in recordings]
         self._tested = [_within(recordings[fold.recording], trials[fold.recording], fold) for fold in folds]
+        self.typical = typical_drive(
+            [(wheel_motion(one.drive.v_left, one.drive.v_right, one.width_m), one.held_s) for one in recordings]
+        )
 
     def test(self, model: MotionModel, wheels: _Tested | None = None) -> _Tested:
         """Fit and test a model; one with a gyro weighs the turn rates of the same fits for wheels alone."""
         pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.whole.turning)
         whole, count = pool.fit(), len(self._folds)
-        fits, errors, inner = [], [], np.full((count, count), np.nan)
+        fits, errors, delays, inner = [], [], [], np.full((count, count), np.nan)
         for f in range(count):
             if wheels is not None:
                 pool = Pool(self._windows, self._widths, model, wheels.fits[f].turning)
             fit = pool.fit(self._clear[f], pool.without(whole, ~self._clear[f]))
             fits.append(fit)
-            errors.append(self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f]))
+            found, delay = self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f])
+            errors.append(found)
+            delays.append(delay)
             inner[f, f] = self._window_error(fit, f, fit.solution.x)
             for g in range(count):
                 if g != f and count >= FEWEST_TO_CHOOSE:
                     inner[f, g] = self._window_error(fit, g, pool.without(fit, ~self._clear[g]))
-        return _Tested(model, whole, fits, errors, inner)
+        return _Tested(model, whole, fits, errors, delays, inner)
 
     def _window_error(self, fit: PooledFit, f: int, x: Floats) -> float:
         """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit.
@@ -230,8 +251,8 @@ class _Tester:
             return float("nan")
         return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
-    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> Floats:
-        """Return the errors of a fold's trials.
+    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> tuple[Floats, float]:
+        """Return the errors of a fold's trials, and the delay of the wheels [s] that they hold for.
 
         Notes
         -----
@@ -244,7 +265,14 @@ class _Tester:
         turn = None if wheels is None else wheels.turning
         recording, trials = self._tested[f]
         rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]))
-        return trial_errors(recording, trials, rates, float(own[1]))
+        return trial_errors(recording, trials, rates, float(own[1])), float(own[1])
+
+    def controller_errors(self, fit: PooledFit, f: int, delay_s: float) -> Floats:
+        """Return the errors of a fold's trials with what a controller can express of a fit without the fold."""
+        recording, trials = self._tested[f]
+        geometry = track_geometry(fit.model, fit.parameters, recording.width_m, self.typical)
+        rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry))
+        return trial_errors(recording, trials, rates, delay_s)
 
 
 def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequence[float]) -> Trials:
@@ -292,7 +320,7 @@ def _nested_choice(tested: Sequence[_Tested], folds: Sequence[Fold]) -> _Choice:
 
 
 def _table(
-    folds: tuple[Fold, ...], horizons_m: Sequence[float], tested: Sequence[_Tested], choice: _Choice
+    tester: _Tester, folds: tuple[Fold, ...], horizons_m: Sequence[float], tested: Sequence[_Tested], choice: _Choice
 ) -> HeldOut:  # fmt: skip
     """Return the table of models that were tested on the same folds."""
     by_name = {one.model.name: one for one in tested}
@@ -301,7 +329,15 @@ def _table(
         _scores("recommended", "recommended", [by_name[name].errors[f] for f, name in enumerate(choice.chosen)])
     )
     fits = {name: one.whole for name, one in by_name.items()}
-    return HeldOut(tuple(horizons_m), folds, tuple(rows), fits, choice.recommended, choice.chosen, choice.why)
+    without = tuple(by_name[name].fits[f] for f, name in enumerate(choice.chosen))
+    if not any(fit.model.uses_gyro for fit in without):
+        delays = [by_name[name].delays[f] for f, name in enumerate(choice.chosen)]
+        errors = [tester.controller_errors(fit, f, delays[f]) for f, fit in enumerate(without)]
+        rows.append(_scores(CONTROLLER.name, CONTROLLER.label, errors))
+    return HeldOut(
+        tuple(horizons_m), folds, tuple(rows), fits, without, tester.typical, choice.recommended, choice.chosen,
+        choice.why,
+    )  # fmt: skip
 
 
 def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> tuple[str, str]:

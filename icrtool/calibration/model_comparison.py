@@ -8,13 +8,15 @@ and final, stand beside.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
-from icrtool.calibration.pooled import recording_of, scaled_gyro
-from icrtool.calibration.record import FittedModel
+from icrtool.calibration.pooled import ErrorsOf, block_predictor, calibration_from, recording_of, scaled_gyro
+from icrtool.calibration.record import Calibration, FittedModel
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs
@@ -55,6 +57,7 @@ class Ladder:
     width_m : track width b, or what stands for it
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
     notes : what was left out of the table and why, and what was corrected
+    calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
     """
 
     horizons_m: tuple[float, ...]
@@ -67,15 +70,30 @@ class Ladder:
     width_m: float
     heading: str
     notes: tuple[str, ...]
+    calibration: Calibration | None
 
     def rung(self, name: str) -> Rung:
         """Return a rung by name."""
         return next(rung for rung in self.rungs if rung.name == name)
 
 
+class Comparison(NamedTuple):
+    """The table, and what gives the errors of the recommended model in any trials (see `block_predictor`)."""
+
+    table: Ladder
+    recommended: ErrorsOf
+
+
 def judge_ladder(
     run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
 ) -> Ladder:
+    """Return the table of `compare_models`."""
+    return compare_models(run, headings, horizons_m=horizons_m).table
+
+
+def compare_models(
+    run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
+) -> Comparison:
     """Test every model on distance it was not fitted to.
 
     Parameters
@@ -100,7 +118,7 @@ def judge_ladder(
     rungs = list(_wheels_rungs(run, recording, trials, wheels))
     if turned is not None:
         rungs += _turned_rungs(run, recording, trials, turned, heading)
-    return Ladder(
+    table = Ladder(
         horizons_m=tuple(horizons_m),
         blocks=len(wheels.folds),
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
@@ -111,7 +129,17 @@ def judge_ladder(
         width_m=recording.width_m,
         heading=heading,
         notes=notes,
+        calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
     )
+    return Comparison(table, block_predictor(recording, wheels))
+
+
+def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:
+    """Return the calibration of a run from the tables that compare its models."""
+    if run.track_width_m is None:
+        return None
+    found = calibration_from([recording], wheels, gyro, robot_of(run))
+    return replace(found, warnings=use_warnings(run))
 
 
 def _with_heading(run: Run, headings: Sequence[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:

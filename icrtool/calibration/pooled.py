@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
 from icrtool import __version__
-from icrtool.calibration.held_out import HeldOut, hold_out
+from icrtool.calibration.controller_numbers import controller_errors
+from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_out, mask_windows
 from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool, PooledFit
-from icrtool.motion.models import GYRO_TERMS, typical_drive, wheel_motion
+from icrtool.motion.models import GYRO_TERMS
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, trial_errors, twist_rates
 from icrtool.records.dropout import MeasuredHeading
@@ -69,6 +72,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         width_m=width,
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
+        begin_ns=int(run.table.stamp_ns[0]),
     )
     if heading is None or not np.isfinite(heading.angle_rad).all():
         return plain
@@ -97,7 +101,7 @@ def scaled_gyro(recording: Recording) -> Floats:
 def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
     """Return scale and bias [rad/s] with which a turn rate (n,) makes the turns of the reference over seconds."""
     t, held = recording.t_s, recording.held_s
-    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], GYRO_STEP_S)))
+    every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan")
     sums = np.concatenate([[0.0], np.cumsum(held * rate)[:-1]])
@@ -109,15 +113,13 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
     return float(found.x[0]), float(found.x[1])
 
 
-def calibrate(
-    recordings: Sequence[Recording], robot: str | None = None, wheel_radius_m: float | None = None
-) -> CalibrationResult:
+def calibrate(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
     """Fit every model to all recordings, test each without a recording or block in turn, recommend one.
 
     Parameters
     ----------
     recordings : one or many, of one robot
-    robot, wheel_radius_m : its name and configured wheel radius, for the file
+    robot : what else its calibration holds of it: name, wheel_radius_m, left_scale, right_scale
 
     Raises
     ------
@@ -134,31 +136,46 @@ def calibrate(
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     wheels, gyro = hold_out(recordings)
+    return CalibrationResult(calibration_from(recordings, wheels, gyro, robot), wheels, gyro, _notes(recordings))
+
+
+def calibration_from(
+    recordings: Sequence[Recording], wheels: HeldOut, gyro: HeldOut | None, robot: Mapping[str, Any] | None = None
+) -> Calibration:
+    """Return the calibration that the held-out tables of recordings recommend."""
     best = wheels.fits[wheels.recommended]
     logs = tuple(
         CalibrationLog(
-            one.name, one.path, one.sha256, float(one.drive.distance[-1]), float(np.degrees(own[0])), -float(own[1])
+            one.name,
+            one.path,
+            one.sha256,
+            float(one.drive.distance[-1]),
+            float(np.degrees(own[0])),
+            -float(own[1]),
+            one.begin_ns,
         )
         for one, own in zip(recordings, best.constants, strict=True)
     )
     scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
-    calibration = Calibration(
-        robot={"name": robot, "track_width_m": recordings[0].width_m, "wheel_radius_m": wheel_radius_m},
+    return Calibration(
+        robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
         fitted=_fitted(best),
         others={name: _fitted(fit) for name, fit in wheels.fits.items()},
         gyro=None if gyro is None else _fitted(gyro.fits[gyro.recommended]),
-        typical=typical_drive(
-            [(wheel_motion(one.drive.v_left, one.drive.v_right, one.width_m), one.held_s) for one in recordings]
-        ),
+        typical=wheels.typical,
         why=wheels.why,
         logs=logs,
         held_out=tuple(scores),
+        controller=controller_errors(recordings, wheels),
+        warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,
     )
+
+
+def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
     without = [one.name for one in recordings if one.gyro_radps is None]
-    notes = () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
-    return CalibrationResult(calibration, wheels, gyro, notes)
+    return () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
 
 
 def _fitted(fit: PooledFit) -> FittedModel:
@@ -176,14 +193,15 @@ def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
                     yield HeldOutScore(name, horizon, float(summary.p95[h]), float(summary.expected[h]), fold.name)
 
 
-def calibrated_errors(
-    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
-) -> Floats:
-    """Return the errors (k, h) [m] of a calibration in the trials of a recording, NaN where there is none.
+ErrorsOf = Callable[[Trials], Floats]
+"""Gives the errors (k, h) [m] of a model in trials, NaN where there is none."""
+
+
+def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
+    """Return what gives the errors of a calibration in any trials of a recording.
 
     Parameters
     ----------
-    trials : starts and ends, such as those that other models are tested in
     with_gyro : the turn rate is the weighted mean with the recording's gyro
 
     Raises
@@ -208,4 +226,56 @@ def calibrated_errors(
     pool = Pool(windows, [recording.width_m], fitted.model, wheels)
     own = pool.own_constants(0, fitted.parameters)
     rates = twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2]))
-    return trial_errors(recording, trials, rates, float(own[1]))
+    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
+
+
+def fixed_predictor(recording: Recording, fit: PooledFit) -> ErrorsOf:
+    """Return what gives the errors of a fit to other recordings, with the delay of this recording's own wheels."""
+    own = Pool([cut_windows(recording)], [recording.width_m], fit.model).own_constants(0, fit.parameters)
+    rates = twist_rates(recording, fit.model, fit.parameters)
+    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
+
+
+def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
+    """Return what gives the errors of the recommended model, each trial predicted without the blocks that it touches.
+
+    Notes
+    -----
+    The parameters, and the delay of the wheels, are fitted to windows that share no distance with any block from a
+    trial's start to its end; the model is the one chosen without the block of the start. Trials for which too little
+    is left to fit to have no error.
+    """
+    windows = [cut_windows(recording)]
+    edges = np.array([fold.begin_m for fold in table.folds])
+    pools = {name: Pool(windows, [recording.width_m], table.fits[name].model) for name in set(table.chosen)}
+    found: dict[tuple[int, int], tuple[Floats, float] | None] = {}
+
+    def rates_without(first: int, last: int) -> tuple[Floats, float] | None:
+        fit = table.without[first]
+        if first != last:
+            fold = Fold("", 0, table.folds[first].begin_m, table.folds[last].end_m)
+            (kept,), _ = mask_windows(windows, [fold])
+            if np.count_nonzero(kept) < FEWEST_RESIDUALS:
+                return None
+            fit = pools[table.chosen[first]].fit(kept, fit.solution.x)
+        return twist_rates(recording, fit.model, fit.parameters), float(fit.constants[0, 1])
+
+    def errors_of(trials: Trials) -> Floats:
+        errors: Floats = np.full(trials.ends.shape, np.nan)
+        distance = recording.drive.distance
+        first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
+        # a trial that ends where a block does touches no more of it
+        last = np.maximum(np.searchsorted(edges, distance[np.maximum(trials.ends, 0)], side="left") - 1, first[:, None])
+        some = trials.ends >= 0
+        for a, b in np.unique(np.column_stack([np.broadcast_to(first[:, None], last.shape)[some], last[some]]), axis=0):
+            key = (int(a), int(b))
+            if key not in found:
+                found[key] = rates_without(*key)
+            if (known := found[key]) is not None:
+                mine = (first[:, None] == a) & (last == b) & some
+                rows = mine.any(axis=1)
+                part = Trials(trials.starts[rows], np.where(mine[rows], trials.ends[rows], -1))
+                errors[rows] = np.where(mine[rows], trial_errors(recording, part, *known), errors[rows])
+        return errors
+
+    return errors_of

@@ -7,7 +7,8 @@ the configured wheel radius.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,9 @@ from icrtool.motion.models import (
     twist,
     wheel_motion,
 )
+from icrtool.records.late_output import call_output
+from icrtool.records.plain_data import plain
+from icrtool.records.run import WarmStart
 from icrtool.records.tables import Floats, Ints, RobotLog
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
@@ -85,6 +89,7 @@ class CalibrationLog(NamedTuple):
     ----------
     heading_offset_deg : what its reference's heading is off; wheels_delay_s : its wheels against its poses, positive
         for later
+    begin_ns : stamp of its first state; 0 where it is not known
     """
 
     name: str
@@ -93,6 +98,43 @@ class CalibrationLog(NamedTuple):
     distance_m: float
     heading_offset_deg: float
     wheels_delay_s: float
+    begin_ns: int = 0
+
+
+class ControllerNumbers(NamedTuple):
+    """What a differential-drive controller is given, with one standard deviation each.
+
+    Attributes
+    ----------
+    multiplier : (y_r - y_l) / b, beside the radius factors
+    left_radius, right_radius : wheel radius over the configured one, configured scales included
+    """
+
+    multiplier: float
+    multiplier_std: float
+    left_radius: float
+    left_radius_std: float
+    right_radius: float
+    right_radius_std: float
+
+
+class ControllerErrors(NamedTuple):
+    """Errors of what a controller can express of the recommended model, on distance it was not fitted to.
+
+    Attributes
+    ----------
+    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
+    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
+    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
+    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; NaN without a trial of 10 m
+    """
+
+    pose_variance: tuple[float, float, float]
+    twist_variance: tuple[float, float, float]
+    turn_noise: tuple[float, float]
+    way_noise: tuple[float, float]
+    p95_m: float
+    full_p95_m: float
 
 
 class Odometry(NamedTuple):
@@ -104,20 +146,23 @@ class Odometry(NamedTuple):
     heading_rad: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Calibration:
     """What goes into the robot, and what error it gives.
 
     Attributes
     ----------
-    robot : name (or None), track_width_m, wheel_radius_m (or None)
+    robot : name (or None), track_width_m, wheel_radius_m (or None), left_scale, right_scale as configured
     fitted : the recommended model; others : every model, by name
     gyro : the recommended model with a gyro, None where a log has none
     typical : curvature and speed at which ICRs and multiplier are stated
     why : reason for the recommendation
     logs : what it was fitted to
     held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
+    controller : errors of what a controller can express; None where the drive is too short to measure them
+    warnings : what to know before use
     created : date and time, UTC, ISO 8601
+    name : stem of its file; empty for one just made
     """
 
     robot: Mapping[str, Any]
@@ -128,8 +173,11 @@ class Calibration:
     why: str
     logs: tuple[CalibrationLog, ...]
     held_out: tuple[HeldOutScore, ...]
+    controller: ControllerErrors | None
+    warnings: tuple[str, ...]
     created: str
     tool_version: str
+    name: str = field(default="", compare=False)
 
     @property
     def recommended(self) -> str:
@@ -144,6 +192,24 @@ class Calibration:
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs, multipliers and radius factors of the recommended model, and their covariance (7, 7)."""
         return self.fitted.geometry(self.width_m, self.typical)
+
+    def controller_numbers(self) -> ControllerNumbers:
+        """Return multiplier and radius factors of the recommended model for a controller."""
+        geometry, covariance = self.geometry()
+        std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        left, right = float(self.robot.get("left_scale", 1.0)), float(self.robot.get("right_scale", 1.0))
+        return ControllerNumbers(
+            geometry.multiplier, std["multiplier"],
+            left * geometry.radius_left, left * std["radius_left"],
+            right * geometry.radius_right, right * std["radius_right"],
+        )  # fmt: skip
+
+    def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
+        """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks; NaN without."""
+        rows = [one for one in self.held_out if one.model == model and one.horizon_m == horizon_m]
+        if not rows:
+            return float("nan"), float("nan")
+        return float(np.median([one.p95_m for one in rows])), float(np.median([one.expected_m for one in rows]))
 
     def twist(self, v_left: Floats | float, v_right: Floats | float) -> Floats:
         """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n).
@@ -175,14 +241,39 @@ class Calibration:
         place = np.concatenate([[0.0], np.cumsum(moved)])
         return Odometry(wheels.stamp_ns, place.real, place.imag, heading)
 
-    def warm_start(self) -> tuple[Floats, Floats]:
-        """Return y_icr_right, y_icr_left, x_icr [m] (3,) and their covariance (3, 3), for a filter to begin with."""
+    def warm_start(self) -> WarmStart:
+        """Return ICRs and their covariance for a filter to begin with."""
         geometry, covariance = self.geometry()
-        return np.array(geometry[:3]), covariance[:3, :3]
+        return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m)
 
     def fitted_to(self, sha256: str) -> bool:
         """Return whether a log was among those the calibration was fitted to."""
         return bool(sha256) and any(log.sha256 == sha256 for log in self.logs)
+
+    def write(self, path: str | Path) -> Path:
+        """Write the calibration file, whole or not at all; into `path` where that is a folder.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        OutputError
+            Something that is not a calibration is there, or it cannot be written.
+        """
+        file: Path = call_output("calibration_file", "write_calibration", self.summary(), Path(path))
+        return file
+
+    def __repr__(self) -> str:
+        numbers = self.controller_numbers()
+        logs = "1 log" if len(self.logs) == 1 else f"{len(self.logs)} logs"
+        p95, _ = self.held_out_m("recommended", 10.0)
+        return (
+            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, multiplier "
+            f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, 95 % within {p95:.2f} m after 10 m, held out>"
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for the calibration file."""
@@ -205,6 +296,10 @@ class Calibration:
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
+            "controller": None
+            if self.controller is None
+            else plain(self.controller_numbers()._asdict() | self.controller._asdict()),
+            "warnings": list(self.warnings),
         }
 
 
@@ -243,9 +338,24 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
         why=str(document["why"]),
         logs=tuple(CalibrationLog(**log) for log in document["logs"]),
         held_out=tuple(HeldOutScore(**score) for score in document["held_out"]),
+        controller=_controller_errors(document["controller"]),
+        warnings=tuple(str(warning) for warning in document["warnings"]),
         created=str(document["created"]),
         tool_version=str(document["tool_version"]),
     )
+
+
+def _controller_errors(document: Mapping[str, Any] | None) -> ControllerErrors | None:
+    if document is None:
+        return None
+    pose, twisted, turn, way = (
+        tuple(map(float, document[name])) for name in ("pose_variance", "twist_variance", "turn_noise", "way_noise")
+    )
+    p95, full = (float("nan") if document[name] is None else float(document[name]) for name in ("p95_m", "full_p95_m"))
+    return ControllerErrors(
+        (pose[0], pose[1], pose[2]), (twisted[0], twisted[1], twisted[2]), (turn[0], turn[1]), (way[0], way[1]),
+        p95, full,
+    )  # fmt: skip
 
 
 def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:

@@ -1,4 +1,4 @@
-"""Words to calls: one file a command; the only room with click, and the one error boundary."""
+"""The command line: one file per command; the only package that uses click, and the only error boundary."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def main() -> None:
                 sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
                 status = status or 1
     except KeyboardInterrupt:
-        # While modules are imported, or a last word is said.
+        # During imports, or while a last message is printed.
         status = INTERRUPTED
     sys.exit(status)
 

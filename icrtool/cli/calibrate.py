@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from icrtool.calibration.findings import Calibration as Findings
     from icrtool.calibration.pooled import CalibrationResult
     from icrtool.config import Config
-    from icrtool.motion.recording import Recording
+    from icrtool.records.run import Run
     from icrtool.records.tables import RobotLog
 
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     "--x-icr",
     metavar="METRES",
     type=float,
-    help="Where the ICRs are known to lie, forward: gives the antenna's place. One log.",
+    help="Known forward position of the ICRs; gives the antenna's position. One log.",
 )
 @click.option(
     "--plot",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Draw the misses before and after: png, svg, pdf. One log.",
+    help="Draw the residuals before and after the calibration: png, svg, pdf. One log.",
 )
 @options.configuration
 @options.verbosity
@@ -87,17 +87,9 @@ def command(
         click.echo("\n\n".join(texts))
 
 
-class _Source(NamedTuple):
-    """A log or run ready to be calibrated from."""
-
-    recording: Recording
-    robot: str | None
-    wheel_radius_m: float | None
-
-
 def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> CalibrationResult:
     """Fit and test the motion models on all sources."""
-    from icrtool.calibration.pooled import calibrate
+    from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
@@ -108,31 +100,24 @@ def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> Calibr
     with options.progress_bar("reading", quiet=quiet) as progress:
         found = []
         for i, source in enumerate(sources):
-            found.append(_source(source, config))
+            found.append(_run(source, config))
             if progress is not None:
                 progress((i + 1) / len(sources))
-    if len(radii := {one.wheel_radius_m for one in found}) > 1:
-        why = f"{' and '.join(sorted(map(str, radii)))} in the logs given"
-        raise ConfigError("robot.wheel_radius_m", why, "fit them with one radius: parameters refer to it")
-    return calibrate([one.recording for one in found], found[0].robot, found[0].wheel_radius_m)
+    return calibrate_runs(found)
 
 
-def _source(source: Path, config: Config) -> _Source:
+def _run(source: Path, config: Config) -> Run:
     """Read a run, or fit a log."""
-    from icrtool.calibration.pooled import gyro_recording_of
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
         from icrtool.output.stored_run import open_run
 
-        run = open_run(source)
-    else:
-        from icrtool.estimation.fit import fit
-        from icrtool.logs import read_log
+        return open_run(source)
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
 
-        run = fit(read_log(source, config), config)
-    robot = run.config.robot
-    return _Source(gyro_recording_of(run), robot.name, robot.wheel_radius_m)
+    return fit(read_log(source, config), config)
 
 
 def _findings(source: Path, config: Config, x_icr: float | None, *, quiet: bool, verbose: bool) -> Findings:

@@ -10,13 +10,14 @@ from icrtool import __version__
 
 _COMMANDS = {
     "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
-    "calibrate": "Estimate antenna, heading offset, delays, wheel scales and ICRs from one log, each with its doubt.",
-    "export": "Print a run's calibration for a robot's controller or filter.",
+    "calibrate": "Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.",
+    "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
+    "export": "Print the calibration of a run or of a file for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",
-    "dropout-report": "Say how far a robot can go blind, over 1 to 20 m from every recorded state.",
-    "info": "Say what logs hold, which topics would be used, and what is wrong with them.",
+    "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
+    "info": "List what logs hold, which topics would be used, and the problems found.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
-    "study": "Simulate and filter many drives: how well, how soon, how surely are the ICRs learned?",
+    "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
 
 
@@ -41,7 +42,7 @@ class _Commands(click.Group):
 @click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="icrtool")
 def icrtool() -> None:
-    """Learn the track ICRs of a skid-steer robot from its field logs, and say how far it can go blind.
+    """Learn the track ICRs of a skid-steer robot from its field logs, and how far it can drive without GNSS.
 
     A log is an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a bare .db3. Results go to standard output,
     warnings and errors to standard error. Exit status: 0 done, 1 the log, configuration or request cannot be used,

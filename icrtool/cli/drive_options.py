@@ -1,4 +1,4 @@
-"""What tells a drive and its sensors on a command line: paths, readers of values, and --change."""
+"""Options for a simulated drive and its sensors: paths, parsers of values, and --change."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def gnss_text(text: str) -> float:
 
 def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) -> None:
     """Refuse a change of the ICRs that a drive is too short for."""
-    late = next((time for time, _ in changes if time >= duration_s), None)
-    if late is not None:
-        why = f"no change at {late:g} s: the drive lasts {duration_s:g} s"
+    unreached = next((time for time, _ in changes if time >= duration_s), None)
+    if unreached is not None:
+        why = f"no change at {unreached:g} s: the drive lasts {duration_s:g} s"
         raise click.BadParameter(why, param_hint="--change")
 
 

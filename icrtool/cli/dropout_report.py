@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -15,6 +15,7 @@ from icrtool.cli.fit import RUNS, plot_formats, run_directories
 from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.output.exports.acceptance import Outcome
@@ -27,12 +28,12 @@ EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is asked of every run.
+    """The options, the same for every run.
 
     Attributes
     ----------
     horizons_m, outage_s : empty: those of the run's configuration
-    config : what the options say; logs are fitted with it
+    config : that of the options; logs are fitted with it
     """
 
     config: Config
@@ -40,7 +41,9 @@ class Request:
     outage_s: tuple[float, ...]
     outage_at_s: tuple[float, ...]
     budgets_m: tuple[float, ...]
+    calibrations: tuple[Calibration, ...]
     gates: tuple[Gate, ...]
+    starts: Literal["moving", "all"]
     trials: bool
     seed: int
     formats: tuple[str, ...]
@@ -61,6 +64,8 @@ class Request:
 @click.option(
     "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
 )
+@click.option("--calibration", "calibrations", metavar="CAL.json", type=click.Path(path_type=Path), multiple=True,
+              help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
 @click.option("--outage", "outages", metavar="SECONDS", type=POSITIVE, multiple=True,
               help="Force outages of this length on the filter; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
@@ -69,6 +74,8 @@ class Request:
               help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+@click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
+              help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -80,11 +87,12 @@ class Request:
 @options.verbosity
 def command(
     sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
-    gates: tuple[str, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, trials: bool, junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
+    ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
+    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Report how far a robot can go without GNSS: open loop from every recorded state, over 1 to 20 m.
+    """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
 
     RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
     icrtool-runs/. The report is written into the run directory, as dropout/.
@@ -93,17 +101,20 @@ def command(
     Example:
       icrtool dropout-report
       icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
+      icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
     formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.output.calibration_file import open_calibration
     from icrtool.records.dropout import DEFAULT_SEED
 
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
-        gates=tuple(parse_gate(text) for text in gates), trials=trials,
+        calibrations=tuple(open_calibration(file) for file in calibrations),
+        gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
         smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
     )  # fmt: skip
@@ -138,7 +149,7 @@ def plan_sources(
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
-    Whatever can be refused at once is refused here, before any work.
+    Everything that can be refused without reading a log is refused here.
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
@@ -275,8 +286,10 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             horizons_m=horizons,
             budgets_m=request.budgets_m,
             gates=request.gates,
+            calibrations=request.calibrations,
             outage_s=outages,
             outage_at_s=request.outage_at_s,
+            starts=request.starts,
             comparison=request.ladder,
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,

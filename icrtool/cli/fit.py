@@ -47,9 +47,9 @@ class FitRequest(NamedTuple):
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
 @click.option(
     "--warm-start",
-    metavar="RUN",
+    metavar="RUN|CAL.json",
     type=click.Path(path_type=Path),
-    help="Start from another run's final ICRs and covariance.",
+    help="Start from another run's final ICRs and covariance, or from those of a calibration.",
 )
 @click.option(
     "--terrain-change",
@@ -159,19 +159,29 @@ def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...
 
 
 def _beside(request: FitRequest) -> str:
-    """Return what else the options did."""
+    """Return a text about further options that had an effect."""
     done = [f"started from {request.warm_start}"] if request.warm_start is not None else []
     done += ["with the smoother's states"] if request.smooths else []
     return f" ({', '.join(done)})" if done else ""
 
 
+def _warm_start(source: Path) -> WarmStart:
+    """Return the ICRs that a run ended with, or those of a calibration file."""
+    if source.is_file():
+        from icrtool.output.calibration_file import open_calibration
+
+        return open_calibration(source).warm_start()
+    from icrtool.output.stored_run import open_run
+
+    return open_run(source).ended_with
+
+
 def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> None:
     from icrtool.output.run_directory import check_target, log_of_run, write_run
-    from icrtool.output.stored_run import open_run
 
     check_target(directory)
     before = log_of_run(directory)
-    start = open_run(request.warm_start).ended_with if request.warm_start is not None else None
+    start = _warm_start(request.warm_start) if request.warm_start is not None else None
     with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 

@@ -1,7 +1,7 @@
-"""Ctrl-C and a kill: they end a command in order, and wait while modules are loaded.
+"""Ctrl-C and SIGTERM: they end a command in order, and wait while modules are imported.
 
-An exception out of nowhere in the middle of an import can leave the import's lock held, for which other threads then
-wait for ever; in the middle of llvmlite's bookkeeping it is lost, or told as an error of llvmlite.
+An exception in the middle of an import can leave the import lock held, and other threads then wait for ever. In the
+middle of llvmlite's bookkeeping it is lost, or reported as an error of llvmlite.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import threading
 from types import CodeType, FrameType
 
 INTERRUPTED, TERMINATED = 130, 143
-"""What a shell says of a program that Ctrl-C or a kill ended: 128 and the number of the signal."""
+"""Exit status of a program that a signal ended: 128 plus the number of the signal."""
 
 LLVMLITE = f"{os.sep}llvmlite{os.sep}"
 
 AGAIN_S = 0.005
-"""How soon a signal that had to wait comes again."""
+"""A signal that had to wait is handled again after this time [s]."""
 
 
 def end_in_order(boundary: CodeType) -> None:
@@ -31,7 +31,7 @@ def end_in_order(boundary: CodeType) -> None:
     if threading.current_thread() is threading.main_thread():
         ending = _Ending(boundary)
         for number in (signal.SIGINT, signal.SIGTERM):
-            # What whoever started us has us ignore, as a shell does for a job in the background, stays ignored.
+            # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, ending.come)
         if hasattr(signal, "setitimer"):
@@ -59,7 +59,7 @@ class _Ending:
             self._end(self._waiting)
 
     def _loading(self, frame: FrameType | None) -> bool:
-        """Say whether the main thread is in the middle of an import, or in llvmlite."""
+        """Return whether the main thread is in the middle of an import, or in llvmlite."""
         while frame is not None and frame.f_code is not self._boundary:
             file = frame.f_code.co_filename
             if file.startswith("<frozen importlib.") or LLVMLITE in file:

@@ -1,4 +1,4 @@
-"""Options that commands share, and the few words they print alike."""
+"""Options and messages that several commands share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
-# Whether one can be read is told where it is read, in our words and with our exit status.
+# Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
 LOG = click.Path(path_type=Path, readable=False)
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
@@ -52,7 +52,7 @@ def cut(command: Command) -> Command:
 
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
-    command = click.option("-v", "--verbose", is_flag=True, help="Say more.")(command)
+    command = click.option("-v", "--verbose", is_flag=True, help="Print more details.")(command)
     return click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings.")(command)
 
 
@@ -71,7 +71,7 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
 
 
 def not_all_used(failed: int, of: int, what: str) -> IcrToolError:
-    """Return the error that sums up those of several inputs, each of which was told when it came."""
+    """Return an error with the number of inputs that could not be used; each was reported when it occurred."""
     from icrtool.errors import IcrToolError
 
     others = "the others were written" if failed < of else "see above"
@@ -110,7 +110,7 @@ def load_ahead(*modules: str) -> None:
 
     def load() -> None:
         for module in modules:
-            # Where it fails, it fails again where it is imported, and is told there.
+            # An import that fails here fails again where the module is used, and is reported there.
             with suppress(ImportError):
                 importlib.import_module(module)
 

@@ -15,7 +15,7 @@ from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.logs.writing.log import WriteOptions
-    from icrtool.simulation.drives import Drive, Icrs, Sensors
+    from icrtool.simulation.drives import DrivePlan, Icrs, Sensors
     from icrtool.simulation.record import TruthTable
 
 WHEEL_MESSAGES = ("joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped")
@@ -93,7 +93,7 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
     type=click.Choice(["encoder", "commanded"]),
     default="encoder",
     show_default=True,
-    help="What the wheel messages tell: counted travel, or what the motors are told.",
+    help="Content of the wheel messages: true travel, counted travel, or the motor commands.",
 )
 @click.option(
     "--wheel-messages",
@@ -147,10 +147,10 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
     metavar="FORWARD,RIGHT",
     type=place_text,
     default="0,0",
-    help="Where the antenna stands, from the body origin [m].",
+    help="Position of the antenna, from the body origin [m].",
 )
 @click.option(
-    "--gnss-delay", metavar="S", type=float, default=0.0, show_default=True, help="Fixes are stamped this much late."
+    "--gnss-delay", metavar="S", type=float, default=0.0, show_default=True, help="The stamps of the fixes lag by this."
 )
 @click.option(
     "--heading",
@@ -193,7 +193,7 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
     type=float,
     default=0.0,
     show_default=True,
-    help="Headings are stamped this much late.",
+    help="The stamps of the headings lag by this.",
 )
 @options.configuration
 @options.verbosity
@@ -204,7 +204,7 @@ def command(
     """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
-    is pentzer-tracked unless --robot, --config or --set robot.… say otherwise. LOG.truth.csv holds the true pose (about
+    is pentzer-tracked unless --robot, --config or --set robot.… name another. LOG.truth.csv holds the true pose (about
     latitude 40.7934, longitude -77.86), ICRs and track speeds at every wheel stamp.
 
     \b
@@ -231,7 +231,7 @@ def command(
 
 
 def simulated_robot(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> Config:
-    """Load the configuration; where nothing is said of a robot, it is the paper's."""
+    """Return the configuration; without any setting of a robot, it is the paper's."""
     config = options.load(config_file, robot, sets)
     if robot is None and config.robot.track_width_m is None and config.robot.wheel_radius_m is None:
         return options.load(config_file, DEFAULT_ROBOT, sets)
@@ -254,8 +254,8 @@ def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> f
     return value
 
 
-def _plan(config: Config, given: dict[str, Any]) -> Drive:
-    from icrtool.simulation.drives import Drive
+def _plan(config: Config, given: dict[str, Any]) -> DrivePlan:
+    from icrtool.simulation.drives import DrivePlan
     from icrtool.simulation.paths import PathPlan
 
     path: Any = PathPlan(given["kind"], given["speed"], given["radius"], given["leg"])
@@ -268,7 +268,7 @@ def _plan(config: Config, given: dict[str, Any]) -> Drive:
     duration = duration if duration is not None else 100.0
     check_changes(given["changes"], duration)
     rate = given["wheel_rate"] or COMMAND_RATE_HZ
-    return Drive(
+    return DrivePlan(
         icrs_m=given["icrs"] or default_icrs(config),
         changes=given["changes"],
         path=path,
@@ -330,14 +330,14 @@ def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str,
     )
 
 
-def _summary(config: Config, plan: Drive, truth: TruthTable, given: dict[str, Any]) -> str:
+def _summary(config: Config, plan: DrivePlan, truth: TruthTable, given: dict[str, Any]) -> str:
     import numpy as np
 
-    way = float(np.hypot(np.diff(truth.north_m), np.diff(truth.east_m)).sum())
+    distance_m = float(np.hypot(np.diff(truth.north_m), np.diff(truth.east_m)).sum())
     what = "track speeds as given" if given["speeds"] is not None else f"{given['kind']} path"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
-        f"drive  {what}, {way:.1f} m in {plan.duration_s:g} s, seed {given['seed']}",
+        f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {given['seed']}",
         f"ICRs   y right {plan.icrs_m[0]:+.3f}, y left {plan.icrs_m[1]:+.3f}, x {plan.icrs_m[2]:+.3f} m",
     ]
     lines += [

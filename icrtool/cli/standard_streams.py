@@ -1,4 +1,4 @@
-"""Standard output and error that may go away: what a command does is done to its end, whoever listens."""
+"""Standard output and error that may be closed: a command completes its work even if nobody reads its output."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, TextIO, cast
 
 
 class Stream:
-    """A standard stream that takes no for an answer: what cannot be written is dropped, and why is kept.
+    """A standard stream whose failures do not stop a command: text that cannot be written is dropped.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Stream:
     def _drop(self, err: OSError) -> None:
         if err.errno != errno.EPIPE:
             self.lost = err.strerror or str(err)
-        # What is still held back goes nowhere too, or the interpreter would come upon the same error when it ends.
+        # Buffered text is dropped, too: the interpreter would fail with the same error when it ends.
         with suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, cast(TextIO, self._stream).fileno())

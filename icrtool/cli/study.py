@@ -32,7 +32,7 @@ VARIES = {
     "rate": "rate",
     "turn-radius": "radius",
 }
-"""The option that a study varies itself; --values sets where."""
+"""The option that a study varies itself; --values sets its values."""
 
 
 def values_text(text: str) -> tuple[float, ...]:
@@ -97,18 +97,18 @@ def command(
     name: StudyName, output: Path | None, seed: int, plots: str,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool, **given: Any,
 ) -> None:  # fmt: skip
-    """Simulate and filter many drives, and say how well, how soon and how surely the ICRs are learned.
+    """Simulate and filter many drives, and report accuracy, convergence time and consistency of the ICRs.
 
     \b
     NAME is one of
-      convergence   Figs. 4, 5    how soon the ICRs converge, by kind of path
+      convergence   Figs. 4, 5    convergence time of the ICRs, by kind of path
       initial       Figs. 6, 7    which initial ICRs converge, without and with the sign guard
       icr-change    Figs. 8, 9    following a change of the ICRs, with and without covariance inflation
       turn-radius   Fig. 10       convergence after a change, by radius of the turn
       input-source  Fig. 11       encoders against commanded speeds
       input-noise   Fig. 12       ICR error by noise of the track speeds
       input-bias    Fig. 13       ICR error by bias of the track speeds
-      gnss          Figs. 35-37   ICR error and blind driving by noise of the GNSS
+      gnss          Figs. 35-37   ICR error and open-loop error by noise of the GNSS
       rate                        whether logs of any rate give the same ICRs
       consistency                 whether the filter's covariance is right
 
@@ -139,7 +139,7 @@ def command(
 
 
 def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyRequest:
-    """Return the study's defaults with what the options say put in."""
+    """Return the study's defaults, changed by the options."""
     from icrtool.simulation.studies import KINDS, default_request
 
     own = VARIES.get(name)
@@ -149,8 +149,13 @@ def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyReq
         raise click.UsageError(f"study {name} varies no number; it takes no --values")
     request = default_request(name, config)
     plan, path = request.plan, request.plan.path
-    told = {"kind": given["kind"], "speed_mps": given["speed"], "radius_m": given["radius"], "leg_m": given["leg"]}
-    plan = replace(plan, path=replace(path, **_given(told)))
+    values = {
+        "kind": given["kind"],
+        "speed_mps": given["speed"],
+        "radius_m": given["radius"],
+        "leg_m": given["leg"],
+    }
+    plan = replace(plan, path=replace(path, **_given(values)))
     if given["icrs"] is not None or config.robot.track_width_m is not None:
         plan = replace(plan, icrs_m=given["icrs"] or default_icrs(config))
     plan = replace(plan, **_given({"duration_s": given["duration"], "changes": given["changes"] or None}))
@@ -173,7 +178,7 @@ def _sensors(sensors: Sensors, config: Config, given: dict[str, Any]) -> Sensors
     counts = encoder_counts(config, given)
     metres = 2 * math.pi * radius / counts if radius is not None else sensors.metres_per_count
     heading_std = math.radians(given["heading_std"]) if given["heading_std"] is not None else None
-    told = {
+    values = {
         "wheels": given["wheels"],
         "wheel_rate_hz": given["rate"],
         "heading_rate_hz": given["rate"],
@@ -184,8 +189,8 @@ def _sensors(sensors: Sensors, config: Config, given: dict[str, Any]) -> Sensors
         "gnss_rate_hz": given["gnss_rate"],
         "heading_std_rad": heading_std,
     }
-    return replace(sensors, **_given(told))
+    return replace(sensors, **_given(values))
 
 
-def _given(told: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in told.items() if value is not None}
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if value is not None}

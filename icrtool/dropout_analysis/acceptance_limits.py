@@ -11,11 +11,12 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
+from icrtool.kernels.trials import Summary
 from icrtool.records.dropout import BudgetDistance, Gate, Verdict
 from icrtool.records.tables import Floats
 
 _FORM = re.compile(
-    r"^\s*(?P<model>\w+)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
+    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
     r"(?P<relation><=|>=|<|>)\s*(?P<bound>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*m?\s*$"
 )
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
@@ -33,8 +34,17 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
     """
     if not (math.isfinite(budget_m) and budget_m > 0):
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
-    reached = ((result, _budget_distance(report.horizons_m, result.summary.p95, budget_m)) for result in report.results)
-    return tuple(BudgetDistance(result.name, result.label, budget_m, *found) for result, found in reached if found)
+    found = []
+    for result in report.results:
+        reached = _budget_distance(report.horizons_m, result.summary.p95, budget_m)
+        if reached is not None:
+            ends = (
+                _budget_distance(report.horizons_m, p95, budget_m)
+                for p95 in (result.intervals.p95_high, result.intervals.p95_low)
+            )
+            low, high = (end[0] if end is not None else math.nan for end in ends)
+            found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high))
+    return tuple(found)
 
 
 def parse_gate(text: str) -> Gate:
@@ -65,14 +75,23 @@ def check_gate(gate: Gate, report: DropoutReport) -> Verdict:
     """
     result = report.result(gate.model)
     if result is None:
-        known = ", ".join(one.name for one in report.results)
+        table = report.comparison
+        rungs = {rung.name: rung.summary for rung in table.rungs} if table is not None else {}
+        if table is not None and gate.model in rungs:
+            return _verdict(gate, rungs[gate.model], np.array(table.horizons_m))
+        known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *rungs]))
         advice = f"this run has {known}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
-    places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m))
+    return _verdict(gate, result.summary, report.horizons_m)
+
+
+def _verdict(gate: Gate, summary: Summary, horizons_m: Floats) -> Verdict:
+    places = np.flatnonzero(np.isclose(horizons_m, gate.horizon_m))
     if not len(places):
-        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", "add it to dropout.horizons_m")
+        known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
+        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m for {gate.model}", f"use {known}")
     column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
-    value = float(getattr(result.summary, column)[places[0]])
+    value = float(getattr(summary, column)[places[0]])
     margin = gate.bound_m - value if gate.relation.startswith("<") else value - gate.bound_m
     return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m))
 

@@ -7,18 +7,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from icrtool.calibration.model_comparison import Ladder, judge_ladder
+from icrtool.calibration.model_comparison import Comparison, compare_models
+from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
-from icrtool.dropout_analysis.trials import ErrorSink, ReportWatch, configured_horizons_m, dropout
+from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, ReportWatch, configured_horizons_m, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage
+from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
 from icrtool.records.run import Run
 
 
@@ -30,6 +33,8 @@ def dropout_report(
     gates: Sequence[str | Gate] = (),
     outage_s: Sequence[float] | None = None,
     outage_at_s: Sequence[float] = (),
+    starts: Starts = "moving",
+    calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
     seed: int = DEFAULT_SEED,
@@ -46,7 +51,10 @@ def dropout_report(
     gates : acceptance limits, for example ``"icr.p95@10m <= 3.8"``
     outage_s : lengths of outages to force on the filter; default those of the run's configuration
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
-    comparison : also compare all models on distance they were not fitted to
+    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
+    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
+        ``calibration:STEM`` of its file where there are several
+    comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
     reference : what trials are compared with: the filter's states or the smoother's
     seed : of the bootstrap
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
@@ -55,7 +63,7 @@ def dropout_report(
     Raises
     ------
     ConfigError
-        A gate, horizon, budget or outage that cannot be met.
+        A gate, horizon, budget or outage that cannot be met, or a calibration of another robot.
     DataError
         The run has fewer than two states.
     RunError
@@ -65,26 +73,32 @@ def dropout_report(
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     # Single trials come first: whoever watches can draw them while the many are driven.
-    examples, worst = example_trials(compared), worst_trials(compared)
+    examples, worst = example_trials(compared), worst_trials(compared, starts=starts)
     outages = (*forced, *real_outages(compared))
+    used, further = _calibration_rows(compared, calibrations)
+    found, why = _compare(compared, run) if comparison else (None, "")
+    if found is not None:
+        further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 
     def with_single(report: DropoutReport) -> DropoutReport:
         smoothed = reference == "smoothed"
-        return replace(report, smoothed=smoothed, examples=examples, worst=worst, outages=outages)
+        expected = tuple(model.name for model in further)
+        return replace(
+            report, smoothed=smoothed, examples=examples, worst=worst, outages=outages, expected=expected
+        )  # fmt: skip
 
     def grown(report: DropoutReport) -> None:
         if watch is not None:
             watch(with_single(report))
 
     horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
-    report = with_single(dropout(compared, horizons, seed=seed, sink=sink, watch=grown))
-    table, why = _compare(compared, run) if comparison else (None, "")
+    report = with_single(dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink, watch=grown))
+    report = replace(report, comparison=found.table if found is not None else None, calibrations=used)
     return replace(
         report,
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report) for gate in limits),
-        by_turning=split_by_turning(compared),
-        comparison=table,
+        by_turning=split_by_turning(compared, starts=starts),
         no_comparison=why,
     )
 
@@ -111,9 +125,28 @@ def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]
     return horizons
 
 
-def _compare(compared: Run, run: Run) -> tuple[Ladder | None, str]:
+def _calibration_rows(
+    run: Run, calibrations: Sequence[Calibration]
+) -> tuple[tuple[UsedCalibration, ...], list[ConstantModel]]:
+    """Return what is known of each calibration, and the model of its row."""
+    used, models = [], []
+    recording = recording_of(run) if calibrations else None
+    for number, one in enumerate(calibrations, start=1):
+        stem = one.name or str(number)
+        if sum(other.name == one.name for other in calibrations) > 1:
+            stem = f"{stem}-{number}" if one.name else stem
+        name = "calibration" if len(calibrations) == 1 else f"calibration:{stem}"
+        label = "calibration" if len(calibrations) == 1 else stem
+        if recording is not None:
+            models.append(ConstantModel(name, label, predictor(one, recording)))
+            seen = one.fitted_to(recording.sha256)
+            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created))
+    return tuple(used), models
+
+
+def _compare(compared: Run, run: Run) -> tuple[Comparison | None, str]:
     """Compare the models of a run; where that cannot be, None and why."""
     try:
-        return judge_ladder(compared, measured_headings(run)), ""
+        return compare_models(compared, measured_headings(run)), ""
     except DataError as err:
         return None, f"{err.why}, {err.advice}"

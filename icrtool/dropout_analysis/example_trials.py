@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
@@ -22,17 +23,21 @@ TYPICAL_OF = 30
 PICTURED = ("icr", "no_slip")
 
 
-def worst_trials(run: Run, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT) -> tuple[ExampleTrial, ...]:
+def worst_trials(
+    run: Run, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *, starts: Starts = "moving"
+) -> tuple[ExampleTrial, ...]:
     """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
+    if starts == "moving":
+        leave_out_standing(ends, standing_states(drive))
     errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
-    ends, starts = ends[:, 0], np.arange(len(errors))
+    ends, states = ends[:, 0], np.arange(len(errors))
     left = np.nan_to_num(errors, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
         chosen.append(worst)
-        left[(starts <= ends[worst]) & (ends >= worst)] = -1.0
+        left[(states <= ends[worst]) & (ends >= worst)] = -1.0
     return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 
@@ -49,7 +54,7 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
     starts = np.flatnonzero(ends >= 0)
     # A parked start repeats the same path many times: the last state of each stop stands for it.
-    moving = starts[np.append(np.diff(drive.distance) > 0, False)[starts]]
+    moving = starts[~standing_states(drive)[starts]]
     if not len(moving):
         return ()
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])

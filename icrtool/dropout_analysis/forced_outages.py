@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from icrtool.dropout_analysis.trials import STANDING_MPS
+from icrtool.dropout_analysis.starts import standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.ekf import run_filter
 from icrtool.records.dropout import Outage
-from icrtool.records.run import Run
+from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Bools, Floats
 
 LONGEST_SHARE = 0.5
@@ -123,7 +123,7 @@ def _spaced(run: Run, length_s: float) -> list[float]:
     Time from which an outage would reach into one of the log's own is none to begin in.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
-    moves = np.diff(run.table.distance_m) >= STANDING_MPS * np.diff(t)
+    moves = ~standing_states(drive_of(run))[:-1]
     moves &= ~_in_real_outage(run, t[:-1], length_s)
     moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
     before = float(np.interp(min(run.settled_s, last / 4), t, moved))

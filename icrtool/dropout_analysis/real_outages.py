@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from icrtool.kernels.filter_records import RECOVERED, USED
 from icrtool.kernels.open_loop import open_loop_path
+from icrtool.kernels.trials import OpenLoopPath
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, drive_of
+from icrtool.records.tables import Ints
+
+COMPARED_S = 1.0
+"""Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""
 
 
 def real_outages(run: Run) -> tuple[Outage, ...]:
-    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix, missed at the next one.
+    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix before.
 
-    One that never ends, and one with a gap in the wheel data, has no miss and is left out; so has one that the drive
-    begins with: neither place nor ICRs were known before it.
+    The end error is the distance to the fixes that ended the outage, not to the filter: a filter that drove on with its
+    wheels is as wrong as the open-loop path. An outage that never ends, and one with a gap in the wheel data, has no
+    end error and is left out; so is one that the drive begins with: neither position nor ICRs were known before it.
     """
     drive, table = drive_of(run), run.table
     origin = int(table.stamp_ns[0])
@@ -23,18 +30,35 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         if first == 0 or last >= len(table) or last <= first or run.in_gap[first:last].any():
             continue
         right, left, x = (float(column[first]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-        path = open_loop_path(drive, right, left, x, first, last)
-        miss = float(np.hypot(path.north[-1] - table.north_m[last], path.east[-1] - table.east_m[last]))
+        after = int(np.searchsorted(table.stamp_ns, end + round(COMPARED_S * 1e9)))
+        gaps = np.flatnonzero(run.in_gap[last:after])
+        after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
+        path = open_loop_path(drive, right, left, x, first, after)
+        error = _end_error_m(run, path, table.stamp_ns[first : after + 1], int(end))
+        inside = slice(last - first + 1)
         outages.append(
             Outage(
                 kind="real",
                 begin_s=(int(begin) - origin) / 1e9,
                 end_s=(int(end) - origin) / 1e9,
                 distance_m=float(table.distance_m[last] - table.distance_m[first]),
-                end_error_m=miss,
-                max_error_m=miss,
-                north_m=path.north,
-                east_m=path.east,
+                end_error_m=error,
+                max_error_m=error,
+                north_m=path.north[inside],
+                east_m=path.east[inside],
             )
         )
     return tuple(outages)
+
+
+def _end_error_m(run: Run, path: OpenLoopPath, stamp_ns: Ints, end_ns: int) -> float:
+    """Return how far the antenna on a path, with its stamps (m,), is from the used fixes since the outage's end."""
+    fixes, code = run.sensors.fixes, run.gnss.code
+    used = (code == USED) | (code == RECOVERED)
+    rows = np.flatnonzero(used & (fixes.stamp_ns >= end_ns) & (fixes.stamp_ns <= max(end_ns, int(stamp_ns[-1]))))
+    forward, right = run.sensors.antenna_m
+    cos, sin = np.cos(path.heading), np.sin(path.heading)
+    at, of = (fixes.stamp_ns[rows] - stamp_ns[0]) / 1e9, (stamp_ns - stamp_ns[0]) / 1e9
+    north = np.interp(at, of, path.north + forward * cos - right * sin) - fixes.north_m[rows]
+    east = np.interp(at, of, path.east + forward * sin + right * cos) - fixes.east_m[rows]
+    return float(np.hypot(north.mean(), east.mean()))

@@ -10,12 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from icrtool.kernels.trials import TrialCounts
-from icrtool.records.dropout import BudgetDistance, ExampleTrial, ModelResult, Outage, TurningSplit, Verdict
+from icrtool.records.dropout import (
+    BudgetDistance,
+    ExampleTrial,
+    LearnedSplit,
+    ModelResult,
+    Outage,
+    ReferenceErrors,
+    TurningSplit,
+    UsedCalibration,
+    Verdict,
+)
 from icrtool.records.late_output import call_output
 from icrtool.records.tables import Floats, Ints
 
@@ -23,6 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from icrtool.calibration.model_comparison import Ladder
+    from icrtool.calibration.record import Calibration
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -36,11 +47,14 @@ class DropoutReport:
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts that were none, by horizon; the same for every model
-    states : recorded states, each a start
-    standing : of them, those at which the robot stood: their trials are near copies of one another
+    states : recorded states
+    standing : of them, those after which the robot stood: their trials are near copies of one another
     seed : of the bootstrap
     run_summary : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
+    starts : ``moving``: each standstill is one start; ``all``: every state is one
+    reference_error : what a perfect model would show, None until the trials are driven
+    by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
     smoothed : the reference is the smoother's trajectory, not the filter's
     budgets : by budget and model
@@ -49,7 +63,9 @@ class DropoutReport:
     examples : a cornering and a straight trial; empty where no trial is that long
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
-    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` says why
+    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
+    calibrations : those with a row of their own
+    expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
 
     name: str
@@ -63,6 +79,9 @@ class DropoutReport:
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
+    starts: Literal["moving", "all"] = "moving"
+    reference_error: ReferenceErrors | None = None
+    by_learning: LearnedSplit | None = None
     smoothed: bool = False
     budgets: tuple[BudgetDistance, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
@@ -72,6 +91,13 @@ class DropoutReport:
     by_turning: tuple[TurningSplit, ...] = ()
     comparison: Ladder | None = None
     no_comparison: str = ""
+    calibrations: tuple[UsedCalibration, ...] = ()
+    expected: tuple[str, ...] = ()
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration of this run alone, which `recommended` stands for; None where it was left out."""
+        return self.comparison.calibration if self.comparison is not None else None
 
     @property
     def passed(self) -> bool:

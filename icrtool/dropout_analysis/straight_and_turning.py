@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
@@ -23,17 +24,21 @@ CELLS = 20
 SPLIT_MODELS = ("icr", "no_slip")
 
 
-def split_by_turning(run: Run, horizon_m: float = SPLIT_HORIZON_M) -> tuple[TurningSplit, ...]:
+def split_by_turning(
+    run: Run, horizon_m: float = SPLIT_HORIZON_M, *, starts: Starts = "moving"
+) -> tuple[TurningSplit, ...]:
     """Return the errors of straight and turning trials of one horizon (Pentzer 2014, Section 6.4, Figs. 33-34).
 
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
-    starts = np.flatnonzero(ends[:, 0] >= 0)
-    straight = heading_range(drive, horizon_m)[starts] < STRAIGHT_RAD
+    if starts == "moving":
+        leave_out_standing(ends, standing_states(drive))
+    tried = np.flatnonzero(ends[:, 0] >= 0)
+    straight = heading_range(drive, horizon_m)[tried] < STRAIGHT_RAD
     errors = {
-        model.name: open_loop_errors(drive, model.icrs, ends)[starts, 0]
+        model.name: open_loop_errors(drive, model.icrs, ends)[tried, 0]
         for model in models_of(run)
         if model.name in SPLIT_MODELS
     }
@@ -49,7 +54,9 @@ def split_by_turning(run: Run, horizon_m: float = SPLIT_HORIZON_M) -> tuple[Turn
 def heading_range(drive: Drive, horizon_m: float) -> Floats:
     """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
     size = horizon_m / CELLS
-    cell = ((drive.distance - drive.distance[0]) / size).astype(np.int64)
+    # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
+    steps = np.diff(np.floor((drive.distance - drive.distance[0]) / size), prepend=0.0)
+    cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
     first = np.flatnonzero(np.diff(cell, prepend=-1))
     cells = np.arange(cell[-1] + CELLS + 1)
     # In a cell without a state the heading lies between those around it.

@@ -1,16 +1,18 @@
-"""GPS-dropout analysis: open loop from every recorded state, over every horizon (Pentzer 2014, Section 6.4)."""
+"""GPS-dropout analysis: open loop from recorded states, over every horizon (Pentzer 2014, Section 6.4)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.dropout_analysis.reference_error import reference_error
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.error_statistics import (
     Blocks,
@@ -19,14 +21,16 @@ from icrtool.kernels.error_statistics import (
     histogram_sorted,
     round_bin_width,
     sort_trials,
+    summarise,
     summarise_sorted,
 )
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.records.dropout import DEFAULT_SEED, ModelResult
+from icrtool.motion.trials import Trials
+from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.run import Run, drive_of, straight_drive
-from icrtool.records.tables import Floats
+from icrtool.records.tables import Bools, Floats
 
 BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95
@@ -37,9 +41,6 @@ LARGEST_TABLE_BYTES = 96 << 20
 
 BYTES_A_TRIAL = 12
 """An error, and where its trial ends."""
-
-STANDING_MPS = 0.01
-"""Slower than this the robot stands."""
 
 BULK_IN_P95 = 3.0
 MOST_BULKS = 10.0
@@ -56,11 +57,19 @@ THREADS = 2
 
 
 class Model(NamedTuple):
-    """A way to predict motion from wheel speeds: ICRs per start, or one triple."""
+    """What predicts motion from wheel speeds: ICRs per start, or one triple."""
 
     name: str
     label: str
     icrs: FrozenIcrs
+
+
+class ConstantModel(NamedTuple):
+    """A model of constant parameters, by the errors (k, h) [m] that it has in trials; NaN where it has none."""
+
+    name: str
+    label: str
+    errors_of: Callable[[Trials], Floats]
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
@@ -74,18 +83,22 @@ def dropout(
     run: Run,
     horizons_m: Sequence[float] | None = None,
     *,
+    starts: Starts = "moving",
     models: Sequence[Model] | None = None,
+    further: Sequence[ConstantModel] = (),
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     watch: ReportWatch | None = None,
 ) -> DropoutReport:
-    """Return how far off the robot is after driving without GNSS, from every recorded state.
+    """Return how far off the robot is after driving without GNSS.
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
+    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
+    further : models of constant parameters, beside those
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
     watch : called with the report as it grows: before the first model, without any result, and after each
@@ -103,31 +116,39 @@ def dropout(
     -----
     ICRs are frozen at the start, wheel speeds alone drive on, the error is the horizontal distance to the filter's
     estimate where the path has grown by the horizon. A start with less path left, a path across a gap in the wheel data
-    and an end inside a real GNSS outage are no trials; they are counted. Overlapping trials are not independent: the
-    intervals come from a moving-block bootstrap with blocks of the horizon's length.
+    and an end inside a real GNSS outage are no trials; they are counted. So are the states of a standstill but its
+    last: their trials are copies of one another, and a parked robot would set the result. Overlapping trials are not
+    independent: the intervals come from a moving-block bootstrap with blocks of the horizon's length.
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
     drive = drive_of(run)
-    models = models if models is not None else models_of(run)
-    standing = int(np.count_nonzero(np.diff(drive.distance) < STANDING_MPS * drive.dt_s[:-1]))
+    predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
+    standing, learned = standing_states(drive), first_learned(run)
+    left_out = standing if starts == "moving" else np.zeros_like(standing)
     groups = _groups(len(horizons), len(run.table))
     counts: list[TrialCounts] = []
-    parts: dict[str, list[ModelResult]] = {model.name: [] for model in models}
-    if len(parts) < len(models):
+    reference: list[ReferenceErrors] = []
+    before: list[Summary] = []
+    after: list[Summary] = []
+    parts: dict[str, list[ModelResult]] = {model.name: [] for model in predictors}
+    if len(parts) < len(predictors):
         raise ValueError("two models have the same name")
 
-    none = TrialCounts(*np.zeros((4, len(horizons)), np.int64))
+    none = TrialCounts(*np.zeros((5, len(horizons)), np.int64))
 
     def done() -> DropoutReport:
         return DropoutReport(
             name=run.name,
             horizons_m=horizons,
             results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
-            counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))) if counts else none,
+            counts=TrialCounts(*_columns(counts)) if counts else none,
             states=len(run.table),
-            standing=standing,
+            standing=int(np.count_nonzero(standing)),
+            starts=starts,
+            reference_error=ReferenceErrors(*_columns(reference)) if len(reference) == len(groups) else None,
+            by_learning=_learned_split(run, learned, before, after) if len(before) == len(groups) else None,
             seed=seed,
             run_summary=run.summary,
             run_directory=run.directory,
@@ -139,14 +160,21 @@ def dropout(
         watch(done())
     with ThreadPoolExecutor(THREADS) as pool:
         for group in groups:
-            ends, count = _ends(drive, horizons[group], pool)
+            ends, count = _ends(drive, horizons[group], left_out, pool)
             blocks = _blocks(drive, horizons[group], ends, pool)
             counts.append(count)
-            for model in models:
-                errors = _errors(drive, model.icrs, ends, pool)
+            reference.append(reference_error(run, drive, ends, seed))
+            for model in predictors:
+                errors = _errors(drive, model, ends, pool)
+                tested = blocks
+                if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
+                    tested = _blocks(drive, horizons[group], np.where(np.isfinite(errors.T), ends, -1), pool)
                 if sink is not None:
                     sink(model.name, horizons[group], errors)
-                parts[model.name].append(_summarise(model, errors, blocks, seed, pool))
+                parts[model.name].append(_summarise(model, errors, tested, seed, pool))
+                if model.name == "icr":
+                    before.append(summarise(errors[:learned]))
+                    after.append(summarise(errors[learned:] if learned is not None else errors[:0]))
                 if watch is not None and group is groups[-1]:
                     watch(done())
     return done()
@@ -204,7 +232,7 @@ def _groups(horizons: int, states: int) -> list[slice]:
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
+def _ends(drive: Drive, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
     """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
     states = len(drive.distance)
     ends = np.empty((len(horizons), states), np.int32)
@@ -212,11 +240,28 @@ def _ends(drive: Drive, horizons: Floats, pool: Executor) -> tuple[NDArray[np.in
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_A_CALL, states)
         found = trial_ends(drive, horizons, lo, hi)
+        leave_out_standing(found, left_out[lo:hi])
         ends[:, lo:hi] = found.T
         return count_trials(found)
 
     counts = pool.map(fill, range(0, states, STARTS_A_CALL))
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
+
+
+def _columns(parts: Iterable[tuple[NDArray[np.generic], ...]]) -> Iterator[Any]:
+    """Join the columns of records that hold some horizons each."""
+    return (np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _learned_split(run: Run, learned: int | None, before: list[Summary], after: list[Summary]) -> LearnedSplit:
+    """Return the trials before and after the state at which the ICRs were learned."""
+    table = run.table
+    return LearnedSplit(
+        learned_s=float(table.t_s[learned]) if learned is not None else None,
+        distance_m=float(table.distance_m[learned]) if learned is not None else None,
+        before=Summary(*_columns(before)),
+        after=Summary(*_columns(after)),
+    )
 
 
 def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Executor) -> list[Blocks | None]:
@@ -228,10 +273,13 @@ def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Execu
     return list(pool.map(cut, range(len(horizons))))
 
 
-def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states = ends.shape[1]
-    errors = np.empty(ends.shape)
+    if isinstance(model, ConstantModel):
+        found = model.errors_of(Trials(np.arange(states), ends.T.astype(np.int64)))
+        return np.ascontiguousarray(found.T).T
+    errors, icrs = np.empty(ends.shape), model.icrs
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_A_CALL, states)
@@ -241,7 +289,9 @@ def _errors(drive: Drive, icrs: FrozenIcrs, ends: NDArray[np.int32], pool: Execu
     return errors.T
 
 
-def _summarise(model: Model, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor) -> ModelResult:
+def _summarise(
+    model: Model | ConstantModel, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor
+) -> ModelResult:
     """Return the errors of one model in numbers, horizon by horizon."""
 
     def summarise(h: int) -> ModelResult:
@@ -267,7 +317,7 @@ def _joined(parts: list[ModelResult]) -> ModelResult:
     return ModelResult(
         parts[0].name,
         parts[0].label,
-        Summary(*(np.concatenate(column) for column in zip(*(part.summary for part in parts), strict=True))),
-        Intervals(*(np.concatenate(column) for column in zip(*(part.intervals for part in parts), strict=True))),
+        Summary(*_columns(part.summary for part in parts)),
+        Intervals(*_columns(part.intervals for part in parts)),
         tuple(one for part in parts for one in part.histograms),
     )

@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL, displace, move
+from icrtool.kernels.window_errors import NEUTRAL, displace, integrate
 from icrtool.records.run import ICR_COLUMNS, half_width_m
 from icrtool.records.tables import Floats, States
 
@@ -98,9 +99,9 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None) ->
     p = _nominal(table, track_width_m)
     width = float(p[0] - p[1])
     way = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
-    rows = np.unique(np.searchsorted(way, np.arange(0.0, float(way[-1]), WINDOW_M)))
+    rows = rows_at_steps(way, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
-    motion = move(table.t_s, dt, drive.v_left, drive.v_right, p, table.t_s[rows])
+    motion = integrate(table.t_s, dt, drive.v_left, drive.v_right, p, table.t_s[rows])
     d, d_by, _ = displace(motion, start, end)
     turn_by = motion.theta_by[end] - motion.theta_by[start]
     turned = motion.theta[end] - motion.theta[start]

@@ -10,7 +10,7 @@ from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, check_start, set_up_filter, wheel_gap_s
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.estimation.terrain_changes import TerrainTest, find_terrain_changes, given_changes
-from icrtool.kernels.filter_records import UNSEEN, Codes, FilterOutput
+from icrtool.kernels.filter_records import RECOVERED, UNSEEN, USED, Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples
@@ -158,12 +158,13 @@ def _outcome(
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:
     """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns].
 
-    Where RTK was lost, the fixes there do not count: the filter drove on with its wheels.
+    A fix that the gate rejected moves no filter and ends no outage. Where RTK was lost, the fixes there do not count:
+    the filter drove on with its wheels.
     """
     lost = np.zeros(len(gnss.stamp_ns), np.bool_)
     for begin, end in rtk_losses_ns:
         lost |= (gnss.stamp_ns > begin) & (gnss.stamp_ns < end)
-    used = gnss.stamp_ns[(gnss.code > UNSEEN) & ~lost]
+    used = gnss.stamp_ns[((gnss.code == USED) | (gnss.code == RECOVERED)) & ~lost]
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)

@@ -105,6 +105,6 @@ def _turns(table: States) -> bool:
     turned = float(np.ptp(table.heading_rad))
     if float(table.distance_m[-1]) < SHORT_DRIVE_M:
         width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
-        ahead = np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1])
+        ahead = np.append(0.0, np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1]))
         turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
     return turned >= SMALL_TURN_RAD

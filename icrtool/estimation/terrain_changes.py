@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.estimation.step_detection import Step, find_steps
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.tables import Bools, Complexes, Floats, Ints, States
 
@@ -244,7 +245,7 @@ def _windows(table: States, psi: Floats, in_gap: Bools, outages_ns: Ints) -> _Wi
     ahead, way = dt * (left - right), dt * (np.abs(left) + np.abs(right)) / 2
     progress = np.cumsum(way / WINDOW_WAY_M + np.abs(ahead) / width / WINDOW_TURN_RAD)
     progress = np.concatenate([[0.0], progress[:-1]])
-    rows = np.unique(np.searchsorted(progress, np.arange(0.0, float(progress[-1]), 1.0)))
+    rows = rows_at_steps(progress, 1.0)
     start, end = rows[:-1], rows[1:]
     turn, gone = np.diff(psi[rows]), _between(way, rows)
     driven = _between(dt * (left + right) / 2 * along, rows)
@@ -270,7 +271,7 @@ def _windows(table: States, psi: Floats, in_gap: Bools, outages_ns: Ints) -> _Wi
 def _blocks(windows: _Windows) -> _Blocks:
     """Estimate 1/W, middle/W and x/W of every block by least squares; noise of the pose tells how well."""
     turned = np.concatenate([[0.0], np.cumsum(np.abs(windows.turn))])
-    ends = np.unique(np.searchsorted(turned, np.arange(BLOCK_TURN_RAD, float(turned[-1]), BLOCK_TURN_RAD)))
+    ends = rows_at_steps(turned, BLOCK_TURN_RAD)[1:]
     first = np.concatenate([[0], ends[:-1]]).astype(np.int64)[: len(ends)]
 
     def total(values: Floats) -> Floats:

@@ -13,7 +13,7 @@ import msgspec
 
 from icrtool import __version__
 from icrtool.fleet.row import Row, columns_of
-from icrtool.output.atomic_file import whole_file
+from icrtool.output.atomic_file import atomic_file
 from icrtool.output.run_directory import json_bytes
 
 FLEET_SCHEMA = "icrtool/fleet/1"
@@ -46,14 +46,14 @@ def write_fleet(rows: Sequence[Row], directory: Path) -> None:
     _write(directory / "fleet.csv", _csv(columns, [[row.get(name) for name in columns] for row in cells]))
     failures = [msgspec.to_builtins(row) for row in rows if row.status == "failed"]
     _write(directory / "failures.csv", _csv(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
-    with whole_file(directory / "fleet.parquet") as file:
+    with atomic_file(directory / "fleet.parquet") as file:
         _write_parquet(columns, cells, file)
     # Last: where it is, the others are of the same batch.
     _write(directory / "fleet.json", json_bytes(fleet_document(rows)))
 
 
 def _write(path: Path, content: bytes) -> None:
-    with whole_file(path) as file:
+    with atomic_file(path) as file:
         file.write_bytes(content)
 
 

@@ -1,7 +1,7 @@
 """True motion of a robot of known ICRs: Eqs. 8-12 of Pentzer 2014 (guard of Eqs. 32-34), integrated without error.
 
-While track speeds and ICRs are held the body moves on a circle (Section 2), so a step is an arc and no Euler step:
-the truth owes nothing to the filter's own discretisation (Eq. 14).
+While track speeds and ICRs are constant the body moves on a circle (Section 2), so a step is an arc, not an Euler step:
+the truth does not depend on the filter's own discretisation (Eq. 14).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SMALLEST_TURN_RAD = 1e-4
 
 @njit
 def arc_step(pose: Floats, v_left: float, v_right: float, icrs: Floats, dt: float, out: Floats) -> None:
-    """Move for dt [s] at held track speeds [m/s]: the exact solution of Eqs. 11-12.
+    """Fill `out` with the pose after dt [s] at held track speeds [m/s]: the exact solution of Eqs. 11-12.
 
     Parameters
     ----------

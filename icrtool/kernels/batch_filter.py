@@ -1,4 +1,4 @@
-"""What a study needs: many filter runs in one compiled call, and a true motion that obeys the filter's model."""
+"""Kernels of the studies: many filter runs in one compiled call, and a true motion that follows the filter's model."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Batch(NamedTuple):
 
 
 class BatchOutput(NamedTuple):
-    """What the runs leave behind.
+    """Results of the runs.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
     for run in range(len(batch.x0)):
         data = Measurements(
             batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
-            batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t,
+            batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t, np.zeros(0, np.bool_),
         )  # fmt: skip
         place = np.empty(3, np.int64)
         place[0] = np.searchsorted(batch.gnss_t, batch.t0, side="right")

@@ -31,7 +31,7 @@ def njit(function: Kernel) -> Kernel:
     writable (read-only containers, CI sandboxes). The kernel then compiles in memory, once a process.
     ``error_model="numpy"`` makes a division by zero an inf, as in the NumPy twins, and lets loops vectorise.
     ``nogil=True`` lets the next piece of a log be read and decompressed while a kernel runs.
-    ``no_cfunc_wrapper``: none of our kernels is handed to C, and the wrapper for that takes time to compile.
+    ``no_cfunc_wrapper``: no kernel is called from C, and the wrapper for that takes time to compile.
     The plain Python function stays reachable as ``.py_func``.
     """
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}

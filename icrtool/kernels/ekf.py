@@ -35,9 +35,9 @@ BLOCK_EVENTS = 500_000
 
 @njit
 def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
-    """Remember a rejected innovation; say whether the run of rejected ones has been right all along.
+    """Remember a rejected innovation; return whether the rejected ones agree, so that the filter must be wrong.
 
-    A wrong fix disagrees with the next wrong fix; a filter that is wrong sees the same innovation again and again.
+    Wrong fixes disagree with one another; a filter that is wrong sees the same innovation again and again.
     `run` (4,) holds count, time of the first, and the last innovation; `limit` is the squared difference that two
     consecutive innovations of a run may have.
     """
@@ -54,7 +54,7 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
 
 @njit
 def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
-    """Return the antenna's place relative to the body origin: a = R(psi) (forward, right), north and east [m].
+    """Return the antenna's position relative to the body origin: a = R(psi) (forward, right), north and east [m].
 
     h(x) = (N, E) + a, so dh/dpsi = (-a_E, a_N); without a lever arm H is Eq. 22.
     """
@@ -103,10 +103,10 @@ def take_fix(
 def take_heading(
     t: float, z: float, r: float, x: Floats, P: Floats, PH: Floats, run: Floats, parameters: FilterParameters
 ) -> tuple[int, float, float]:
-    """Gate and apply one heading z [rad] of variance r; return what became of it, its NIS and its innovation.
+    """Gate and apply one heading z [rad] of variance r; return its code, its NIS and its innovation [rad].
 
-    The gate asks whether this sample is right (variance r); the update gives it its share of what its neighbours say
-    too (variance r times the correlation).
+    The gate tests this sample alone (variance r). The update uses variance r times the correlation, because the errors
+    of neighbouring samples are not independent.
     """
     nu = wrap(z - x[2])
     nis = nu * nu / (P[11] + r)
@@ -132,8 +132,8 @@ def advance(
 ) -> float:  # fmt: skip
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
 
-    Through a gap in the wheel data and through slip nothing is dead-reckoned: the pose only grows uncertain, and what
-    is measured next does not change the ICRs.
+    Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: only its uncertainty grows, and
+    the next measurement does not change the ICRs.
     """
     travelled = 0.0
     if in_gap or slips:
@@ -160,7 +160,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
 
     Parameters
     ----------
-    state : as the rows before left it; changed to what these leave
+    state : after the rows before `begin`; changed in place to the state after row `end` - 1
     out : its x, variance and distance are of these rows (end - begin, ...), the rest is of all measurements
     nodes : filled with every event; None: nothing is kept (compiled as a function of its own)
 

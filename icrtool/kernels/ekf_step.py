@@ -17,7 +17,7 @@ from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import Floats, step_jacobian
 
 NORTH, EAST, HEADING = (cast(int, np.int64(axis)) for axis in range(3))
-"""What is measured. With a type: of a function that is called with a plain number numba compiles a copy for it."""
+"""Which state is measured. Typed: numba compiles one more copy of a function for every plain number in a call."""
 
 DIAGONAL = (0, 6, 11, 15, 18, 20)
 """Places of the variances in P."""
@@ -117,7 +117,7 @@ def correct(x: Floats, P: Floats, PH: Floats, S: float, nu: float) -> None:
 def keep_sides(x: Floats, P: Floats, PH: Floats, least: float) -> None:
     """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
 
-    The right track is right of the left one: what the paper's guard (Section 5.1) knows, kept for the states too.
+    The right track is to the right of the left one: the paper's guard (Section 5.1) applied to the states, too.
     Estimate projection (Simon and Chia 2002): the covariance stays as it is.
     """
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""What open-loop errors say: percentiles and mean per horizon, how far to trust them, and histograms.
+"""Statistics of open-loop errors: percentiles and mean per horizon, their confidence intervals, and histograms.
 
 Errors are float64 (n_starts, n_horizons) [m] with NaN where there was no trial, as
 `icrtool.kernels.open_loop_fast` makes them. Trials from neighbouring starts share most of their path and are not
@@ -21,7 +21,7 @@ TAIL = 0.05
 BLOCK_PARTS = 4
 """Blocks begin at every quarter of their length."""
 MIN_BLOCKS = 3
-"""With fewer blocks of path in all, resampling them says nothing: the interval is not available (NaN)."""
+"""With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
 MIN_KEPT_TRIALS = 20_000
@@ -75,7 +75,7 @@ def resample_blocks(blocks: Floats, starts: Ints, segments: Ints, ordered: Float
     Notes
     -----
     p95 of a resample is a weighted quantile, the weight of a trial being how often its segment was drawn: the trials
-    are sorted once, and each resample walks down from the largest until 5 % of the weight is behind it.
+    are sorted once; each resample sums weights from the largest error down, until 5 % of the weight is reached.
     """
     before = BLOCK_PARTS - 1
     drawn = np.zeros(before + len(blocks) + before, dtype=np.int64)

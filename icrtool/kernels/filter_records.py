@@ -14,7 +14,7 @@ Flags = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""What became of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+"""Codes of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
 
 
 class FilterParameters(NamedTuple):
@@ -64,7 +64,7 @@ class Measurements(NamedTuple):
     gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
     heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
     change_t : (c,) times of terrain changes
-    slipping : (n,) intervals [k, k+1) in which the robot does not do what its wheels do; empty for none
+    slipping : (n,) intervals [k, k+1) in a slip event; empty for none
     """
 
     wheel_t: Floats
@@ -81,7 +81,7 @@ class Measurements(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """What one run leaves behind.
+    """Results of one run.
 
     Attributes
     ----------

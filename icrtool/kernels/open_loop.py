@@ -16,11 +16,13 @@ from icrtool.kernels.kinematics import euler_step
 from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints, OpenLoopPath, TrialCounts
 
 SHORT = -1
-"""No trial: less than the horizon is left of the path."""
+"""No trial: less than the horizon is left of the log's distance."""
 GAP = -2
-"""No trial: the way spans a gap in the wheel data."""
+"""No trial: the trial spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
+STANDING = -4
+"""No trial: the robot stands at the start, and another start counts for this standstill."""
 
 
 @njit
@@ -158,8 +160,8 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
 
 def count_trials(ends: Ints) -> TrialCounts:
     """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
-    short, gap, outage = ((ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE))
-    return TrialCounts(len(ends) - short - gap - outage, short, gap, outage)
+    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING)]
+    return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)
 
 
 def open_loop_errors_direct(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:

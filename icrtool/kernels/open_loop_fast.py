@@ -28,17 +28,17 @@ from icrtool.kernels.open_loop import compiled_drive, compiled_icrs, integrate_t
 from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints
 
 TOLERANCE_M = 1e-11
-"""Bound [m] on what the moments left out may add to an end position. With rounding, 1e-9 m is kept with room."""
+"""Largest error [m] of an end position by the moments left out. With rounding the total stays well below 1e-9 m."""
 ROUNDING_LIMIT_M = 2e-10
 """Where rounding alone could move an end position by this much [m], the path is integrated directly."""
 MAX_MOMENTS = 16
-"""A block which needs more is split: halving the block is cheaper than doubling its moments."""
+"""A block that needs more moments is split: halving the block is cheaper than doubling its moments."""
 MIN_BLOCK = 8
-"""Blocks of this size are not split but integrated directly: no dearer, when each needs a window of its own."""
+"""Blocks of this size are integrated directly instead of split: that is not slower."""
 BLOCK = 2048
 """Starts a block (at least as many as the states of its first trial: then the window is about twice the block)."""
 CONSTANT_BLOCK = 8192
-"""The same where one triple of ICRs serves every start: one moment does for any block, and longer ones share more."""
+"""The same where every start has the same ICRs: one moment is enough for any block, and longer blocks share more."""
 MAX_BLOCK = 32768
 """Bounds the memory of a block to a few MB."""
 TILE = 128
@@ -118,17 +118,17 @@ def sum_moments(drive: Drive, plan: BlockPlan, state_lo: int, rows: int, turns: 
     for row in range(rows):
         i = state_lo + row
         turn, dt = turns[row], 0.0 if drive.gap[i] else drive.dt_s[i]
-        way_left, way_right = dt * drive.v_left[i], dt * drive.v_right[i]
+        step_left, step_right = dt * drive.v_left[i], dt * drive.v_right[i]
         real, imag = 0.0, 0.0
-        if way_left != 0.0 or way_right != 0.0:
+        if step_left != 0.0 or step_right != 0.0:
             # no trial spans a gap, and standstill adds nothing: a parked robot costs no sine
             real, imag = math.cos(plan.a_centre * turn), math.sin(plan.a_centre * turn)
         turns[row + 1] = turn + dt * (drive.v_left[i] - drive.v_right[i])
         for m in range(sums.shape[1]):
-            sums[row + 1, m, 0] = sums[row, m, 0] + way_left * real
-            sums[row + 1, m, 1] = sums[row, m, 1] + way_left * imag
-            sums[row + 1, m, 2] = sums[row, m, 2] + way_right * real
-            sums[row + 1, m, 3] = sums[row, m, 3] + way_right * imag
+            sums[row + 1, m, 0] = sums[row, m, 0] + step_left * real
+            sums[row + 1, m, 1] = sums[row, m, 1] + step_left * imag
+            sums[row + 1, m, 2] = sums[row, m, 2] + step_right * real
+            sums[row + 1, m, 3] = sums[row, m, 3] + step_right * imag
             factor = plan.half_width * turn / (m + 1)
             real, imag = -imag * factor, real * factor
 
@@ -186,7 +186,7 @@ def solve_block(
     Notes
     -----
     For one horizon the ends grow with the starts, so `next_row` (n_horizons,) points to the next start to reach its
-    end, and moments are needed only at the tile in hand: memory is that of the block's starts, however long the window.
+    end, and moments are needed only for the current tile: memory is that of the block's starts, for any window.
     `frozen` (row_hi - row_lo, 9) keeps q, both factors and both sums of each start. `sums` and `turns` come with their
     row 0 filled. The caller allocates: in here that would double the time to compile. The trial stands in the loop: a
     function which takes the arrays would not be inlined, and be half as fast.
@@ -257,7 +257,7 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
     -----
     Section 6.4 of Pentzer 2014. Beyond the result and `ends`, memory is a few MB whatever the log; call it for ranges
     of starts to bound those as well. Blocks whose ICRs vary too much over their turns, or whose ICRs nearly coincide,
-    are halved, and at last integrated directly.
+    are halved; the smallest blocks are integrated directly.
     """
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.full(by_horizon.shape, np.nan)
@@ -265,7 +265,7 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
     block = CONSTANT_BLOCK if len(icrs.x_icr) == 1 else BLOCK
     row_lo, size, starts = 0, MAX_BLOCK, len(ends)
     while row_lo < starts:
-        # a robot which hardly moves has long windows: longer blocks share them
+        # a robot that hardly moves has long windows: longer blocks share them
         first_window = last_end(by_horizon, row_lo, row_lo + 1) - lo - row_lo
         row_hi = min(row_lo + min(max(block, first_window), size), starts)
         while True:

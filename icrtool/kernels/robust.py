@@ -175,9 +175,9 @@ def normal_equations(residuals: Floats, jacobian: Floats, scale: Floats, overlap
     """Return the data's part of the information matrix (k, k) and of the gradient (k,), soft-L1 weighted."""
     z = residuals / scale
     weights = soft_l1_weights(z) / overlap
-    slopes = jacobian / scale[:, None]
-    pulled = slopes * weights[:, None]
-    return pulled.T @ slopes, pulled.T @ z
+    scaled = jacobian / scale[:, None]
+    pulled = scaled * weights[:, None]
+    return pulled.T @ scaled, pulled.T @ z
 
 
 def sandwich_covariance(
@@ -195,12 +195,12 @@ def sandwich_covariance(
     Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread: no variance is less
     than that of H^-1.
     """
-    z, slopes = residuals / scale, jacobian / scale[:, None]
+    z, scaled = residuals / scale, jacobian / scale[:, None]
     influence = soft_l1_weights(z) / overlap
-    information: Floats = (slopes * influence[:, None]).T @ slopes + np.diag(pull)
+    information: Floats = (scaled * influence[:, None]).T @ scaled + np.diag(pull)
     order = np.argsort(group, kind="stable")
     first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
-    gradients = np.add.reduceat((slopes * (influence * z)[:, None])[order], first)
+    gradients = np.add.reduceat((scaled * (influence * z)[:, None])[order], first)
     count = len(first)
     meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
     inverse = np.linalg.solve(information, np.eye(len(pull)))

@@ -6,7 +6,7 @@ there, what was left after its updates. Backwards, with F of Eqs. 17, 27-29 betw
     C = P_i F^T (P-_{i+1})^-1,   xs_i = x_i + C (xs_{i+1} - x-_{i+1}),   Ps_i = P_i + C (Ps_{i+1} - P-_{i+1}) C^T
 
 (Rauch, Tung, Striebel 1965). A long log is taken in chunks from checkpoints of the forward pass: memory does not grow
-with it, at the price of running the filter twice.
+with it; the filter runs twice.
 """
 
 from __future__ import annotations
@@ -99,26 +99,26 @@ def multiply(A: Floats, B: Floats, out: Floats) -> None:
 
 @njit
 def smooth_chunk(
-    nodes: Nodes, count: int, step_heading: float, guard: int, later: Floats, xs: Floats, Ps: Floats, out: Smoothed
+    nodes: Nodes, count: int, step_heading: float, guard: int, following: Floats, xs: Floats, Ps: Floats, out: Smoothed
 ) -> None:
     """Smooth the first `count` nodes of a chunk backwards, filling `out` at their rows.
 
     Parameters
     ----------
     step_heading, guard : as in `FilterParameters`
-    later : (31,) the first node of the chunk that follows: x_predicted, P_predicted, step; step NaN where none follows
-    xs, Ps : (6,), (6, 6) smoothed there; they end as the smoothed first node of this chunk. `later` likewise
+    following : (31,) first node of the next chunk: x_predicted, P_predicted, step; step NaN where there is none
+    xs, Ps : (6,), (6, 6) smoothed there; they end as the smoothed first node of this chunk. `following` likewise
     """
     F, P, P_predicted, X, D, T = (
         np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     )  # fmt: skip
     for m in range(count - 1, -1, -1):
         square(nodes.P[m], P)
-        if math.isnan(later[27]):
+        if math.isnan(following[27]):
             xs[:], Ps[:] = nodes.x[m], P
         else:
-            transition(nodes.x[m], later[27:31], step_heading, guard, F)
-            square(later[6:27], P_predicted)
+            transition(nodes.x[m], following[27:31], step_heading, guard, F)
+            square(following[6:27], P_predicted)
             multiply(F, P, X)
             D[:] = Ps - P_predicted
             solve_positive(P_predicted, X)
@@ -126,7 +126,7 @@ def smooth_chunk(
             for i in range(6):
                 total = nodes.x[m, i]
                 for n in range(6):
-                    total += X[n, i] * (xs[n] - later[n])
+                    total += X[n, i] * (xs[n] - following[n])
                 T[0, i] = total
             xs[:] = T[0]
             multiply(D, X, T)
@@ -136,7 +136,7 @@ def smooth_chunk(
                     for n in range(6):
                         total += X[n, i] * T[n, k]
                     Ps[i, k] = Ps[k, i] = total
-        later[:6], later[6:27], later[27:31] = nodes.x_predicted[m], nodes.P_predicted[m], nodes.step[m]
+        following[:6], following[6:27], following[27:31] = nodes.x_predicted[m], nodes.P_predicted[m], nodes.step[m]
         if nodes.row[m] >= 0:
             for i in range(6):
                 out.x[nodes.row[m], i] = xs[i]
@@ -162,12 +162,12 @@ def run_smoother(
         if end < last:
             filter_rows(data, begin, end, state, parameters, forward, None)
     out = Smoothed(np.empty((last - first, 6)), np.empty((last - first, 6)))
-    later, xs, Ps = np.full(31, np.nan), np.zeros(6), np.zeros((6, 6))
+    following, xs, Ps = np.full(31, np.nan), np.zeros(6), np.zeros((6, 6))
     for (begin, end), state in zip(reversed(list(pairwise(borders))), reversed(saved), strict=True):
         nodes = empty_nodes(most_events(data, state.place, begin, end))
         count = filter_rows(data, begin, end, state, parameters, forward, nodes)
         rows = Smoothed(out.x[begin - first : end - first], out.variance[begin - first : end - first])
-        smooth_chunk(nodes, count, parameters.step_heading, parameters.guard, later, xs, Ps, rows)
+        smooth_chunk(nodes, count, parameters.step_heading, parameters.guard, following, xs, Ps, rows)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Open-loop trials: what the kernels take and give.
+"""Open-loop trials: inputs and outputs of the kernels.
 
 No kernel is here: a process that only reads or draws these records need not load numba.
 """
@@ -22,10 +22,10 @@ class Drive(NamedTuple):
     ----------
     dt_s : float64, interval [s] from state k to state k + 1; the last one is never used
     v_left, v_right : float64, track speeds [m/s] held over that interval
-    north, east, heading : float64, reference pose [m, m, rad]: where trials start and what they are judged by
+    north, east, heading : float64, reference pose [m, m, rad]: start of a trial, compared with its end
     distance : float64, path length [m], non-decreasing
     gap : bool, the interval from k to k + 1 is a gap in the wheel data
-    in_outage : bool, state k has no reference to be judged by
+    in_outage : bool, state k has no reference to compare a trial's end with
     """
 
     dt_s: Floats
@@ -72,6 +72,7 @@ class TrialCounts(NamedTuple):
     short: Ints
     gap: Ints
     outage: Ints
+    standing: Ints
 
 
 class Summary(NamedTuple):

@@ -1,4 +1,4 @@
-"""Wheels-only motion and its derivatives in one pass: what fitting constant ICRs over windows of way needs.
+"""Wheels-only motion and its derivatives in one pass: used to fit constant ICRs over windows of distance.
 
 Write the plane as complex numbers, z = forward + j right. With constant parameters p every window of a log shares two
 prefix sums, heading theta and place S, whatever its start s and end e (Euler steps as in `icrtool.kernels.open_loop`):
@@ -91,7 +91,7 @@ def march(
     t: Floats, dt: Floats, lag: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats,
     theta: Floats, place: Complexes, theta_by: Floats, place_by: Complexes, theta_rate: Floats, place_rate: Complexes,
 ) -> None:  # fmt: skip
-    """Fill the prefix sums at `times` (m,), ascending [s]; see `move` for the rest."""
+    """Fill the prefix sums at `times` (m,), ascending [s]; see `integrate` for the rest."""
     by, psi, s = np.zeros((3, 7)), 0.0, 0.0 + 0.0j
     psi_by, s_re, s_im = np.zeros(7), np.zeros(7), np.zeros(7)
     row = 0
@@ -128,7 +128,7 @@ def march(
         psi += dt[i] * omega
 
 
-def move(
+def integrate(
     t: Floats, dt: Floats, v_left: Floats, v_right: Floats, p: Floats, times: Floats, lag: Floats | None = None
 ) -> Motion:
     """Return where wheels alone lead at any times, with derivatives.
@@ -166,11 +166,11 @@ def displace(motion: Motion, start: Ints, end: Ints) -> tuple[Complexes, Complex
     -------
     d : complex (w,) [m], forward + j right
     d_by : complex (w, 7), by `PARAMETERS`
-    d_late : complex (w,), by a common shift of both times [m/s]
+    d_shift : complex (w,), by a common shift of both times [m/s]
     """
     back = np.exp(-1j * motion.theta[start])
-    way = motion.place[end] - motion.place[start]
-    way_by = motion.place_by[end] - motion.place_by[start]
-    d_by = back[:, None] * (way_by - 1j * motion.theta_by[start] * way[:, None])
-    d_late = back * (motion.place_rate[end] - motion.place_rate[start] - 1j * motion.theta_rate[start] * way)
-    return back * way, d_by, d_late
+    moved = motion.place[end] - motion.place[start]
+    moved_by = motion.place_by[end] - motion.place_by[start]
+    d_by = back[:, None] * (moved_by - 1j * motion.theta_by[start] * moved[:, None])
+    d_shift = back * (motion.place_rate[end] - motion.place_rate[start] - 1j * motion.theta_rate[start] * moved)
+    return back * moved, d_by, d_shift

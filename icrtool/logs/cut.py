@@ -1,4 +1,4 @@
-"""Which part of a log is read: moments as users give them, as log times."""
+"""The part of a log that is read: converts times given by a user to log times."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def _parsed(text: str, key: str) -> float | datetime:
 
 
 def cut_of(container: Container, start: float | datetime | None, end: float | datetime | None, log: Path) -> Cut:
-    """Return the log times that two moments stand for.
+    """Return the part of a log between two times, as log times.
 
     Raises
     ------
     DataError
-        Nothing lies between them.
+        The end is not after the start.
     """
     if start is None and end is None:
         return WHOLE
@@ -72,7 +72,7 @@ def nanoseconds(given: float | datetime, first_ns: int) -> int:
 
 
 def _first_ns(container: Container) -> int:
-    """Return the log time of the first message; where no index has it, all messages are gone through."""
+    """Return the log time of the first message [ns]; without an index all messages are read for it."""
     begin = container.begin_ns()
     if begin is not None:
         return begin

@@ -1,4 +1,4 @@
-"""What a surveyed log holds, in words."""
+"""The text of ``icrtool info``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
     Parameters
     ----------
     measured : the assembled log, None when it cannot be used
-    everything : list the topics of types that no role can use, too
+    everything : also list the topics whose types no role can use
     """
     size = sum(file.bytes for file in survey.inputs)
     topics, files = _count(len(survey.channels), "topic"), _count(len(survey.inputs), "file")
@@ -91,7 +91,7 @@ def _topics(survey: Survey, *, everything: bool) -> list[str]:
 
 
 def _gaps(stamps: Ints) -> str:
-    """Say how many intervals are far longer than usual, and the longest."""
+    """Return a text: how many intervals are far longer than the median, and the longest [s]; empty for none."""
     if len(stamps) < 3:
         return ""
     interval = np.diff(stamps) / 1e9
@@ -115,7 +115,7 @@ def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource],
             source.stamps.note
             or f"header stamps, {round(source.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
         )
-        refused = "used all the same, as configured" if source.topic == chosen else "cannot be used"
+        refused = "used although unsuitable, because it is configured" if source.topic == chosen else "cannot be used"
         verdict = f"{refused}: {source.problem}" if source.problem else source.why
         lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
     return lines

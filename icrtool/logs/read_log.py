@@ -1,4 +1,4 @@
-"""Read a log: open, take the columns of all candidates in one pass, choose, convert to the charter's frame."""
+"""Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A log after one pass: its channels, all candidates, what was lost, its files."""
+    """A log after one pass: its channels, all candidates, the messages that could not be read, its files."""
 
     name: LogText
     path: LogText
@@ -97,7 +97,7 @@ def survey_log(
                 problems = tuple(container.problems)
                 inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
             except BaseException:
-                # The pool waits for its threads before Ctrl-C, or an error, goes on.
+                # The pool waits for its threads before it passes on Ctrl-C or an error.
                 ended.set()
                 raise
         channels = tuple(container.channels)
@@ -160,7 +160,7 @@ def log_name(path: Path) -> str:
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
-    """Choose the streams of a surveyed log and convert them; errors as `read_log`."""
+    """Return the log with its streams chosen and converted; errors as `read_log`."""
     found, name = survey.candidates, survey.name
     choice = choose_streams(found, config, survey.path, survey.channels)
     motion, position, source = choice.wheels, choice.gnss, choice.heading
@@ -173,8 +173,8 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     warnings = list(survey.problems)
     if clock == "log" and any(delay is not None for delay in delays):
         warnings.append(
-            f"{name}: a stream without header stamps stands beside header stamps that are far from log time; "
-            "all go by log time"
+            f"{name}: one stream has no header stamps, and the header stamps of another are far from log time; "
+            "log time is used for all streams"
         )
     for role, one in (("wheels", motion), ("gnss", position), ("heading", source)):
         if one is not None and one.stamps.note and one.stamps.note != "no header":
@@ -196,7 +196,7 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         streams += (_stream("heading", source, heading.stamp_ns, clock, f"{choice.why['heading']}; {convention}"),)
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
-        f"{name}: {topic}: {unreadable[topic]} messages did not have their type's shape and were left out"
+        f"{name}: {topic}: {unreadable[topic]} messages do not fit their message type; left out"
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
@@ -234,7 +234,7 @@ def _place_in_words(antenna: tuple[float, float] | None) -> str:
 def _collect(
     container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
-    """Take the columns of all channels that some role may need, in one pass over the log."""
+    """Return the columns of all channels that some role may need, read in one pass over the log."""
     unread: dict[str, str] = {}
     collectors: dict[int, Collector | None] = {}
     by_id = {channel.id: channel for channel in container.channels}
@@ -261,7 +261,7 @@ def _collect(
 
 
 def _collector(channel: Channel, paths: tuple[str, ...], unread: dict[str, str]) -> Collector | None:
-    """Return what gathers a channel's columns; None, with the reason in `unread`, where its definition is refused."""
+    """Return a collector of a channel's columns; None, with the reason in `unread`, where its definition is refused."""
     try:
         return collector_for(channel, paths)
     except DefinitionError as err:
@@ -274,7 +274,7 @@ def _empty_table(channel: Channel) -> TopicTable:
 
 
 def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]:
-    """Read and decompress the next block while this one is decoded."""
+    """Yield blocks; the next one is read and decompressed while the caller decodes this one."""
     pending: Future[Block | None] = pool.submit(next, blocks, None)
     while (block := pending.result()) is not None:
         pending = pool.submit(next, blocks, None)
@@ -310,7 +310,7 @@ def _stream(
 def _fixes(
     source: PositionSource, config: Config, clock: Literal["header", "log"], name: str, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
-    """Bring positions to the local plane about the datum: `given`, else configured, else the first fix."""
+    """Return positions in the local plane about the datum: `given`, else the configured one, else the first fix."""
     if not source.usable.any():
         raise DataError(
             name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
@@ -350,7 +350,7 @@ def _fixes(
 def _headings(
     source: HeadingSource, config: Config, clock: Literal["header", "log"], name: str
 ) -> tuple[HeadingSamples, str]:
-    """Bring headings to clockwise from north; say how the convention is known."""
+    """Return headings clockwise from north, and a text on how the convention is known."""
     if not source.usable.any():
         raise DataError(
             name, f"{source.topic}: {source.problem or 'no usable heading'}", "choose another with topics.heading"

@@ -24,9 +24,9 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     Raises
     ------
     LogError
-        No CSV.
+        The file is not a CSV table.
     DataError
-        A column that is missing or holds what is no number.
+        A column is missing or holds a value that is not a number.
     """
     import pandas as pd
 

@@ -8,8 +8,8 @@ displaces the robot, in the body frame of its start, by
 omega is linear in the parameters, so d Theta / d theta does not depend on them; the derivatives of S are prefix sums
 too, and all windows of a recording with their derivatives cost a few passes over its samples.
 
-Each recording has constants of its own, which are no part of a calibration: the offset of its reference's heading, the
-delay of its wheels against its poses, the bias of its gyro.
+Each recording has constants of its own, which are not part of a calibration: the offset of its reference heading, the
+delay of its wheels relative to its poses, the bias of its gyro.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from icrtool.motion.recording import STRETCH_M, Windows
 from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
 CONSTANTS = ("heading_offset_rad", "wheels_read_later_s", "gyro_bias_radps")
-"""What each recording has of its own: added to the reference's heading; wheels read later; added to the turn rate."""
+"""Constants of each recording: offset added to the reference heading; delay of the wheels; added to the turn rate."""
 
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02])
 """Prior of `CONSTANTS` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
@@ -55,7 +55,7 @@ class PooledFit:
 
     @property
     def turning(self) -> Turning:
-        """What a model with a gyro weighs."""
+        """The model and parameters whose turn rate a model with a gyro combines with the gyro's."""
         return self.model, self.parameters
 
 
@@ -70,7 +70,7 @@ class WindowResiduals:
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     """
 
     def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
@@ -113,12 +113,12 @@ class WindowResiduals:
         expected = w.reference * np.exp(-1j * offset)
         d_by = back * (knot_place_by[:, w.end] - knot_place_by[:, w.start] - 1j * knot_angle[:, w.start] * went)
         rate = moved[row]
-        d_late = back * (rate[w.end] - rate[w.start] - 1j * omega[row][w.start] * went)
-        slopes = np.empty((len(parameters) + 3, len(d)), np.complex128)
-        slopes[: len(parameters)] = d_by[:-1]
-        slopes[-3], slopes[-2], slopes[-1] = 1j * expected, d_late, d_by[-1]
-        residual, slopes = (d - expected) / self._root, slopes / self._root
-        return np.concatenate([residual.real, residual.imag]), np.concatenate([slopes.real, slopes.imag], axis=1).T
+        d_shift = back * (rate[w.end] - rate[w.start] - 1j * omega[row][w.start] * went)
+        by = np.empty((len(parameters) + 3, len(d)), np.complex128)
+        by[: len(parameters)] = d_by[:-1]
+        by[-3], by[-2], by[-1] = 1j * expected, d_shift, d_by[-1]
+        residual, by = (d - expected) / self._root, by / self._root
+        return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T
 
     def _locate(self, at: Floats) -> tuple[Ints, Floats]:
         """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
@@ -134,7 +134,7 @@ class Pool:
     Parameters
     ----------
     windows, widths_m : by recording
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Pool:
         self._windows = windows
         groups, offset = [], 0
         for w in windows:
-            stretch = (w.start_m / STRETCH_M).astype(np.int64)
+            stretch = np.unique(np.floor(w.start_m / STRETCH_M), return_inverse=True)[1]
             groups.append(np.tile(stretch + offset, 2))
             offset += int(stretch.max()) + 1
         self.group = np.concatenate(groups)
@@ -157,8 +157,8 @@ class Pool:
         kept = np.ones(len(self._windows[recording].start) * 2, np.bool_)
 
         def evaluate(constants: Floats) -> tuple[Floats, Floats]:
-            residuals, slopes = part(parameters, constants)
-            return residuals, slopes[:, -3:]
+            residuals, by = part(parameters, constants)
+            return residuals, by[:, -3:]
 
         return robust_least_squares(evaluate, np.zeros(3), np.zeros(3), free, overlap=len(kept) / 10.0).x
 
@@ -181,9 +181,9 @@ class Pool:
         residuals, jacobians = [], []
         for i, part in enumerate(self._parts):
             columns = slice(k + 3 * i, k + 3 * i + 3)
-            residual, slopes = part(x[:k], x[columns])
+            residual, by = part(x[:k], x[columns])
             jacobian = np.zeros((len(residual), len(x)))
-            jacobian[:, :k], jacobian[:, columns] = slopes[:, :k], slopes[:, k:]
+            jacobian[:, :k], jacobian[:, columns] = by[:, :k], by[:, k:]
             residuals.append(residual)
             jacobians.append(jacobian)
         return np.concatenate(residuals), np.concatenate(jacobians)

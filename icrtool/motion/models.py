@@ -24,7 +24,7 @@ VX, VY, OMEGA = 0, 1, 2
 
 
 class WheelMotion(NamedTuple):
-    """What terms are made of, (n,) each.
+    """Inputs of the terms, (n,) each.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ TERMS: dict[str, Term] = {
 """Every term by name."""
 
 GYRO_TERMS = ("gyro_scale", "wheels_weight")
-"""Terms of a model with a gyro: the turn rate is the gyro's where a drive shows nothing of the wheels' turning."""
+"""Terms of a model with a gyro: without evidence about the wheels, its turn rate is the gyro's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats
 
 
 class TrackGeometry(NamedTuple):
-    """What a twist that is linear in V_l and V_r amounts to as track ICRs and controller numbers.
+    """Track ICRs and controller numbers of a twist that is linear in V_l and V_r.
 
     Attributes
     ----------
@@ -248,6 +248,24 @@ def track_geometry(
     return TrackGeometry(
         y_right, y_left, x, separation / width_m, 1.0 / turn_gain, separation * turn_left, -separation * turn_right
     )
+
+
+CONTROLLER = MotionModel(
+    "controller", "separation and radii alone", ("vx_v", "vx_w", "omega_w", "omega_v"),
+    "diff_drive_controller of ros2_controllers",
+)  # fmt: skip
+"""What a differential-drive controller can express; it follows from another model's geometry and is never fitted."""
+
+
+def controller_parameters(geometry: TrackGeometry) -> Floats:
+    """Return the parameters of `CONTROLLER` (4,) with the multiplier and radius factors of a geometry.
+
+    Notes
+    -----
+    v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b) with V_l = v + w b / 2, V_r = v - w b / 2.
+    """
+    left, right, m = geometry.radius_left, geometry.radius_right, geometry.multiplier
+    return np.array([(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m])
 
 
 def find_model(name: str) -> MotionModel:

@@ -1,4 +1,4 @@
-"""What motion models are fitted to and judged by: wheel speeds, a reference trajectory, a gyro, and windows of it."""
+"""Data to fit and test motion models: wheel speeds, reference trajectory, gyro, and windows of them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
-"""Lengths of the windows. One length alone lets a circle of just that circumference show nothing."""
+"""Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
 
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
@@ -39,7 +40,7 @@ MOVING_MPS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One log as motion models see it.
+    """One log as input of the motion models.
 
     Attributes
     ----------
@@ -49,6 +50,7 @@ class Recording:
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns the other way, and its sign was turned
+    begin_ns : stamp of the first state; 0 where it is not known
     """
 
     name: str
@@ -59,6 +61,7 @@ class Recording:
     path: str = ""
     sha256: str = ""
     gyro_reversed: bool = False
+    begin_ns: int = 0
 
     @property
     def held_s(self) -> Floats:
@@ -118,12 +121,11 @@ def cut_windows(
         There are fewer than `FEWEST_WINDOWS`.
     """
     drive = recording.drive
-    total = float(drive.distance[-1])
     place = drive.north + 1j * drive.east
     together = pooled or (recording,)
     pooled_m = sum(float(one.drive.distance[-1]) for one in together)
     every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
-    begins = np.unique(np.searchsorted(drive.distance, np.arange(0.0, total, every)))
+    begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
     ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
     row, column = np.nonzero(ends.T >= 0)[::-1]

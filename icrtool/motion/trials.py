@@ -50,13 +50,13 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     return Trials(starts, trial_ends(drive, np.array(horizons_m, np.float64))[starts])
 
 
-def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_read_later_s: float = 0.0) -> Floats:
+def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_delay_s: float = 0.0) -> Floats:
     """Return the distance (k, h) [m] between open-loop position and reference at each trial's end, NaN for no trial.
 
     Parameters
     ----------
     rates : (3, n) body twist of each wheel sample, of `twist_rates`
-    wheels_read_later_s : delay of the wheels against the poses, a constant of the recording
+    wheels_delay_s : delay of the wheels relative to the poses, a constant of the recording
 
     Notes
     -----
@@ -68,8 +68,8 @@ def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_rea
     v_x, v_y, omega = rates
     heading = np.concatenate([[0.0], np.cumsum(held * omega)])[:-1]
     place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * heading))])[:-1]
-    if wheels_read_later_s:
-        later = t + wheels_read_later_s
+    if wheels_delay_s:
+        later = t + wheels_delay_s
         heading, place = np.interp(later, t, heading), np.interp(later, t, place)
     reference = drive.north + 1j * drive.east
     turn = np.exp(1j * (drive.heading - heading))
@@ -91,7 +91,7 @@ def twist_rates(
 
     Parameters
     ----------
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it weighs
+    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     gyro_bias : added to the turn rate [rad/s]
     """
     motion = wheel_motion(recording.drive.v_left, recording.drive.v_right, recording.width_m)

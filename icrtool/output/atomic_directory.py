@@ -18,8 +18,8 @@ from icrtool.errors import OutputError
 from icrtool.output import disk
 from icrtool.output.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
 
-Judge = Callable[[Path], bool]
-"""Says whether a directory is one that we wrote and may replace."""
+IsOurs = Callable[[Path], bool]
+"""Whether a directory is one that we wrote and may replace."""
 
 LONGEST_NAME_BYTES = 200
 """A hidden name is that of the place and some letters; a longer one is shortened to its hash."""
@@ -27,13 +27,13 @@ LONGEST_NAME_BYTES = 200
 NAMES_SHOWN = 5
 
 
-def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
+def check_place(directory: Path, ours: IsOurs, *, kind: str) -> None:
     """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
 
     Parameters
     ----------
     directory : where it shall appear; nothing, an empty directory and one of ours may be there
-    ours : says which directories may be replaced
+    ours : whether a directory may be replaced
     kind : what is being written, for the message ("run directory")
 
     Raises
@@ -65,9 +65,9 @@ def check_place(directory: Path, ours: Judge, *, kind: str) -> None:
 
 
 @contextmanager
-def whole_directory(
+def atomic_directory(
     directory: Path,
-    ours: Judge,
+    ours: IsOurs,
     *,
     kind: str,
     names: Collection[str] = (),
@@ -98,7 +98,8 @@ def whole_directory(
     partial: Path | None = None
     try:
         place = _resolved(directory)
-        made = _make_parents(place)
+        made = [parent for parent in place.parents if not parent.exists()][::-1]
+        _make_parents(place, made)
         for left in _hidden(place):
             _clean(left, place, names)
         partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
@@ -120,7 +121,7 @@ def whole_directory(
                 parent.rmdir()
 
 
-def restore(directory: Path, ours: Judge) -> None:
+def restore(directory: Path, ours: IsOurs) -> None:
     """Rename an old directory back to its place, where a killed process left it aside and put nothing there.
 
     Raises
@@ -213,11 +214,11 @@ def _prefix(place: Path) -> str:
     return f".{place.name}."
 
 
-def _is_ours(place: Path, ours: Judge, kind: str) -> bool:
+def _is_ours(place: Path, ours: IsOurs, kind: str) -> bool:
     return ours(place) or kind_of(place) == kind
 
 
-def _inner(place: Path, ours: Judge) -> Path | None:
+def _inner(place: Path, ours: IsOurs) -> Path | None:
     """Return a directory of the same kind below a place."""
     for folder, folders, _ in os.walk(place):
         for name in folders:
@@ -240,13 +241,11 @@ def _check_parent(directory: Path) -> None:
             return
 
 
-def _make_parents(place: Path) -> list[Path]:
-    """Make the missing parents of `place`; return those made, outermost first."""
-    missing = [parent for parent in place.parents if not parent.exists()]
+def _make_parents(place: Path, missing: Collection[Path]) -> None:
+    """Make the missing parents of `place`."""
     place.parent.mkdir(parents=True, exist_ok=True)
     for parent in missing:
         disk.sync(parent.parent)
-    return missing[::-1]
 
 
 def _listed(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:

@@ -13,7 +13,7 @@ from icrtool.output import disk
 
 
 @contextmanager
-def whole_file(file: Path) -> Iterator[Path]:
+def atomic_file(file: Path) -> Iterator[Path]:
     """Give a path beside a file to write to; at the end of the block it is synced and moved to its place.
 
     A link stays a link: what it leads to is replaced.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration, calibration_of
 from icrtool.errors import OutputError, RunError
-from icrtool.output.atomic_file import whole_file
+from icrtool.output.atomic_file import atomic_file
 from icrtool.output.run_directory import json_bytes
 
 FILE_NAME = "calibration.json"
@@ -18,6 +19,10 @@ FILE_NAME = "calibration.json"
 def open_calibration(file: Path | str) -> Calibration:
     """Read a calibration file.
 
+    Parameters
+    ----------
+    file : what ``icrtool calibrate -o`` or `Calibration.write` wrote
+
     Raises
     ------
     RunError
@@ -25,7 +30,7 @@ def open_calibration(file: Path | str) -> Calibration:
     """
     path = Path(file)
     try:
-        return calibration_of(json.loads(path.read_bytes()))
+        return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
@@ -47,7 +52,7 @@ def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
         Something that is not a calibration is there, or it cannot be written.
     """
     file = calibration_file(place)
-    with whole_file(file) as partial:
+    with atomic_file(file) as partial:
         partial.write_bytes(json_bytes(document))
     return file
 

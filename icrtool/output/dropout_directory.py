@@ -17,10 +17,11 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
-from icrtool.output.atomic_directory import whole_directory
+from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.figures.dropout_figures import ReportFigures
 from icrtool.output.run_directory import json_bytes
+from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import LADDER_COLUMNS, ladder_document, ladder_rows
 from icrtool.output.trials_file import trials_file
 from icrtool.records.dropout import ExampleTrial, ModelResult
@@ -37,6 +38,7 @@ KNOWS = {
     "icr": "the distance up to each start",
     "no_slip": "the track width",
     "icr_final": "all of the drive (in sample)",
+    "recommended": "the blocks of the drive that the trial does not touch",
 }
 """What the ICRs of a model were learned from."""
 
@@ -61,7 +63,7 @@ def report_writer(directory: Path, drawer: Drawer, stamp_ns: Ints | None = None)
         Something that is not a dropout report stands in its place, or the disk does not take it.
     """
     with (
-        whole_directory(directory, is_dropout_directory, kind="dropout report") as partial,
+        atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial,
         drawer.into(partial / "plots") as draw,
         trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink,
     ):
@@ -133,6 +135,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
         "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
         "starts": report.states,
+        "starts_counted": report.starts,
         "starts_standing": report.standing,
         "tolerance_m": TOLERANCE_M,
         "bootstrap": {
@@ -144,6 +147,10 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         },
         "models": [_model_document(result, report) for result in report.results],
         "trials": _count_documents(report),
+        "reference_error": _reference_documents(report),
+        "by_learning": _learned_document(report),
+        "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
+        "recommended": report.calibration.summary() if report.calibration is not None else None,
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
         "ladder": ladder_document(report.comparison)
@@ -197,7 +204,9 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
     shared = [name for name in columns if name != "model"]
     rows = [{name: columns[name][row] for name in shared} for row in mine]
-    return {"name": result.name, "label": result.label, "knows": KNOWS.get(result.name), "by_horizon": rows}
+    used = next((one for one in report.calibrations if one.name == result.name), None)
+    knows = used.fitted_text if used is not None else KNOWS.get(result.name)
+    return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows}
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
@@ -211,10 +220,34 @@ def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
                 "too_little_way_left": int(counts.short[h]),
                 "across_wheel_gap": int(counts.gap[h]),
                 "ends_in_gnss_outage": int(counts.outage[h]),
+                "from_standstill": int(counts.standing[h]),
             },
+            "why_none": why_no_trial(report, h),
         }
         for h, horizon in enumerate(report.horizons_m)
     ]
+
+
+def _reference_documents(report: DropoutReport) -> list[dict[str, Any]]:
+    """Return the reference's own error at each horizon: what a perfect model would show."""
+    found = report.reference_error
+    if found is None:
+        return []
+    names = ("horizon_m", "std_m", "expected_m", "p95_m")
+    return [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *found))]
+
+
+def _learned_document(report: DropoutReport) -> dict[str, Any] | None:
+    """Return the trials before and after the ICRs were first learned."""
+    split = report.by_learning
+    if split is None:
+        return None
+    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
+    parts = {
+        part: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
+        for part, summary in (("before", split.before), ("after", split.after))
+    }
+    return {"model": "icr", "learned_s": split.learned_s, "learned_at_distance_m": split.distance_m, **parts}
 
 
 def _drive_document(drive: ExampleTrial) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from icrtool.output.atomic_directory import check_place, whole_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
@@ -68,12 +68,12 @@ def write_run(
     Raises
     ------
     OutputError
-        A file or a foreign directory is in the way, or the disk does not take it.
+        A file or a foreign directory is there, or the disk does not take it.
     """
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
     with (
-        whole_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
+        atomic_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
         (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):

@@ -53,7 +53,7 @@ class StreamDocument(TypedDict):
     topic: str
     message_type: str
     count: int
-    rate_hz: float
+    rate_hz: float | None
     clock: str
     why: str
 

@@ -36,7 +36,7 @@ PIECES_AHEAD = 4
 
 
 class StatesFileError(ValueError):
-    """A file that does not hold the columns of the states. Only `read_run` sees it, and says it better."""
+    """A file that does not hold the columns of the states. Only `read_run` sees it, and raises a clearer one."""
 
 
 def write_states(table: States, path: Path, states: StatesFormat) -> str:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.tables import Ints, States
+from icrtool.records.text import escaped
 
 FIT_AGAIN = "fit the log again"
 
@@ -146,7 +147,17 @@ def _read_document(directory: Path) -> dict[str, Any]:
         raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
     if schema != RUN_SCHEMA:
         raise RunError(directory, f"its schema is {schema}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN)
-    return cast("dict[str, Any]", document)
+    # What a log wrote there is printed from here on.
+    return {escaped(key): value if key == "inputs" else _escaped(value) for key, value in document.items()}
+
+
+def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return plain data with all its texts escaped."""
+    if isinstance(value, dict):
+        return {escaped(key): _escaped(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_escaped(item) for item in value]
+    return escaped(value) if isinstance(value, str) else value
 
 
 def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mapping[str, str]) -> States | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.output.atomic_directory import check_place, whole_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.run_directory import json_bytes
 from icrtool.simulation.studies import KINDS, Column, StudyResult
 
@@ -42,10 +42,10 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
     Raises
     ------
     OutputError
-        A file or a foreign directory is in the way, or the disk does not take it.
+        A file or a foreign directory is there, or the disk does not take it.
     """
     name = result.request.name
-    with whole_directory(directory, is_study_directory, kind=KIND) as partial:
+    with atomic_directory(directory, is_study_directory, kind=KIND) as partial:
         (partial / STUDY_FILE).write_bytes(json_bytes(study_document(result)))
         _write_csv(result.columns, partial / f"{name}.csv")
         if plots:
@@ -55,7 +55,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 
 
 def is_study_directory(directory: Path) -> bool:
-    """Say whether a directory is a study of ours, of whatever version."""
+    """Return whether a directory is a study of ours, of whatever version."""
     try:
         schema = json.loads((directory / STUDY_FILE).read_bytes())["schema"]
     except (OSError, ValueError, KeyError, TypeError):

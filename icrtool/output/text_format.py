@@ -9,7 +9,7 @@ TABLE_WIDTH = 100
 """Letters in a line of a printed table."""
 
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
-"""What the numbers of a compared model were fitted to, by `icrtool.calibration.model_comparison.Rung.fitted`."""
+"""What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
 
 
 def run_title(summary: Mapping[str, Any]) -> str:

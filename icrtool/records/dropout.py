@@ -1,4 +1,4 @@
-"""Parts of a dropout report: what tables, files and pictures show.
+"""Parts of a dropout report, for tables, files and figures.
 
 No kernel is here: a process that only draws them need not load numba.
 """
@@ -65,7 +65,8 @@ class Outage:
     ----------
     begin_s, end_s : seconds since the first recorded state
     distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: miss at re-acquisition (both the same)
+    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
+        the same)
     north_m, east_m : (m,) the path without GNSS, for a picture
     """
 
@@ -96,14 +97,69 @@ class Rung:
     summary: Summary
 
 
+class ReferenceErrors(NamedTuple):
+    """The error that the reference itself puts into trials, by horizon; (h,) [m] each, NaN where there is no trial.
+
+    Attributes
+    ----------
+    std : root mean square
+    expected, p95 : mean and 95th percentile: what a perfect motion model would show
+    """
+
+    std: Floats
+    expected: Floats
+    p95: Floats
+
+
+class LearnedSplit(NamedTuple):
+    """Trials of the momentary ICRs that start before and after the ICRs were first learned.
+
+    Attributes
+    ----------
+    learned_s, distance_m : when and where they were learned, seconds and metres since the first recorded state; None
+        where they never were: all trials are before
+    before, after : by horizon
+    """
+
+    learned_s: float | None
+    distance_m: float | None
+    before: Summary
+    after: Summary
+
+
+class UsedCalibration(NamedTuple):
+    """A calibration that a report has a row of.
+
+    Attributes
+    ----------
+    name, label : of its row
+    model : of the calibration
+    logs : how many it was fitted to; fitted_to_this : this log is among them
+    created : date and time, UTC
+    """
+
+    name: str
+    label: str
+    model: str
+    logs: int
+    fitted_to_this: bool
+    created: str
+
+    @property
+    def fitted_text(self) -> str:
+        """Whether this log was among those it was fitted to, in words."""
+        return "fitted to this log" if self.fitted_to_this else "not fitted to this log"
+
+
 class BudgetDistance(NamedTuple):
     """How far a model's 95th percentile stays within a budget.
 
     Attributes
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
-    beyond : the budget still held at `distance_m`, the last horizon with trials
+    beyond : the error is within the budget at `distance_m`, the last horizon with trials
     between_m : horizons interpolated between
+    low_m, high_m : distances at which the interval of p95 leaves the budget; NaN where there is no interval
     """
 
     model: str
@@ -112,6 +168,8 @@ class BudgetDistance(NamedTuple):
     distance_m: float
     beyond: bool
     between_m: tuple[float, float]
+    low_m: float = math.nan
+    high_m: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +191,7 @@ class Verdict:
     Attributes
     ----------
     value_m : NaN where the log has no trial of that length
-    margin_m : negative when the bound was missed
+    margin_m : negative where the limit was exceeded
     """
 
     gate: Gate
@@ -160,7 +218,7 @@ class TurningSplit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredHeading:
-    """Where the robot pointed by a sensor of its own, at the states of a run.
+    """Heading by a sensor of the robot, at the states of a run.
 
     Attributes
     ----------

@@ -1,11 +1,11 @@
-"""Slip events: spans in which the wheels and the motion of the robot disagree."""
+"""Slip events: time spans in which the robot does not move as its wheels do."""
 
 from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
 SlipKind = Literal["immobilised", "slip", "skid", "spin"]
-"""Wheels turn and the robot stands; it misses distance along its heading; it moves sideways; it misses turn."""
+"""Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
 
 
 EVENT_COLUMNS = (

@@ -54,11 +54,11 @@ HEADING = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
 GYRO = (("turn_rate_radps",), ("yaw_rate_radps",))
 
 LATEST_S = 4e9
-"""Stamps beyond the year 2096 do not fit into nanoseconds with room for differences."""
+"""Limit of stamps, the year 2096: differences of larger stamps may overflow 64 bits of nanoseconds."""
 
 
 class Parts(NamedTuple):
-    """What frames give of a log."""
+    """The parts of a log that data frames give."""
 
     wheels: WheelSamples
     gnss: PositionFixes
@@ -78,7 +78,7 @@ def parts_from_frames(
     Raises
     ------
     DataError
-        A column is missing, holds what is no number, or has fewer than two samples; the column is named.
+        A column is missing, holds a value that is not a number, or has fewer than two samples; the column is named.
     """
     samples, wheel_columns = _wheels(wheels, name)
     fixes, datum, position_columns = _position(position, name)
@@ -98,7 +98,7 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
     Raises
     ------
     DataError
-        It has all of none.
+        No group is complete.
     """
     for columns in options:
         if all(column in frame for column in columns):
@@ -114,7 +114,7 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
     try:
         return np.asarray(frame[column], np.float64)
     except (TypeError, ValueError) as err:
-        raise DataError(name, f"column {column}: holds what is no number", str(err)) from err
+        raise DataError(name, f"column {column}: holds a value that is not a number", str(err)) from err
 
 
 def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[Ints, list[Floats]]:

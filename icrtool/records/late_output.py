@@ -10,6 +10,6 @@ import importlib
 from typing import Any
 
 
-def call_output(module: str, function: str, *arguments: object, **options: object) -> Any:  # noqa: ANN401 - see there
+def call_output(module: str, function: str, *arguments: object, **options: object) -> Any:  # noqa: ANN401 - the type is that of the function called
     """Return ``icrtool.output.MODULE.FUNCTION(*arguments, **options)``."""
     return getattr(importlib.import_module(f"icrtool.output.{module}"), function)(*arguments, **options)

@@ -1,4 +1,4 @@
-"""What a log's sensors measured once they are aligned: the streams as the filter uses them, and what was found."""
+"""The measurements of a log after alignment: the streams as the filter uses them, and the findings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Fixes:
     north_m, east_m : float64 (m,)
     var_north_m2, var_east_m2 : float64 (m,), finite
     fix_class : uint8 (m,), keys of `icrtool.alignment.gnss_quality.CLASSES`
-    misreported : bool (m,), reported as RTK-fixed and no fixed solution
+    misreported : bool (m,), reported as RTK-fixed, but not a fixed solution
     down_weighted : bool (m,), given a larger variance for their class
     """
 
@@ -75,12 +75,12 @@ class SensorData:
     name : of the log
     headings : clockwise from north, offset corrected; every variance finite
     gyro : not used by the filter; None without one
-    heading_from_position : heading and position are fields of the same messages: they are late together
-    heading_correlation_s : headings closer together than this err alike
+    heading_from_position : heading and position are fields of the same messages: they have the same delay
+    heading_correlation_s : the errors of headings closer together than this are correlated
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
-    events : spans in which the robot did not do what its wheels did, in order of time
-    icr_start : ICRs that the alignment found, or that such robots have; None: the preset's start
+    events : slip events, in order of time
+    icr_start : initial ICRs by the alignment, or typical ones of such robots; None: those of the preset
     """
 
     name: str
@@ -118,7 +118,7 @@ class SensorData:
 
 @dataclass(frozen=True, slots=True)
 class FixStatistics:
-    """What the position fixes of a log show of themselves.
+    """Statistics of the position fixes of a log.
 
     Attributes
     ----------

@@ -27,12 +27,12 @@ STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""
 
 DEFAULT_HALF_WIDTH_M = 0.3
-"""Half of a small field robot, where the width is not known."""
+"""Half the width of a small field robot [m], used where the width is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasurementOutcome:
-    """What became of the fixes or headings of a log.
+    """How the filter used each fix or heading of a log.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Run:
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     outages_ns : half-open spans without usable GNSS, (k, 2)
     sensors : the streams as the filter used them
-    gnss, heading : what became of the fixes and headings
+    gnss, heading : how the filter used each fix and heading
     smoothed : states of the RTS smoother at the same stamps, None where they were not asked for
     summary : equal to run.json
     directory : where it was read from, None for one just made
@@ -158,7 +158,7 @@ class Run:
         Raises
         ------
         OutputError
-            A file or a foreign directory is in the way, or the disk does not take it.
+            A file or a directory of another program exists at `path`, or the disk cannot be written.
         """
         call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots)
 
@@ -181,17 +181,17 @@ class Run:
 
 
 def half_width_m(track_width_m: float | None) -> float:
-    """Return b/2, or what stands for it when the width is not known."""
+    """Return b/2 [m], or a default where the width is not known."""
     return track_width_m / 2 if track_width_m is not None else DEFAULT_HALF_WIDTH_M
 
 
 def drive_of(run: Run) -> Drive:
-    """Return the run's states as the kernels want them."""
+    """Return the states of a run as input of the kernels."""
     return make_drive(run.table, run.in_gap, run.outages_ns)
 
 
 def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
-    """Return states as the kernels want them."""
+    """Return states as input of the kernels."""
     in_outage = np.zeros(len(table), np.bool_)
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
@@ -210,7 +210,7 @@ def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
 
 
 def straight_drive() -> Drive:
-    """Return twenty states straight on, to load compiled kernels with."""
+    """Return twenty states of straight driving, with which compiled kernels are loaded."""
     path = np.arange(20.0)
     no = np.zeros(len(path), np.bool_)
     return Drive(

@@ -1,4 +1,4 @@
-"""What the sensors of a robot measured: typed columns by stamp, and where they came from."""
+"""Samples of a robot's sensors: typed columns by stamp, and their source."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ Role = Literal["wheels", "gnss", "heading"]
 
 
 NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
-"""What a message says of how its position was solved: nothing, without carrier phase (or unknown), RTK float, RTK
-fixed, RTK without saying which."""
+"""How a message states that its position was solved: not stated, without carrier phase (or unknown), RTK float, RTK
+fixed, RTK fixed or float."""
 
 
 def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
@@ -80,8 +80,8 @@ class PositionFixes:
     ----------
     stamp_ns : int64 (n,), non-decreasing
     north_m, east_m : float64 (n,)
-    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where the log does not say
-    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message tells any
+    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where not stated
+    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message states any
     """
 
     stamp_ns: Ints
@@ -93,9 +93,15 @@ class PositionFixes:
     stated_class: Bytes | None = None
 
     def __post_init__(self) -> None:
-        told = () if self.stated_class is None else (self.stated_class,)
+        stated = () if self.stated_class is None else (self.stated_class,)
         _check_lengths(
-            self.stamp_ns, self.north_m, self.east_m, self.var_north_m2, self.var_east_m2, self.cov_north_east_m2, *told
+            self.stamp_ns,
+            self.north_m,
+            self.east_m,
+            self.var_north_m2,
+            self.var_east_m2,
+            self.cov_north_east_m2,
+            *stated,
         )
 
     def cut(self, rows: slice) -> PositionFixes:
@@ -112,7 +118,7 @@ class HeadingSamples:
     ----------
     stamp_ns : int64 (n,), non-decreasing
     heading_rad : float64 (n,), in (-pi, pi]
-    var_rad2 : float64 (n,), NaN where the log does not say
+    var_rad2 : float64 (n,), NaN where not stated
     """
 
     stamp_ns: Ints

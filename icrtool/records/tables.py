@@ -71,9 +71,9 @@ class RobotLog:
     Attributes
     ----------
     datum : None where the position reference was metric already (total station, lidar, motion capture)
-    rejected_fixes : fixes dropped at the door by reason (``no fix``, ``not finite`` ...)
+    rejected_fixes : number of fixes dropped while reading, by reason (``no fix``, ``not finite`` ...)
     warnings : sentences for the user, in the order they were found
-    antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None where not told
+    antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None without one
     gyro : turn rates of an inertial unit, None without one; the filter does not use them
     heading : without a row where no topic states one
     gyros : all inertial units with turn rates, all axes
@@ -104,7 +104,7 @@ class RobotLog:
         Raises
         ------
         DataError
-            A column is missing, holds what is no number, or has fewer than two samples; the column is named.
+            A column is missing, holds a value that is not a number, or has fewer than two samples; the column is named.
         """
         samples, fixes, datum, headings, rates, streams = parts_from_frames(wheels, position, heading, gyro, name)
         return cls(LogText(name), samples, fixes, headings, datum, streams, (), {}, (), gyro=rates)

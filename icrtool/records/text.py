@@ -45,7 +45,7 @@ class LogText(str):
         return format(str(self), spec)
 
     def __repr__(self) -> str:
-        return f"LogText({str(self)!r})"
+        return f"'{self}'"
 
     def __reduce__(self) -> tuple[type[LogText], tuple[str]]:
         return LogText, (self.raw,)

@@ -1,9 +1,10 @@
-"""Simulate: a robot of known ICRs drives a path, and the sensors of Pentzer 2014, Section 4, look at it."""
+"""Simulate a robot of known ICRs on a path, and the sensors of Pentzer 2014, Section 4."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
@@ -24,6 +25,12 @@ PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
 
 GYRO_STD_RADPS = 0.003
 
+MOST_SAMPLES = 20_000_000
+"""Of a sensor, and steps of the truth: five and a half hours at the default step."""
+
+LARGEST, SMALLEST = 1e6, 1e-9
+"""Magnitudes of the numbers of a drive and its sensors, in their units; 0 is allowed where it has a meaning."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrackSpeeds:
@@ -35,16 +42,16 @@ class TrackSpeeds:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """What really happens.
+class DrivePlan:
+    """What is simulated: the robot's true ICRs, its path and its motors.
 
     Attributes
     ----------
-    icrs_m : true y_icr_right, y_icr_left, x_icr; the driver knows these, and plans with them
-    changes : (seconds, ICRs that hold from then on), in order of time; the driver does not notice
-    path : a path, or track speeds as given
-    command_rate_hz : the plan reaches the motors this often, and is held between; None: at every step
-    motor_lag_s : time constant with which the tracks follow; 0: at once
+    icrs_m : true y_icr_right, y_icr_left, x_icr; the track speeds of a path are computed with them
+    changes : (seconds, true ICRs from then on), in order of time; the track speeds do not change
+    path : a path, or given track speeds
+    command_rate_hz : rate of the motor commands, each held until the next; None: a command at every step
+    motor_lag_s : time constant with which the tracks follow their commands; 0: without lag
     step_s : track speeds of a path are held this long; one over a whole number
     """
 
@@ -60,11 +67,11 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """What looks at it. The defaults are Section 4 of Pentzer 2014.
+    """The sensors and their errors. The defaults are Section 4 of Pentzer 2014.
 
     Attributes
     ----------
-    wheels : ``ideal`` (true displacement), ``encoder`` (whole counts) or ``commanded`` (what the motors are told)
+    wheels : ``ideal`` (true displacement), ``encoder`` (whole counts) or ``commanded`` (motor commands)
     wheel_rate_hz, heading_rate_hz, gnss_rate_hz : samples per second
     metres_per_count : travel of one encoder count
     input_noise_mps, input_bias_mps : white noise per sample and bias, on both track speeds
@@ -72,8 +79,8 @@ class Sensors:
     outages_s : (begin, end) without fixes
     heading_std_rad, heading_resolution_rad : white noise, and the step that headings are rounded to
     heading_offset_rad : added to every heading, clockwise
-    antenna_forward_m, antenna_right_m : where the antenna stands, body frame
-    gnss_delay_s, heading_delay_s : their stamps are this much later than the wheels' clock says
+    antenna_forward_m, antenna_right_m : position of the antenna, body frame
+    gnss_delay_s, heading_delay_s : how much their stamps lag behind the wheels' clock
     """
 
     wheels: Literal["ideal", "encoder", "commanded"] = "encoder"
@@ -101,7 +108,7 @@ class Truth:
     Attributes
     ----------
     t_s : (n,) increasing from 0
-    command_left_mps, command_right_mps : (n,) what the motors are told, held over [k, k+1)
+    command_left_mps, command_right_mps : (n,) motor commands, held over [k, k+1)
     v_left_mps, v_right_mps : (n,) true track speeds, held over [k, k+1)
     travel_left_m, travel_right_m : (n,) their integrals
     icrs_m : (c, 3); which : int64 (n,) row of it that holds over [k, k+1)
@@ -130,7 +137,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """What the sensors say, at the times at which they looked.
+    """Measurements of the sensors, by time of measurement.
 
     Attributes
     ----------
@@ -151,14 +158,15 @@ class Readings:
     yaw_rate_radps: Floats
 
 
-def check_drive(plan: Drive, sensors: Sensors) -> None:
-    """Refuse what cannot be driven or seen.
+def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
+    """Refuse a plan that cannot be driven, or sensors that give too few samples.
 
     Raises
     ------
     ConfigError
-        It names what is impossible.
+        It names the impossible value.
     """
+    _check_numbers(plan, sensors)
     for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
         if not right > left:
             raise ConfigError(
@@ -172,7 +180,7 @@ def check_drive(plan: Drive, sensors: Sensors) -> None:
         and plan.path.kind not in ("circle", "spins", "straight")
     ):
         raise ConfigError(
-            "radius", f"a {plan.path.kind} path has no bends of radius 0", "only a circle may stand on the spot"
+            "radius", f"a {plan.path.kind} path has no bends of radius 0", "only a circle may have radius 0"
         )
     times = [time for time, _ in plan.changes]
     if times != sorted(set(times)):
@@ -184,22 +192,47 @@ def check_drive(plan: Drive, sensors: Sensors) -> None:
         )
 
 
-def move(plan: Drive, tail_s: float) -> Truth:
-    """Drive a plan for its duration and `tail_s` more: the last wheel speed needs a next sample."""
+def _check_numbers(plan: DrivePlan, sensors: Sensors) -> None:
+    """Refuse numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive."""
+    for part in (plan, sensors, plan.path):
+        for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
+            for number in _numbers_in(getattr(part, name)):
+                if number and not SMALLEST <= abs(number) <= LARGEST:
+                    why = f"{number:g} is not of a magnitude from {SMALLEST:g} to {LARGEST:g}"
+                    raise ConfigError(name, why, "give a number in the unit of its name")
+    rates = (1.0 / plan.step_s, sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
+    if not 0.0 < (samples := plan.duration_s * max(rates)) <= MOST_SAMPLES:
+        raise ConfigError(
+            "duration", f"{plan.duration_s:g} s at {max(rates):g} Hz are {samples:.3g} samples",
+            f"at most {MOST_SAMPLES:,} are simulated",
+        )  # fmt: skip
+
+
+def _numbers_in(value: object) -> Iterator[float]:
+    """Yield the numbers of a field: itself, or those of the tuples in it."""
+    if isinstance(value, tuple):
+        for each in value:
+            yield from _numbers_in(each)
+    elif isinstance(value, int | float):
+        yield float(value)
+
+
+def drive_plan(plan: DrivePlan, tail_s: float) -> Truth:
+    """Return the true motion over a plan's duration and `tail_s` [s] more: the last wheel speed needs a next sample."""
     end = plan.duration_s + tail_s + 2 * plan.step_s
     given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
     # Divided, not multiplied: k / 100 and j / 20 are then the same double where they are the same time.
     grid = np.arange(math.ceil(end / plan.step_s)) / round(1 / plan.step_s)
     t = np.union1d(grid, np.concatenate([given[given < end], edges[edges < end]]))
-    told_at = t
+    command_t = t
     if plan.command_rate_hz is not None:
-        told_at = np.floor(t * plan.command_rate_hz * (1 + 1e-12)) / plan.command_rate_hz
+        command_t = np.floor(t * plan.command_rate_hz * (1 + 1e-12)) / plan.command_rate_hz
     if isinstance(plan.path, TrackSpeeds):
-        row = np.clip(np.searchsorted(given, told_at, side="right") - 1, 0, None)
+        row = np.clip(np.searchsorted(given, command_t, side="right") - 1, 0, None)
         left, right = plan.path.v_left_mps[row], plan.path.v_right_mps[row]
     else:
-        left, right = track_speeds(*plan_body(plan.path, told_at, plan.icrs_m), plan.icrs_m)
+        left, right = track_speeds(*plan_body(plan.path, command_t, plan.icrs_m), plan.icrs_m)
     v_left, v_right = left, right
     if plan.motor_lag_s > 0:
         v_left, v_right = follow(left, t, plan.motor_lag_s), follow(right, t, plan.motor_lag_s)
@@ -213,12 +246,12 @@ def move(plan: Drive, tail_s: float) -> Truth:
 
 
 def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:
-    """Look at the truth for `duration_s` from time 0.
+    """Return the measurements of the true motion from time 0 to `duration_s` [s].
 
     Notes
     -----
     Wheel noise is drawn as a speed per sample and summed into the travel, so that positions and speeds of a message
-    say the same. An encoder then counts whole counts of that travel.
+    agree. An encoder then rounds that travel to counts.
     """
     wheel_t = sample_times(sensors.wheel_rate_hz, duration_s)
     v_left, v_right = (_wheel_speed(truth, side, wheel_t, sensors, rng) for side in ("left", "right"))
@@ -254,7 +287,7 @@ def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Gene
 
 
 def sample_times(rate_hz: float, duration_s: float) -> Floats:
-    """Return the times [s] of a sensor that looks `rate_hz` times a second, in [0, duration_s)."""
+    """Return the sample times [s] of a sensor of `rate_hz` in [0, duration_s)."""
     count = math.ceil(duration_s * rate_hz * (1 - 1e-12))
     return np.arange(count) / rate_hz
 
@@ -264,8 +297,8 @@ def _wheel_speed(
 ) -> Floats:
     """Return the speed (n,) [m/s] of a side over each interval, noise and bias included, before any counting."""
     if sensors.wheels == "commanded":
-        told: Floats = getattr(truth, f"command_{side}_mps")
-        speed = told[truth.rows(wheel_t)]
+        command: Floats = getattr(truth, f"command_{side}_mps")
+        speed = command[truth.rows(wheel_t)]
     else:
         edges = np.append(wheel_t, len(wheel_t) / sensors.wheel_rate_hz)
         speed = np.diff(np.interp(edges, truth.t_s, getattr(truth, f"travel_{side}_m"))) / np.diff(edges)

@@ -1,4 +1,4 @@
-"""Paths to drive: what the body shall do over time, and the track speeds that a robot of known ICRs needs for it."""
+"""Paths: speed and turn rate of the body over time, and the track speeds that a robot of known ICRs needs for them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "st
 PATH_KINDS: tuple[PathKind, ...] = get_args(PathKind)
 
 CURVED_SWINGS = ((0.8, 1.4), (0.2, 3.0))
-"""Share of the curvature, and length in radii per radian, of the two rhythms of path ``curved``: the heading swings by
-up to 1.7 rad and never repeats soon."""
+"""Share of the curvature, and length in radii per radian, of the two oscillations of path ``curved``: the heading
+varies by up to 1.7 rad, without a short period."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathPlan:
-    """What the body shall do.
+    """A path of the body.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class PathPlan:
     speed_mps : speed of the body; of the faster track where the body stands (``spins``, ``circle`` of radius 0)
     radius_m : of circles and of the tightest bend; a lawnmower's legs are two radii apart
     leg_m : length of a lawnmower's legs
-    phase_rad : where the rhythms of ``curved`` begin
+    phase_rad : phase of the oscillations of ``curved`` at the start
     """
 
     kind: PathKind = "curved"
@@ -43,7 +43,7 @@ class PathPlan:
 def plan_body(path: PathPlan, t: Floats, icrs_m: tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Return forward velocity [m/s] and turn rate [rad/s], clockwise positive, at times t (n,) [s]; (n,) each."""
     speed = np.full(len(t), path.speed_mps)
-    way = path.speed_mps * t
+    distance = path.speed_mps * t
     if path.kind == "spins" or (path.kind == "circle" and path.radius_m == 0):
         turn = np.full(len(t), path.speed_mps / max(abs(icrs_m[0]), abs(icrs_m[1])))
         whole_turns = np.floor(turn * t / (2 * math.pi))
@@ -53,14 +53,14 @@ def plan_body(path: PathPlan, t: Floats, icrs_m: tuple[float, float, float]) -> 
     if path.kind == "circle":
         return speed, speed / path.radius_m
     if path.kind == "figure-eight":
-        lap = np.floor(way / (2 * math.pi * path.radius_m))
+        lap = np.floor(distance / (2 * math.pi * path.radius_m))
         return speed, np.where(lap % 2 == 0, 1.0, -1.0) * speed / path.radius_m
     if path.kind == "lawnmower":
-        lap, within = np.divmod(way, path.leg_m + math.pi * path.radius_m)
+        lap, within = np.divmod(distance, path.leg_m + math.pi * path.radius_m)
         bend = np.where(lap % 2 == 0, 1.0, -1.0) * speed / path.radius_m
         return speed, np.where(within < path.leg_m, 0.0, bend)
     swing = sum(
-        share * np.cos(way / (length * path.radius_m) + path.phase_rad * (number + 1))
+        share * np.cos(distance / (length * path.radius_m) + path.phase_rad * (number + 1))
         for number, (share, length) in enumerate(CURVED_SWINGS)
     )
     return speed, swing * speed / path.radius_m

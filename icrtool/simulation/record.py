@@ -1,4 +1,4 @@
-"""A simulated drive as a robot records it: stamps, places on the globe, and the truth beside it."""
+"""A simulated drive as a robot records it: stamps, geodetic positions, and the table of the truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.records.tables import Floats, Ints
-from icrtool.simulation.drives import Drive, Readings, Sensors, Truth, check_drive, move, sense
+from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sense
 
 START_NS = 1_760_000_000_000_000_000
 DATUM = (40.7934, -77.86, 350.0)
@@ -17,7 +17,7 @@ DATUM = (40.7934, -77.86, 350.0)
 HEIGHT_STD_RATIO = 2.0
 LARGEST_RTK_STD_M = 0.05
 LARGEST_SBAS_STD_M = 0.6
-"""What a receiver of this noise would call its fix: GBAS, SBAS, or a plain fix beyond."""
+"""NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,8 @@ class TruthTable:
         return {column.name: getattr(self, column.name) for column in fields(self)}
 
 
-def simulate(plan: Drive, sensors: Sensors, seed: int) -> tuple[SensorRecord, TruthTable]:
-    """Drive a plan and record it.
+def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorRecord, TruthTable]:
+    """Return the measurements and the truth of a simulated drive.
 
     Parameters
     ----------
@@ -89,10 +89,10 @@ def simulate(plan: Drive, sensors: Sensors, seed: int) -> tuple[SensorRecord, Tr
     Raises
     ------
     ConfigError
-        What cannot be driven or seen.
+        The plan cannot be driven, or a sensor gives too few samples.
     """
     check_drive(plan, sensors)
-    truth = move(plan, 1.0 / sensors.wheel_rate_hz)
+    truth = drive_plan(plan, 1.0 / sensors.wheel_rate_hz)
     height_rng, sensor_rng = (np.random.default_rng((seed, stream)) for stream in (1, 0))
     readings = sense(truth, sensors, plan.duration_s, sensor_rng)
     return record(readings, sensors, height_rng), truth_table(truth, readings.wheel_t)

@@ -13,7 +13,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import ConfigError
 from icrtool.records.tables import Bools, Floats, Ints
-from icrtool.simulation.drives import Drive, Sensors, check_drive
+from icrtool.simulation.drives import DrivePlan, Sensors, check_drive
 from icrtool.simulation.paths import PathKind, PathPlan
 from icrtool.simulation.study_runs import Progress
 
@@ -40,17 +40,20 @@ PAPER_TRACK_WIDTH_M = 0.51
 STUDY_STEP_S = 0.005
 """Track speeds of a path are held this long in a study: no longer than any wheel interval."""
 
+MOST_RUNS = 100_000
+"""Runs of a setting."""
+
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """One number of a study beside the paper's.
+class StudyNumber:
+    """One number of a study, and the number in the paper.
 
     Attributes
     ----------
-    what : what was measured
-    ours : low, middle, high; or one number; NaN where there is none
+    what : the quantity
+    ours : 5th percentile, median, 95th percentile; or one number; NaN where there is none
     unit : of `ours`
-    paper : what the paper says, in words; empty where it says nothing
+    paper : the paper's number as text; empty where it has none
     """
 
     what: str
@@ -61,20 +64,20 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class StudyRequest:
-    """What to study.
+    """The settings of a study.
 
     Attributes
     ----------
-    plan, sensors : the drive and what looks at it; a study varies one thing of them
+    plan, sensors : the drive and its sensors; a study varies one of their settings
     config : filter and robot
     presets : the filter presets to compare
     values : settings of what is varied; empty where nothing is
     paths : the kinds of path to compare, where a study compares them
-    vary_path : every run of a ``curved`` path begins elsewhere in its rhythms
+    vary_path : every run of a ``curved`` path has another phase
     """
 
     name: StudyName
-    plan: Drive
+    plan: DrivePlan
     sensors: Sensors
     config: Config
     presets: tuple[Preset, ...]
@@ -85,7 +88,7 @@ class StudyRequest:
     vary_path: bool = True
 
     def settings(self) -> dict[str, Any]:
-        """Return what stands in study.json: every parameter, as plain data."""
+        """Return the settings for study.json: every parameter, as plain data."""
         from dataclasses import asdict
 
         plan = {**asdict(self.plan), "path": asdict(cast(PathPlan, self.plan.path))}
@@ -104,26 +107,26 @@ class StudyRequest:
 
 @dataclass(frozen=True, slots=True)
 class StudyResult:
-    """What came out.
+    """The results of a study.
 
     Attributes
     ----------
     columns : one row a run: the CSV
     levels : one record a setting, with the statistics over its runs
-    findings : what to compare with the paper
-    curves : what the picture draws beside the levels, arrays by name
+    findings : numbers to compare with the paper's
+    curves : further arrays for the figure, by name
     """
 
     request: StudyRequest
     columns: dict[str, Column]
     levels: tuple[dict[str, Any], ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[StudyNumber, ...]
     curves: dict[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class StudyKind:
-    """A study as it is known by name.
+    """A kind of study: what it varies, and the function that carries it out.
 
     Attributes
     ----------
@@ -141,14 +144,14 @@ class StudyKind:
 
 KINDS: dict[StudyName, StudyKind] = {
     "convergence": StudyKind(
-        "4, 5", "how soon the ICRs converge, by kind of path", "", ("study_sweeps", "study_convergence")
+        "4, 5", "convergence time of the ICRs, by kind of path", "", ("study_sweeps", "study_convergence")
     ),
     "initial": StudyKind(
         "6, 7", "which initial ICRs converge, without and with the sign guard", "initial y ICRs [m]",
         ("study_initial", "study_initial"),
     ),
     "icr-change": StudyKind(
-        "8, 9", "how soon the filter follows a change of the ICRs, without and with covariance inflation", "",
+        "8, 9", "time to follow a change of the ICRs, without and with covariance inflation", "",
         ("study_changes", "study_icr_change"),
     ),
     "turn-radius": StudyKind(
@@ -165,7 +168,7 @@ KINDS: dict[StudyName, StudyKind] = {
         "11", "encoders against commanded speeds", "", ("study_sweeps", "study_input_source")
     ),
     "gnss": StudyKind(
-        "35-37", "ICR error and blind driving by noise of the GNSS", "GNSS noise [m]", ("study_sweeps", "study_gnss")
+        "35-37", "ICR error and open-loop error by noise of the GNSS", "GNSS noise [m]", ("study_sweeps", "study_gnss")
     ),
     "rate": StudyKind(
         "", "whether logs of any rate give the same ICRs", "rate of wheels and heading [Hz]",
@@ -182,7 +185,7 @@ def default_request(name: StudyName, config: Config) -> StudyRequest:  # noqa: P
     """Return a study with the paper's parameters, and the configuration's robot for the start of preset ``field``."""
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
-    plan, sensors = Drive(step_s=STUDY_STEP_S), Sensors(wheels="ideal", heading_resolution_rad=0.0)
+    plan, sensors = DrivePlan(step_s=STUDY_STEP_S), Sensors(wheels="ideal", heading_resolution_rad=0.0)
     both: tuple[Preset, ...] = ("paper", "field")
     base = StudyRequest(name, plan, sensors, config, both, runs=40)
     winding = replace(plan, path=PathPlan("curved", radius_m=2.0), duration_s=200.0)
@@ -214,7 +217,7 @@ def default_request(name: StudyName, config: Config) -> StudyRequest:  # noqa: P
 
 
 def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyResult:
-    """Carry out a study on all cores.
+    """Return the results of a study, computed on all cores.
 
     Parameters
     ----------
@@ -225,8 +228,8 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     ConfigError
         A request that cannot be driven.
     """
-    if request.runs < 1:
-        raise ConfigError("runs", f"{request.runs} is not a positive number")
+    if not 1 <= request.runs <= MOST_RUNS:
+        raise ConfigError("runs", f"{request.runs} is not a number from 1 to {MOST_RUNS:,}")
     if not all(math.isfinite(value) for value in request.values):
         raise ConfigError("values", f"{request.values} holds a value that is not finite")
     check_drive(request.plan, request.sensors)
@@ -238,11 +241,12 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
 
 
 def statistics(values: Floats) -> dict[str, float]:
-    """Return count, mean, std, median, 5th and 95th percentile of values (runs,), NaN passed over."""
-    told = values[np.isfinite(values)]
-    if not len(told):
+    """Return count, mean, std, median, 5th and 95th percentile of values (runs,); NaN are ignored."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return {"count": 0, "mean": math.nan, "std": math.nan, "p5": math.nan, "p50": math.nan, "p95": math.nan}
-    low, middle, high = (float(value) for value in np.percentile(told, [5, 50, 95]))
+    low, middle, high = (float(value) for value in np.percentile(finite, [5, 50, 95]))
     return {
-        "count": len(told), "mean": float(told.mean()), "std": float(told.std()), "p5": low, "p50": middle, "p95": high,
+        "count": len(finite), "mean": float(finite.mean()), "std": float(finite.std()),
+        "p5": low, "p50": middle, "p95": high,
     }  # fmt: skip

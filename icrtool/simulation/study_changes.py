@@ -1,4 +1,4 @@
-"""Studies of a change of the ICRs on the way: with and without covariance inflation, and by radius of the turn."""
+"""Studies of a change of the ICRs during a drive: with and without covariance inflation, and by radius of the turn."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from icrtool.errors import ConfigError
 from icrtool.records.tables import Floats
 from icrtool.simulation.drives import Icrs
 from icrtool.simulation.paths import PathPlan
-from icrtool.simulation.studies import Finding, StudyRequest, StudyResult, statistics
+from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, measure_times, trace
 from icrtool.simulation.study_runs import Chunk, Progress
 from icrtool.simulation.study_sweeps import Level, base_scenario, run_levels, spread
@@ -27,7 +27,7 @@ ZOOM_STEPS = 500
 
 
 def changed(icrs_m: Icrs, number: int) -> Icrs:
-    """Return the ICRs after change 1, 2, …: wider and narrower in turn. The paper does not say its own."""
+    """Return the ICRs after change 1, 2, …: alternately wider and narrower. The paper does not state its values."""
     right, left, x = icrs_m
     width = right - left
     if number % 2:
@@ -36,19 +36,19 @@ def changed(icrs_m: Icrs, number: int) -> Icrs:
 
 
 def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Change the ICRs twice; with and without telling the filter (Figs. 8, 9)."""
+    """Return how the filter follows two changes of the ICRs, with and without covariance inflation (Figs. 8, 9)."""
     plan = request.plan
     if not plan.changes:
         icrs = tuple((time, changed(plan.icrs_m, number + 1)) for number, time in enumerate(CHANGE_TIMES_S))
         plan = replace(plan, changes=tuple(change for change in icrs if change[0] < plan.duration_s))
         if not plan.changes:
             why = f"{plan.duration_s:g} s end before the first change, at {CHANGE_TIMES_S[0]:g} s"
-            raise ConfigError("duration", why, "drive longer, or say when with --change")
+            raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
     request = replace(request, plan=plan)
     levels = [
         Level(preset, name, replace(base_scenario(request, preset), inflate=inflate))
         for preset in request.presets
-        for name, inflate in (("not told", False), ("inflated", True))
+        for name, inflate in (("not inflated", False), ("inflated", True))
     ]
     times = [time for time, _ in plan.changes]
     edges = [*times, plan.duration_s]
@@ -63,19 +63,19 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
     columns, records, found = run_levels(levels, request, measure, progress)
     findings = []
     for level, one in zip(levels, found, strict=True):
-        told = level.value == "inflated"
-        rises = np.concatenate([one[f"change{n}_rise_{icr}_s"] for n in range(1, len(edges)) for icr in ICR_NAMES])
+        inflated = level.value == "inflated"
+        durations = np.concatenate([one[f"change{n}_rise_{icr}_s"] for n in range(1, len(edges)) for icr in ICR_NAMES])
         settles = np.concatenate([one[f"change{n}_settle_s"] for n in range(1, len(edges))])
-        paper = "0.03-0.17 s (Fig. 9)" if told else "100-140 s (Fig. 8)"
+        paper = "0.03-0.17 s (Fig. 9)" if inflated else "100-140 s (Fig. 8)"
         findings += [
-            Finding(f"{level.series}, {level.value}: 10-90 % rise", spread(rises), "s", paper),
-            Finding(f"{level.series}, {level.value}: all three stay within 10 % after", spread(settles), "s"),
-            Finding(
+            StudyNumber(f"{level.series}, {level.value}: convergence time (10-90 %)", spread(durations), "s", paper),
+            StudyNumber(f"{level.series}, {level.value}: all three stay within 10 % after", spread(settles), "s"),
+            StudyNumber(
                 f"{level.series}, {level.value}: … in so many of the changes",
                 (100 * float(np.isfinite(settles).mean()),),
                 "%",
             ),
-            Finding(f"{level.series}, {level.value}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
+            StudyNumber(f"{level.series}, {level.value}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
         ]
     true_icrs = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
     curves: dict[str, Floats] = {"changes": np.array(times), "true_icrs": true_icrs}
@@ -96,7 +96,7 @@ def _zoom(chunk: Chunk, since_s: float) -> Floats:
 
 
 def study_turn_radius(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Change the ICRs on circles of several radii, telling the filter (Fig. 10).
+    """Return the convergence after a change of the ICRs on circles of several radii, with inflation (Fig. 10).
 
     The faster track keeps one speed: at radius 0 the robot spins, and the wider the circle, the slower it turns.
     """
@@ -123,8 +123,10 @@ def study_turn_radius(request: StudyRequest, progress: Progress | None) -> Study
             settles = np.concatenate([one[f"settle_{icr}_s"] for icr in ICR_NAMES])
             label = f"{level.series}: radius {level.value:g} m"
             findings += [
-                Finding(f"{label}: an ICR stays within 10 % after, mean", (statistics(settles)["mean"],), "s", paper),
-                Finding(f"{label}: all three do", spread(one["settle_s"]), "s"),
-                Finding(f"{label}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
+                StudyNumber(
+                    f"{label}: an ICR stays within 10 % after, mean", (statistics(settles)["mean"],), "s", paper
+                ),
+                StudyNumber(f"{label}: all three do", spread(one["settle_s"]), "s"),
+                StudyNumber(f"{label}: ends inverted", (100 * float(one["inverted"].mean()),), "%"),
             ]
     return StudyResult(request, columns, records, tuple(findings))

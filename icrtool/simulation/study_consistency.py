@@ -1,4 +1,4 @@
-"""Is the covariance right? NEES, NIS and coverage over many seeds: where the model holds, and with the presets."""
+"""Consistency of the filter's covariance: NEES, NIS and coverage over many seeds, with a true model and the presets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrtool.kernels.batch_filter import model_states, run_batch
 from icrtool.records.tables import Bools, Floats
 from icrtool.simulation.drives import Readings, Sensors, sample_times
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
-from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult, statistics
+from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES
 from icrtool.simulation.study_runs import (
     Chunk,
@@ -33,11 +33,11 @@ from icrtool.simulation.study_sweeps import base_scenario
 STATES = ("north", "east", "heading", *ICR_NAMES)
 
 MODEL_ICR_STD_M = 0.1
-"""How well the ICRs are known at the start where the model holds: little enough for an EKF to be nearly linear."""
+"""Initial standard deviation of the ICRs in case ``model``: small enough for an EKF to be nearly linear."""
 
 STOP_EVERY_S = 5.0
 SETTLED_S = 10.0
-"""Stops from here on count: before, the presets' starts are still wearing off."""
+"""Only stops after this time count: before, the initial values of the presets still have an effect."""
 
 PROBABILITY = 0.95
 
@@ -48,12 +48,12 @@ WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of head
 
 
 def study_consistency(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Compare errors with what the filter says of them.
+    """Return the errors of the filter in its own standard deviations: NEES, NIS and coverage.
 
     Notes
     -----
     Case ``model``: the truth obeys Eq. 14 with process noise drawn from Q (Eq. 30) and measurements drawn from R
-    (Eq. 31), and the filter starts from a prior it is told. Then NEES and NIS are chi-squared (Bar-Shalom, Li,
+    (Eq. 31), and the filter starts from the prior of the truth. Then NEES and NIS are chi-squared (Bar-Shalom, Li,
     Kirubarajan 2001, Section 5.4). Cases ``paper`` and ``field``: constant ICRs and exact kinematics, preset's start.
     """
     stops = tuple(np.arange(STOP_EVERY_S, request.plan.duration_s, STOP_EVERY_S))
@@ -142,8 +142,8 @@ def _per_run(case: dict[str, Floats], name: str) -> Floats:
 
 def _settled(case: dict[str, Floats]) -> Bools:
     stops = case["stops"][0]
-    late: Bools = stops >= min(SETTLED_S, stops[-1])
-    return late
+    settled: Bools = stops >= min(SETTLED_S, stops[-1])
+    return settled
 
 
 def _level(name: str, case: dict[str, Floats]) -> dict[str, Any]:
@@ -157,9 +157,9 @@ def _level(name: str, case: dict[str, Floats]) -> dict[str, Any]:
     by_stop = nees.mean(axis=0)
     level["nees"]["stops_in_band_pct"] = 100 * float(((by_stop >= low) & (by_stop <= high)).mean())
     for what, degrees in (("gnss", 2), ("heading", 1)):
-        told = case[f"nis_{what}"][np.isfinite(case[f"nis_{what}"])]
-        band = chi2_band(degrees * len(told), len(told))
-        level[f"nis_{what}"] = {"mean": float(told.mean()), "expected": float(degrees), "band": band}
+        finite = case[f"nis_{what}"][np.isfinite(case[f"nis_{what}"])]
+        band = chi2_band(degrees * len(finite), len(finite))
+        level[f"nis_{what}"] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
     level["states"] = list(STATES)
     level["coverage_pct"] = [100 * float((np.abs(ratio[..., place]) <= 2).mean()) for place in range(6)]
     level["rms_error_over_std"] = [float(np.sqrt((ratio[..., place] ** 2).mean())) for place in range(6)]
@@ -167,18 +167,18 @@ def _level(name: str, case: dict[str, Floats]) -> dict[str, Any]:
     return level
 
 
-def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
+def _findings(levels: tuple[dict[str, Any], ...]) -> list[StudyNumber]:
     findings = []
     for level in levels:
         name = level["series"]
         for what in ("nees", "nis_gnss", "nis_heading"):
             low, high = level[what]["band"]
             expected = f"{level[what]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
-            findings.append(Finding(f"{name}: {WORDS[what]}, mean", (level[what]["mean"],), "", expected))
-            findings.append(Finding(f"{name}: {WORDS[what]}, median run", (level["by_run"][what]["p50"],), ""))
+            findings.append(StudyNumber(f"{name}: {WORDS[what]}, mean", (level[what]["mean"],), "", expected))
+            findings.append(StudyNumber(f"{name}: {WORDS[what]}, median run", (level["by_run"][what]["p50"],), ""))
         covered = level["coverage_pct"]
         findings.append(
-            Finding(
+            StudyNumber(
                 f"{name}: pose within 2 sigma, least and most",
                 (min(covered[:3]), max(covered[:3])),
                 "%",
@@ -186,7 +186,7 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
             )
         )
         findings.append(
-            Finding(
+            StudyNumber(
                 f"{name}: ICRs within 2 sigma, least and most",
                 (min(covered[3:]), max(covered[3:])),
                 "%",

@@ -9,22 +9,22 @@ import numpy as np
 
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
 from icrtool.records.tables import Floats
-from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult
+from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult
 from icrtool.simulation.study_measures import inverted, trace
 from icrtool.simulation.study_runs import Chunk, Progress, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
 
 GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": GUARDED}
-"""Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as the tool has them."""
+"""Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as icrtool uses them."""
 
 CONVERGED_M = 0.1
-"""All three ICRs are this near the truth, on the average of the last tenth of a run."""
+"""A run has converged where all three ICRs, averaged over its last tenth, are within this distance of the truth [m]."""
 
 LAST_SHARE = 10
 
 
 def study_initial(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Start every run at a point of a grid of y ICRs, in every guard."""
+    """Return from which points of a grid of initial y ICRs the filter converges, for every guard."""
     preset = request.presets[0]
     base = base_scenario(request, preset)
     settings = request.config.filter
@@ -72,7 +72,7 @@ def _measure(chunk: Chunk) -> dict[str, Floats]:
     }
 
 
-def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
+def _findings(levels: tuple[dict[str, Any], ...]) -> list[StudyNumber]:
     findings = []
     papers = {
         "no guard": "those with y_icr_right > 0 (Fig. 6)",
@@ -86,8 +86,8 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[Finding]:
         for label, some in (("proper start", proper), ("inverted start", wrong)):
             if some:
                 shares = [100 * float(np.mean([level[fate] for level in some])) for fate in ("converged", "inverted")]
-                findings.append(Finding(f"{name}, {label}: converged", (shares[0],), "%", papers[name]))
-                findings.append(Finding(f"{name}, {label}: ends inverted", (shares[1],), "%"))
+                findings.append(StudyNumber(f"{name}, {label}: converged", (shares[0],), "%", papers[name]))
+                findings.append(StudyNumber(f"{name}, {label}: ends inverted", (shares[1],), "%"))
     return findings
 
 

@@ -37,20 +37,20 @@ def measure_errors(chunk: Chunk) -> dict[str, Floats]:
 
 
 def measure_times(chunk: Chunk, since_s: float = 0.0, until_s: float = np.inf) -> dict[str, Floats]:
-    """Return rise and settling times [s] of every ICR after `since_s`, NaN where they do not come before `until_s`."""
+    """Return convergence and settling times [s] of every ICR after `since_s`; NaN: not before `until_s`."""
     begin = max(int(np.searchsorted(chunk.t_s, since_s - 1e-9)) - 1, 0)
     end = int(np.searchsorted(chunk.t_s, until_s - 1e-9))
     t = chunk.t_s[begin:end] - max(since_s, chunk.t_s[0])
     columns = {}
     for place, name in enumerate(ICR_NAMES):
         value, target = chunk.x[:, begin:end, 3 + place], float(chunk.true_icrs_m[end - 1, place])
-        columns[f"rise_{name}_s"] = rise_times(t, value, target)
+        columns[f"rise_{name}_s"] = convergence_times(t, value, target)
         columns[f"settle_{name}_s"] = settling_times(t, value, target)
     columns["settle_s"] = np.max([columns[f"settle_{name}_s"] for name in ICR_NAMES], axis=0)
     return columns
 
 
-def rise_times(t: Floats, value: Floats, target: float) -> Floats:
+def convergence_times(t: Floats, value: Floats, target: float) -> Floats:
     """Return the time (runs,) [s] between the first samples past 10 % and past 90 % of the change to the target.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Many simulated runs through the filter, chunk by chunk on all cores, each reduced to what a study asks of it."""
+"""Filter many simulated runs, chunk by chunk on all cores; each chunk is reduced to the numbers a study needs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.batch_filter import Batch, BatchOutput, run_batch
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
-from icrtool.simulation.drives import Drive, Icrs, Readings, Sensors, Truth, move, sense
+from icrtool.simulation.drives import DrivePlan, Icrs, Readings, Sensors, Truth, check_drive, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 
 Progress = Callable[[float], None]
@@ -27,17 +27,17 @@ CHUNK_STATES = 160_000
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One setting of a study: what is driven, what looks at it, and the filter.
+    """One setting of a study: drive, sensors and filter.
 
     Attributes
     ----------
     config : its filter section is used, and its robot for the start of preset ``field``
-    vary_path : every run of a ``curved`` path begins elsewhere in its rhythms
-    inflate : tell the filter of the drive's ICR changes (Section 5.2)
+    vary_path : every run of a ``curved`` path has another phase
+    inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
     guard : sign guard, of `icrtool.kernels.kinematics`; other than GUARDED the filter takes the Euler steps of Eq. 14
     """
 
-    plan: Drive
+    plan: DrivePlan
     sensors: Sensors
     config: Config
     vary_path: bool = True
@@ -47,7 +47,7 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Some runs of a scenario, done.
+    """The filtered runs of a part of a scenario.
 
     Attributes
     ----------
@@ -110,6 +110,8 @@ def run_scenarios(
     -------
     list of the columns of `measure`, (runs, ...), a scenario each
     """
+    for scenario in scenarios:
+        check_drive(scenario.plan, scenario.sensors)
     jobs = [
         (number, part)
         for number, scenario in enumerate(scenarios)
@@ -144,7 +146,7 @@ def on_all_cores(work: Callable[[Job], Done], jobs: Sequence[Job], progress: Pro
 
 
 def joined(parts: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
-    """Put the columns of chunks one below the other."""
+    """Return the columns of all chunks, concatenated."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -185,12 +187,12 @@ def _simulate(scenario: Scenario, run: int, seed: int) -> tuple[Truth, Readings]
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
     if scenario.vary_path and isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
-    truth = move(plan, 1 / scenario.sensors.wheel_rate_hz)
+    truth = drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
     return truth, sense(truth, scenario.sensors, plan.duration_s, rng)
 
 
 def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
-    """Return readings as the table a log would give."""
+    """Return readings as a log."""
 
     def stamps(times: Floats) -> Ints:
         return np.rint(times * 1e9).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Studies that vary one thing and look at the ICRs: paths, input noise and bias, input source, GNSS noise, rates."""
+"""Studies of the ICRs that vary one setting: path, input noise or bias, input source, GNSS noise, rates."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.records.tables import Floats
-from icrtool.simulation.drives import Sensors, move, sense
+from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
-from icrtool.simulation.studies import Column, Finding, StudyRequest, StudyResult, statistics
+from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_errors, trace
 from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
 
@@ -68,12 +68,12 @@ def run_levels(
 
 def spread(values: Floats) -> tuple[float, float, float]:
     """Return the 5th percentile, the median and the 95th percentile."""
-    told = statistics(values)
-    return told["p5"], told["p50"], told["p95"]
+    found = statistics(values)
+    return found["p5"], found["p50"], found["p95"]
 
 
 def study_convergence(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Time the convergence from the preset's start, by kind of path (Figs. 4, 5)."""
+    """Return the convergence times from the preset's start, by kind of path (Figs. 4, 5)."""
     path = cast(PathPlan, request.plan.path)
     levels = []
     for preset in request.presets:
@@ -89,12 +89,14 @@ def study_convergence(request: StudyRequest, progress: Progress | None) -> Study
         progress,
     )
     findings = [
-        Finding(f"{level.value} ({level.series}): all three ICRs converged after", spread(one["settle_s"]), "s", said)
+        StudyNumber(
+            f"{level.value} ({level.series}): all three ICRs converged after", spread(one["settle_s"]), "s", paper
+        )
         for level, one in zip(levels, found, strict=True)
-        for said in ["2.9-12.8 s, driven (Figs. 15, 17)" if level.value == "circle" else "5-15 s, driven"]
+        for paper in ["2.9-12.8 s, driven (Figs. 15, 17)" if level.value == "circle" else "5-15 s, driven"]
     ]
     shown = next((place for place, level in enumerate(levels) if level.value == path.kind), 0)
-    truth = move(levels[shown].scenario.plan, 0.0)
+    truth = drive_plan(levels[shown].scenario.plan, 0.0)
     curves = {
         "trace": found[shown]["trace"],
         "path": truth.pose[:: 1 + len(truth.pose) // PATH_POINTS, :2],
@@ -105,12 +107,12 @@ def study_convergence(request: StudyRequest, progress: Progress | None) -> Study
 
 
 def study_input_noise(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Vary the noise of the track speeds (Fig. 12)."""
+    """Return the ICR errors by noise of the track speeds (Fig. 12)."""
     return _vary_sensors(request, "input_noise_mps", "Fig. 12's axis: -1 to 1 m", progress)
 
 
 def study_input_bias(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Vary the bias of both track speeds (Fig. 13)."""
+    """Return the ICR errors by bias of both track speeds (Fig. 13)."""
     return _vary_sensors(request, "input_bias_mps", "Fig. 13's axis: -0.1 to 0.02 m", progress)
 
 
@@ -125,7 +127,9 @@ def _vary_sensors(
         ]
     columns, records, found = run_levels(levels, request, measure_errors, progress)
     findings = [
-        Finding(f"{preset}: error of {icr} at {max(request.values):g} m/s", spread(one[f"error_{icr}_m"]), "m", paper)
+        StudyNumber(
+            f"{preset}: error of {icr} at {max(request.values):g} m/s", spread(one[f"error_{icr}_m"]), "m", paper
+        )
         for preset in request.presets
         for level, one in zip(levels, found, strict=True)
         if level.series == preset and level.value == max(request.values)
@@ -141,7 +145,7 @@ def _varied(sensors: Sensors, name: Literal["input_noise_mps", "input_bias_mps"]
 
 
 def study_input_source(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Compare encoders with commanded speeds (Fig. 11, Section 5.3), on the same drives.
+    """Return the ICR errors with encoders and with commanded speeds (Fig. 11, Section 5.3), on the same drives.
 
     The motors get commands at a low rate and follow with a lag; the bias is between command and track.
     """
@@ -157,11 +161,11 @@ def study_input_source(request: StudyRequest, progress: Progress | None) -> Stud
     ]
     columns, records, found = run_levels(levels, request, measure_errors, progress)
     findings = [
-        Finding(f"{level.series}: error of {icr}, {level.value} speeds", spread(one[f"error_{icr}_m"]), "m")
+        StudyNumber(f"{level.series}: error of {icr}, {level.value} speeds", spread(one[f"error_{icr}_m"]), "m")
         for level, one in zip(levels, found, strict=True)
         for icr in ICR_NAMES
     ]
-    truth = move(request.plan, 1.0)
+    truth = drive_plan(request.plan, 1.0)
     curves: dict[str, Floats] = {"true_t": truth.t_s, "true_v": truth.v_left_mps}
     for name, sensors in views.items():
         seen = sense(truth, sensors, request.plan.duration_s, np.random.default_rng((request.seed, 0)))
@@ -170,7 +174,7 @@ def study_input_source(request: StudyRequest, progress: Progress | None) -> Stud
 
 
 def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Vary the noise of the GNSS, and drive blind with what was learned (Figs. 35-37)."""
+    """Return ICR errors and open-loop errors by noise of the GNSS (Figs. 35-37)."""
     width = cast(float, request.config.robot.track_width_m)
 
     def measure(chunk: Chunk) -> dict[str, Floats]:
@@ -189,14 +193,16 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
         if level.value in (min(request.values), 0.3):
             label = f"{level.series}: GNSS {level.value:g} m"
             paper = "within 3.8 m for 95 % (RTK, tracked, Fig. 29)" if level.value == min(request.values) else ""
-            findings.append(Finding(f"{label}: blind 10 m, p95", spread(one["blind_icr_10m_p95_m"]), "m", paper))
-            findings.append(Finding(f"{label}: rms error of y_icr_right", spread(one["rms_y_icr_right_m"]), "m"))
-    findings.append(Finding("no slip: blind 10 m, p95", spread(found[0]["blind_no_slip_10m_p95_m"]), "m"))
+            findings.append(
+                StudyNumber(f"{label}: open loop after 10 m, p95", spread(one["blind_icr_10m_p95_m"]), "m", paper)
+            )
+            findings.append(StudyNumber(f"{label}: rms error of y_icr_right", spread(one["rms_y_icr_right_m"]), "m"))
+    findings.append(StudyNumber("no slip: open loop after 10 m, p95", spread(found[0]["blind_no_slip_10m_p95_m"]), "m"))
     return StudyResult(request, columns, records, tuple(findings))
 
 
 def study_rate(request: StudyRequest, progress: Progress | None) -> StudyResult:
-    """Record the same drives at several rates, to see whether the ICRs are the same."""
+    """Return the ICR errors of the same drives recorded at several rates."""
     levels = []
     for preset in request.presets:
         base = base_scenario(request, preset)
@@ -212,9 +218,9 @@ def study_rate(request: StudyRequest, progress: Progress | None) -> StudyResult:
             means = [float(one[f"error_{icr}_m"].mean()) for one in of_preset]
             stated = [float(np.median(one[f"std_{icr}_m"])) for one in of_preset]
             findings.append(
-                Finding(f"{preset}: {icr} differs between rates by at most", (max(means) - min(means),), "m")
+                StudyNumber(f"{preset}: {icr} differs between rates by at most", (max(means) - min(means),), "m")
             )
             findings.append(
-                Finding(f"{preset}: stated std of {icr}, least and greatest", (min(stated), max(stated)), "m")
+                StudyNumber(f"{preset}: stated std of {icr}, least and greatest", (min(stated), max(stated)), "m")
             )
     return StudyResult(request, columns, records, tuple(findings))

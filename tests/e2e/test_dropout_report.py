@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from icrtool.cli import main
+from icrtool.output.own_files import OWN_FILES
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_figure_eight"
@@ -77,7 +78,7 @@ def test_a_log_is_fitted_and_reported_on_in_one_go(fitted: Path) -> None:
     assert "Traceback" not in err
     assert (fitted / RUN / "states.csv").is_file()
     assert (fitted / RUN / "plots" / "trajectory.png").is_file()
-    files = {"summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
+    files = {OWN_FILES, "summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
     pictures = {f"plots/{name}.png" for name in PICTURES | {"outages"}}
     assert files_in(fitted / RUN / "dropout") == files | pictures
     assert "stays within 0.5 m (95 %) for" in out
@@ -112,11 +113,13 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
     assert done.returncode == 0, done.stderr
     assert {name: (folder / RUN / name).read_bytes() for name in before} == before
     assert files_in(folder / RUN / "dropout") == {
+        OWN_FILES,
         "summary.csv",
         "histogram.csv",
         "ladder.csv",
         "worst.csv",
         "report.json",
+        ".icrtool-files",
     }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])
@@ -244,3 +247,16 @@ def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> 
     status, _, err = report_here(folder, RUN)
     assert status == 1
     assert "measurements.npz was edited" in err
+
+
+def test_a_standstill_counts_once_unless_every_start_is_asked_for(folder: Path, report_here) -> None:
+    documents = {}
+    for starts in ("moving", "all"):
+        status, _, err = report_here(folder, RUN, "--starts", starts, "--horizons", "1,5,1e6", "--no-ladder")
+        assert (status, err) == (0, "")
+        documents[starts] = json.loads((folder / RUN / "dropout" / "report.json").read_text(encoding="utf-8"))
+    moving, every = (documents[starts]["trials"][0] for starts in ("moving", "all"))
+    assert every["no_trial"]["from_standstill"] == 0
+    assert every["trials"] - moving["trials"] == moving["no_trial"]["from_standstill"]
+    assert documents["all"]["starts_counted"] == "all"
+    assert documents["all"]["trials"][2]["why_none"]

@@ -75,7 +75,7 @@ class BagDirectory:
             self._scratch.cleanup()
 
     def begin_ns(self) -> int | None:
-        """Return the log time of the first message of all files, None where one of them does not say."""
+        """Return the log time of the first message of all files, None where one of them has no index."""
         begins = [part.begin_ns() for part in self._parts]
         known = [begin for begin in begins if begin is not None]
         return min(known) if known and len(known) == len(begins) else None
@@ -104,20 +104,20 @@ class BagDirectory:
                 spans.append(Span(min(begins), max(ends), file.name))
         if self._by_name:
             for odd in check_spans(self._path, spans):
-                self._problems.say(odd)
+                self._problems.add(odd)
 
     def _read_metadata(self) -> _Metadata:
-        """Return what metadata.yaml says; a recorder that was killed leaves none, or half of it."""
+        """Return the content of metadata.yaml; a recorder that was killed leaves no such file, or half of it."""
         file = self._path / "metadata.yaml"
         if not file.is_file():
-            self._problems.say("no metadata.yaml; the storage files in it were read by name")
+            self._problems.add("no metadata.yaml; its storage files were found by their names")
             return _Metadata()
         try:
             if file.stat().st_size > _LARGEST_METADATA_BYTES:
-                raise ValueError("far too long")
+                raise ValueError("too long")
             return _metadata(file.read_text(encoding="utf-8"))
         except (ValueError, OSError, RecursionError):
-            self._problems.say("its metadata.yaml cannot be read; the storage files in it were read by name")
+            self._problems.add("its metadata.yaml cannot be read; its storage files were found by their names")
             return _Metadata()
 
     def _find_files(self, names: tuple[str, ...]) -> list[Path]:
@@ -127,7 +127,7 @@ class BagDirectory:
         if len(there) < len(named):
             found = frozenset(there)
             missing = [file.name for file in named if file not in found]
-            self._problems.say(f"metadata.yaml names files that are not there: {some_of(missing)}")
+            self._problems.add(f"metadata.yaml names files that are not there: {some_of(missing)}")
         if there:
             return there
         self._by_name = True
@@ -140,9 +140,9 @@ class BagDirectory:
             self._parts.append(kind(storage, message_compression))
             self.files.append(file)
         except LogError as err:
-            self._problems.say(f"{file.name}: {err.why}; {err.advice}")
+            self._problems.add(f"{file.name}: {err.why}; {err.advice}")
         except OSError as err:
-            self._problems.say(f"{file.name}: cannot be read; {err.strerror}")
+            self._problems.add(f"{file.name}: cannot be read; {err.strerror}")
 
     def _unpacked(self, file: Path) -> Path:
         """Decompress a storage file to a temporary folder, a piece at a time."""
@@ -164,11 +164,11 @@ class BagDirectory:
                     sink.write(piece)
                     left -= len(piece)
             if left <= 0:
-                self._problems.say(f"{file.name}: is over {LARGEST_RATIO} times its size when decompressed; cut there")
+                self._problems.add(f"{file.name}: is over {LARGEST_RATIO} times its size when decompressed; cut there")
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
-            self._problems.say(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
+            self._problems.add(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
         except OSError as err:
             free = shutil.disk_usage(self._scratch.name).free
             raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err
@@ -195,12 +195,12 @@ class BagDirectory:
 
 
 def _metadata(text: str) -> _Metadata:
-    """Return what the text of a metadata.yaml says of the storage files.
+    """Return what the text of a metadata.yaml states about the storage files.
 
     Raises
     ------
     ValueError
-        No YAML, none of a bag, an alias, or more files than a bag has.
+        The text is not YAML, or not the metadata of a bag; it has an alias, or names more files than a bag has.
     """
     document = _plain_yaml(text)
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
@@ -217,12 +217,12 @@ def _metadata(text: str) -> _Metadata:
 def _plain_yaml(text: str) -> object:  # noqa: PLR0912 - one branch for each kind of event
     """Return a YAML text as dicts, lists and strings.
 
-    An alias, with which a short text can stand for gigabytes, is refused; merge keys are keys like any other.
+    An alias lets a short text stand for gigabytes: it is refused. Merge keys are ordinary keys here.
 
     Raises
     ------
     ValueError
-        No YAML, an alias, or a key that is no text.
+        The text is not YAML, has an alias, or has a key that is not a text.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError

@@ -18,7 +18,7 @@ Bytes = NDArray[np.uint8]
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 
 MOST_NAMED = 12
-"""Names that a message lists before it says that there are more."""
+"""Names that a message to the user lists; of more names it shows that there are more."""
 
 LATEST_NS = 1 << 62
 """The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
@@ -35,7 +35,7 @@ class Channel:
     encoding : ``cdr`` (ROS 2), ``ros1``, or what the log calls an encoding that cannot be read
     definition : text of the message definition, empty when the log does not carry it
     definition_format : how `definition` is written
-    count : number of messages where an index tells, else None
+    count : number of messages by the log's index, None without an index
     """
 
     id: int
@@ -59,7 +59,7 @@ class Cut(NamedTuple):
 
         Parameters
         ----------
-        held : its channels, None where no index says
+        held : its channels, None without an index
         begin_ns, end_ns : its first and last log time by the index; 0 and 0 where that is not known
         """
         if held is not None and not held & wanted:
@@ -132,7 +132,7 @@ class Container(Protocol):
         ...
 
     def share_read(self) -> float:
-        """Return how much of the log has gone by, 0 to 1."""
+        """Return the share of the log that has been read, 0 to 1."""
         ...
 
     def close(self) -> None:
@@ -141,31 +141,31 @@ class Container(Protocol):
 
 
 class Problems(list[str]):
-    """What could not be read of a file, in sentences: each is kept once, and no more of them than a person reads."""
+    """Sentences about what could not be read of a file: each is kept once, and at most `MOST_PROBLEMS` of them."""
 
     def __init__(self, name: str) -> None:
         super().__init__()
         self._name = LogText(name)
 
-    def say(self, problem: str) -> None:
-        """Add a sentence."""
+    def add(self, problem: str) -> None:
+        """Add a sentence, if it is new and there is space."""
         text = shortened(escaped(f"{self._name}: {problem}"), LONGEST_PROBLEM)
         if text not in self and len(self) <= MOST_PROBLEMS:
             self.append(text if len(self) < MOST_PROBLEMS else f"{self._name}: and more of the kind")
 
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
-    """Return a block without the messages whose log time cannot be one."""
+    """Return a block without the messages whose log time is negative or beyond `LAST_TIME_NS`."""
     possible = (block.log_time_ns >= 0) & (block.log_time_ns < LATEST_NS)
     if possible.all():
         return block
-    problems.say("messages with an impossible log time left out")
+    problems.add("messages with an impossible log time left out")
     _, *columns = block
     return Block(block.data, *(column[possible] for column in columns))
 
 
 def some_of(names: Sequence[str]) -> str:
-    """Return names from a log in a row, the first ones of many."""
+    """Return names from a log, separated by commas; of many names only the first ones."""
     shown = [str(LogText(name)) for name in names[:MOST_NAMED]]
     return ", ".join([*shown, *(["…"] if len(names) > MOST_NAMED else [])])
 

@@ -1,4 +1,4 @@
-"""Decompression with a ceiling: what a chunk claims to hold is checked before memory is asked for."""
+"""Decompression with a limit: the size that a chunk states is checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from icrtool.logs.containers.channel import Block
 
 LARGEST_CHUNK_BYTES = 1 << 28
-"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; one that claims more than this is damaged."""
+"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; a chunk that states more is damaged."""
 
 LARGEST_RATIO = 100
-"""A log as a whole inflates no more than this, beside one chunk of the largest size."""
+"""A log may take this many times its size when decompressed, and one chunk of the largest size more."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOCK_BYTES = 1 << 24
@@ -21,10 +21,10 @@ _UNKNOWN_SIZE_BYTES = 1 << 24
 
 
 class Inflation:
-    """How much of a log was decompressed, held below a multiple of what it takes in the file.
+    """Counts the bytes decompressed from a log, and limits them to a multiple of their size in the file.
 
-    Recorded chunks shrink by 2 to 20 times. A chunk that is made to inflate 1,000 times costs little space, and a
-    thousand of them would cost minutes.
+    Recorded chunks shrink by a factor of 2 to 20. A crafted chunk can grow by 1,000 times; a thousand such chunks would
+    take minutes.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Inflation:
 
 
 class DecompressionError(Exception):
-    """A chunk that does not decompress; `args[0]` says why."""
+    """A chunk that cannot be decompressed; `args[0]` is the reason."""
 
 
 def decompress(data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
@@ -55,13 +55,13 @@ def decompress(data: bytes | memoryview, compression: str, size: int, *, partial
     Parameters
     ----------
     compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : the size the log says it has, in bytes
-    partial : the data is cut off; return what can be had of it
+    size : decompressed size stated in the log [bytes]
+    partial : the data is cut off; return the part that can be decompressed
 
     Raises
     ------
     DecompressionError
-        Damaged data, another size than announced, or a compression that is not known.
+        Damaged data, a size other than `size`, or an unknown compression.
     """
     if compression in ("", "none"):
         return bytes(data)
@@ -104,14 +104,14 @@ _DECODERS = {"lz4": _lz4, "zstd": _zstd, "bz2": _bz2}
 
 
 def unpack_messages(
-    blocks: Iterator[Block], wanted: frozenset[int], compression: str, say: Callable[[str], None]
+    blocks: Iterator[Block], wanted: frozenset[int], compression: str, report: Callable[[str], None]
 ) -> Iterator[Block]:
     """Decompress the wanted messages of a bag that was written with message compression.
 
     Parameters
     ----------
-    compression : ``zstd``, or what metadata.yaml calls a compression that cannot be read
-    say : told once, after the last block, how many messages do not decompress, and why
+    compression : ``zstd``, or the name in metadata.yaml of a compression that is not supported
+    report : called once, after the last block, with how many messages could not be decompressed, and why
     """
     left_out, reason = 0, ""
     for block in blocks:
@@ -132,11 +132,11 @@ def unpack_messages(
                 rows, messages, held = [], [], 0
         yield _repacked(block, rows, messages)
     if left_out:
-        say(f"{left_out} compressed messages left out: {reason}")
+        report(f"{left_out} compressed messages left out: {reason}")
 
 
 def _repacked(block: Block, rows: list[int], messages: list[bytes]) -> Block:
-    """Return the given rows of a block with other contents."""
+    """Return the given rows of a block, with `messages` as their contents."""
     end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
     start = np.concatenate([[0], end])[:-1].astype(np.int64)
     data = np.frombuffer(b"".join(messages), np.uint8)

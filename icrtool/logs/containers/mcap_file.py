@@ -46,13 +46,13 @@ _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
 
 
 class _Chunk(NamedTuple):
-    """Where a chunk record's content is: file offset and length; what an index tells of it.
+    """Where a chunk record's content is in the file: offset and length; and its entry in the index.
 
     Attributes
     ----------
-    channels : those it holds, None where that is not told
+    channels : those it holds, None without an entry
     index_length : length of the message index records that follow it
-    begin_ns, end_ns : first and last log time in it, 0 where that is not told
+    begin_ns, end_ns : first and last log time in it, 0 without an entry
     """
 
     at: int
@@ -68,7 +68,7 @@ class McapFile:
 
     Parameters
     ----------
-    message_compression : how each message was compressed on its own (rosbag2's metadata.yaml tells), empty if not
+    message_compression : compression of each single message, from rosbag2's metadata.yaml; empty for none
 
     Raises
     ------
@@ -90,10 +90,10 @@ class McapFile:
         try:
             self._size = path.stat().st_size
             if self._stream.read(len(MAGIC)) != MAGIC:
-                raise LogError(path, "not an MCAP file", "its first bytes are not MCAP's")
+                raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
             self._chunks = self._read_index()
             if self._chunks is None:
-                for _ in self._walk(learn=True):
+                for _ in self._read_in_order(learn=True):
                     pass
         except BaseException:
             self.close()
@@ -101,7 +101,7 @@ class McapFile:
         self.channels = [self._channel(number) for number in sorted(self._channels)]
 
     def share_read(self) -> float:
-        """Return the place in the file as a share of its size."""
+        """Return the share of the file that has been read, 0 to 1."""
         return self._stream.tell() / max(self._size, 1)
 
     def close(self) -> None:
@@ -117,9 +117,9 @@ class McapFile:
         """Yield the messages of the wanted channels, chunk by chunk."""
         if not wanted:
             return
-        blocks = self._walk() if self._chunks is None else self._indexed(self._chunks, wanted, cut)
+        blocks = self._read_in_order() if self._chunks is None else self._indexed(self._chunks, wanted, cut)
         if self._message_compression:
-            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
+            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
     def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
@@ -142,7 +142,7 @@ class McapFile:
         )
 
     def _read_index(self) -> list[_Chunk] | None:
-        """Return the chunks by the file's index; None where there is none, or the file is not as it says."""
+        """Return the chunks listed in the file's index; None without an index, or where it does not fit the file."""
         from mcap.records import Channel as McapChannel
         from mcap.records import ChunkIndex, Schema, Statistics
 
@@ -170,7 +170,7 @@ class McapFile:
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
             return None
         chunks.sort(key=lambda chunk: chunk.at)
-        standing = self._held_against_file(chunks)
+        standing = self._found_in_file(chunks)
         if standing is not None:
             self._schemas, self._channels = schemas, channels
             self._counts = dict(statistics.channel_message_counts)
@@ -199,10 +199,11 @@ class McapFile:
                 yield opcode, summary[at : at + length]
             at += length
 
-    def _held_against_file(self, chunks: list[_Chunk]) -> list[_Chunk] | None:
-        """Return the chunks of the index that stand where it says; None where the records one by one tell more.
+    def _found_in_file(self, chunks: list[_Chunk]) -> list[_Chunk] | None:
+        """Return the chunks of the index that are at their stated offsets; None where the index must not be used.
 
-        They do where messages stand outside chunks, and where the index does not fit a file that is whole.
+        It must not be used where messages are outside chunks, or where it does not fit a complete file: reading the
+        records one after the other finds more messages then.
         """
         by_place = {chunk.at - _HEAD_BYTES: chunk for chunk in chunks}
         if len(by_place) == len(chunks) and self._reaches_end(by_place):
@@ -214,15 +215,16 @@ class McapFile:
             if self._head(at) == (_CHUNK, chunk.length):
                 standing.append(chunk)
             else:
-                self.problems.say(f"no chunk at byte {at}, where the index says one is")
+                self.problems.add(f"no chunk at byte {at}, where the index lists one")
         return standing or None
 
     def _reaches_end(self, chunks: dict[int, _Chunk] | None) -> bool:
-        """Say whether the records follow one another to the end of the data.
+        """Return whether the records follow one another to the end of the data.
 
         Parameters
         ----------
-        chunks : by file offset of their record; they must be all there are, with no message outside them. None: any.
+        chunks : by file offset of their record; True then also means that the file has no other chunk, and no message
+            outside them. None: any records.
         """
         at, left = len(MAGIC), dict(chunks or {})
         while True:
@@ -241,15 +243,15 @@ class McapFile:
                 at += chunk.index_length
 
     def _head(self, at: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a file offset; opcode 0 where none stands."""
+        """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
         if not 0 <= at < self._size:
             return 0, 0
         self._stream.seek(at)
         head = self._stream.read(_HEAD_BYTES)
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
-    def _walk(self, *, learn: bool = False) -> Iterator[Block]:
-        """Go through the records one after the other, as far as they can be read.
+    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
+        """Yield the messages by reading the records one after the other, as far as they can be read.
 
         Parameters
         ----------
@@ -271,10 +273,10 @@ class McapFile:
             if opcode == 0 or length > left:
                 break
             at += _HEAD_BYTES + length
-        self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
+        self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
-        """Read a run of records that stand outside chunks; return them and the bytes consumed after the first 9."""
+        """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
             self._stream.seek(at)
@@ -282,7 +284,7 @@ class McapFile:
             rows, stop = self._table.scan_mcap(piece)
             if stop:
                 return self._messages(piece, rows, learn=learn), stop - _HEAD_BYTES
-        self.problems.say(f"record at byte {at} left out: damaged")
+        self.problems.add(f"record at byte {at} left out: damaged")
         return None, length
 
     def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
@@ -293,7 +295,7 @@ class McapFile:
             records = np.frombuffer(_chunk_records(self._stream.read(chunk.length), self._inflation, cut=cut), np.uint8)
         except DecompressionError as err:
             if not cut:
-                self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
+                self.problems.add(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
             return
         stop, begin = 0, -1
         while begin < stop < len(records):
@@ -302,7 +304,7 @@ class McapFile:
             yield self._messages(records, rows, learn=learn)
         if stop < len(records) and not cut:
             lost = f"{len(records) - stop} of {len(records)} bytes left out, damaged"
-            self.problems.say(f"chunk at byte {chunk.at - _HEAD_BYTES}: {lost}")
+            self.problems.add(f"chunk at byte {chunk.at - _HEAD_BYTES}: {lost}")
 
     def _messages(self, data: Bytes, rows: NDArray[np.int64], *, learn: bool) -> Block:
         is_message = rows[:, 0] == MCAP_MESSAGE
@@ -314,7 +316,7 @@ class McapFile:
         return with_possible_times(block, self.problems)
 
     def _learn(self, opcode: int, content: bytes) -> None:
-        """Remember a schema or channel record that the walk came upon."""
+        """Remember a schema or channel record."""
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema
 
@@ -324,11 +326,11 @@ class McapFile:
         elif isinstance(record, McapChannel):
             known = self._channels.setdefault(record.id, record) == record
         else:
-            self.problems.say("a schema or channel that cannot be read was left out")
+            self.problems.add("a schema or channel that cannot be read was left out")
             return
         if not known:
             what = f"{type(record).__name__.lower()} {record.id}"
-            self.problems.say(f"{what} is described twice, differently; the first description was used")
+            self.problems.add(f"{what} is described twice, differently; the first description was used")
 
 
 def _parse(opcode: int, content: bytes) -> _Parsed | None:
@@ -374,5 +376,5 @@ def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
 
 
 def is_mcap(stream: BinaryIO) -> bool:
-    """Say whether a stream begins like an MCAP file."""
+    """Return whether a stream begins like an MCAP file."""
     return stream.read(len(MAGIC)) == MAGIC

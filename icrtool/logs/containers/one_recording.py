@@ -1,4 +1,4 @@
-"""Whether what lies in a directory without metadata.yaml is one recording: by the files' kinds, then by their times."""
+"""Checks that the files of a directory without metadata.yaml are one recording: by file type, then by log time."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from icrtool.logs.containers.channel import some_of
 STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
 
 LONGEST_PAUSE_S = 3600.0
-"""The files of a split recording follow each other at once; a pause in it may last, but not so long."""
+"""The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
 
 LEAST_OVERLAP_S = 1.0
-"""A recorder that fills one buffer while it writes another lets the files of a split overlap by less."""
+"""The files of a split recording overlap by less than this: a recorder fills one buffer while it writes another."""
 
 
 class Span(NamedTuple):
@@ -34,13 +34,13 @@ def storage_files(directory: Path) -> list[Path]:
     Raises
     ------
     LogError
-        There is none, or there are recordings of several kinds, of which one must be named.
+        There is none, or there are recordings of several kinds: the user must name one.
     """
     found = sorted((file for file in directory.iterdir() if _is_storage(file)), key=_natural_key)
     others = sorted((entry for entry in directory.iterdir() if _is_other_log(entry)), key=_natural_key)
     kinds = {match[1] for file in found if (match := STORAGE.search(file.name))}
     if not found and len(others) == 1:
-        raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} lies in it", "name that")
+        raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
     if len(kinds) > 1 or others:
         why = f"holds more than one recording: {some_of([entry.name for entry in (*found, *others)])}"
         raise LogError(directory, why, "name one of them")
@@ -55,12 +55,12 @@ def storage_files(directory: Path) -> list[Path]:
 
 
 def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
-    """Hold the times of files that were found by name against each other.
+    """Compare the log times of files that were found by name.
 
     Returns
     -------
     list of str
-        What is odd about them.
+        A sentence for each pair of files that overlap.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def _is_storage(entry: Path) -> bool:
 
 
 def _is_other_log(entry: Path) -> bool:
-    """Say whether an entry is a ROS 1 bag, or a bag directory of its own."""
+    """Return whether an entry is a ROS 1 bag, or a bag directory of its own."""
     if entry.is_dir():
         return (entry / "metadata.yaml").is_file()
     return entry.suffix == ".bag" and entry.is_file()

@@ -1,4 +1,4 @@
-"""From a path to an opened container, by content, not by name."""
+"""Open a log: the container is recognised by its content, not by its file name."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
 
 
 def open_log(path: Path) -> Container:
-    """Open a log.
+    """Return the opened container at a path.
 
     Raises
     ------
     LogError
-        No such path, an empty file, none of the containers, or one of which nothing can be read.
+        The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
     """
     try:
         container = _open(path)
@@ -40,7 +40,7 @@ def _open(path: Path) -> Container:
     if stat.S_ISDIR(mode):
         return BagDirectory(path)
     if not stat.S_ISREG(mode):
-        # A pipe would be waited for, and none of the containers can be read without going back.
+        # Opening a pipe would block, and every container needs random access.
         raise LogError(path, "not a file", f"a log is {KINDS}")
     with path.open("rb") as stream:
         if not stream.read(1):

@@ -16,7 +16,7 @@ MOST_ROWS = 1 << 18
 
 @njit
 def little_endian(data: Bytes, at: int, size: int) -> int:
-    """Return the unsigned little-endian integer of `size` bytes; over 2^63 it comes out negative."""
+    """Return the unsigned little-endian integer of `size` bytes; a value above 2^63 comes out negative."""
     value = np.uint64(0)
     for i in range(size):
         value |= np.uint64(data[at + i]) << np.uint64(8 * i)
@@ -63,7 +63,7 @@ def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int
     """Find message and connection records of a ROS 1 bag chunk.
 
     Parameters and returns as `scan_mcap`; for a connection the range is that of its data (the header its publisher
-    sent), and the place of the record's own header stands instead of the log time.
+    sent), and its log time is replaced by the position of the record's own header.
     """
     at, count, size = begin, 0, len(data)
     while at + 4 <= size and count < len(rows):
@@ -101,7 +101,7 @@ def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int
 
 
 class RecordTable:
-    """A reusable table for a scan's rows, which bounds them: where it is full, the scan stops and can go on."""
+    """A reusable table for the rows of a scan. A scan stops when the table is full, and can be continued."""
 
     def __init__(self) -> None:
         self._rows: Ints = np.empty((MOST_ROWS, 5), np.int64)

@@ -75,8 +75,8 @@ class Ros1Bag:
             self._check_start()
             self._chunks = self._read_index()
             if self._chunks is None:
-                self.problems.say("has no index (not closed, or cut off); read from start to end")
-                for _ in self._walk(learn=True):
+                self.problems.add("has no index (not closed, or cut off); read from start to end")
+                for _ in self._read_in_order(learn=True):
                     pass
         except BaseException:
             self.close()
@@ -84,7 +84,7 @@ class Ros1Bag:
         self.channels = list(self._connections.values())
 
     def share_read(self) -> float:
-        """Return the place in the file as a share of its size."""
+        """Return the share of the file that has been read, 0 to 1."""
         return self._stream.tell() / max(self._size, 1)
 
     def close(self) -> None:
@@ -101,14 +101,14 @@ class Ros1Bag:
         if not wanted:
             return
         if self._chunks is None:
-            yield from self._walk()
+            yield from self._read_in_order()
             return
         for chunk in self._chunks:
             if not cut.needs(chunk.connections, chunk.begin_ns, chunk.end_ns, wanted):
                 continue
             record = self._record(chunk.at)
             if record is None or record.op != _CHUNK:
-                self.problems.say(f"no chunk at byte {chunk.at}, where the index says one is")
+                self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
                 continue
             yield from self._read_chunk(record)
 
@@ -116,13 +116,13 @@ class Ros1Bag:
         start = self._stream.read(len(MAGIC))
         if start[:9] == MAGIC[:9] and start != MAGIC:
             raise LogError(
-                self._path, "a bag of another version", "only 2.0 is read; `rosbag fix` turns older ones into it"
+                self._path, "a bag of another version", "only 2.0 can be read; `rosbag fix` converts older ones"
             )
         if start != MAGIC:
             raise LogError(self._path, "not a ROS 1 bag", "its first bytes are not a bag's")
 
     def _record(self, at: int) -> _Record | None:
-        """Read the header of the record at a file offset; None where no whole header stands."""
+        """Return the record at a file offset with its header fields; None where there is no complete header."""
         if not 0 <= at < self._size:
             return None
         self._stream.seek(at)
@@ -134,7 +134,7 @@ class Ros1Bag:
         return _Record(fields, at + header_length + 8, length)
 
     def _read_index(self) -> list[_Chunk] | None:
-        """Return the chunks by the bag's index; None where there is none, or it is damaged."""
+        """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
         first = self._record(len(MAGIC))
         if first is None or first.op != _BAG_HEADER:
             return None
@@ -170,8 +170,8 @@ class Ros1Bag:
         self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
         return sorted(chunks.values(), key=lambda chunk: chunk.at)
 
-    def _walk(self, *, learn: bool = False) -> Iterator[Block]:
-        """Go through the records one after the other, as far as they can be read.
+    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
+        """Yield the messages by reading the records one after the other, as far as they can be read.
 
         Parameters
         ----------
@@ -192,7 +192,7 @@ class Ros1Bag:
                 self._learn(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
             at = record.at + record.length
         if at < self._size:
-            self.problems.say(f"cut off or damaged at byte {at} of {self._size}; what stands before it was read")
+            self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         size = record.number(b"size")
@@ -205,7 +205,7 @@ class Ros1Bag:
             data = np.frombuffer(records, np.uint8)
         except DecompressionError as err:
             if not cut:
-                self.problems.say(f"chunk at byte {record.at} left out: {err.args[0]}")
+                self.problems.add(f"chunk at byte {record.at} left out: {err.args[0]}")
             return
         stop, begin = 0, -1
         while begin < stop < len(data):
@@ -213,7 +213,7 @@ class Ros1Bag:
             rows, stop = self._table.scan_bag(data, begin)
             yield self._messages(data, rows, learn=learn)
         if stop < len(data) and not cut:
-            self.problems.say(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+            self.problems.add(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _messages(self, data: Bytes, rows: Ints, *, learn: bool) -> Block:
         if learn:
@@ -249,5 +249,5 @@ def _header_fields(header: bytes) -> dict[bytes, bytes]:
 
 
 def is_ros1_bag(stream: BinaryIO) -> bool:
-    """Say whether a stream begins like a ROS 1 bag of any version."""
+    """Return whether a stream begins like a ROS 1 bag of any version."""
     return stream.read(9) == MAGIC[:9]

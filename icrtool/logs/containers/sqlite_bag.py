@@ -20,23 +20,23 @@ from icrtool.records.text import LogText
 MAGIC = b"SQLite format 3\0"
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
 _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "sum"})
-"""All that a query of ours reads and calls."""
+"""The tables, columns and functions that our queries use; SQLite refuses everything else."""
 
 _MOST_TOPICS = 1 << 17
 _STEPS, _LEAST_STEPS, _STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
-"""Of SQLite's machine: between two looks at whether to stop; what a query may take, beside some for each byte of the
-file. Pages of a damaged table may refer to one another without end."""
+"""Steps of SQLite's virtual machine: between two checks whether to stop; the most that a query may take; and so many
+more per byte of the file. The pages of a damaged table may refer to one another without end."""
 
 _FIRST_ROWS, _MOST_ROWS = 64, 4096
 _BLOCK_BYTES = 1 << 24
 _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
-"""What sqlite3 raises; the latter where a damaged name stands in its message."""
+"""The errors of sqlite3; the latter where its message contains a damaged name."""
 
 Row = tuple[Any, Any, Any, Any, int, int]
 """Topic ids, log times [ns], sizes, messages; last row number, count of messages that are bytes.
 
-SQLite holds a column to no type.
+SQLite does not enforce the type of a column.
 """
 
 
@@ -45,7 +45,7 @@ class SqliteBag:
 
     Parameters
     ----------
-    message_compression : how each message was compressed on its own (rosbag2's metadata.yaml tells), empty if not told
+    message_compression : compression of each single message, from rosbag2's metadata.yaml; empty if not known
 
     Raises
     ------
@@ -82,7 +82,7 @@ class SqliteBag:
         return self._last_row / max(self._rows, 1)
 
     def close(self) -> None:
-        """Release the database; nothing stays beside it that was not there before."""
+        """Release the database; no new file stays beside it."""
         self._database.close()
         if self._made_beside is not None:
             self._made_beside.unlink(missing_ok=True)
@@ -101,7 +101,7 @@ class SqliteBag:
             return
         blocks = self._stored(wanted, cut)
         if self._message_compression:
-            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.say)
+            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
     def _connect(self) -> sqlite3.Connection:
@@ -114,15 +114,15 @@ class SqliteBag:
                 database.execute("SELECT name FROM sqlite_master")
             except _DAMAGE as err:
                 database.close()
-                self.problems.say(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
+                self.problems.add(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
             else:
                 return database
-        # Without `immutable` SQLite wants to write beside a log that was recorded in WAL mode.
+        # Without `immutable` SQLite writes files beside a log that was recorded in WAL mode.
         database = self._open("mode=ro&immutable=1")
         try:
             database.execute("SELECT name FROM sqlite_master")
         except _DAMAGE:
-            # SQLite refuses a file that is shorter than its header says. With this it reads the pages that are there.
+            # SQLite refuses a file that is shorter than its header states. With this it reads the pages that are there.
             database.execute("PRAGMA writable_schema = ON")
         return database
 
@@ -134,7 +134,7 @@ class SqliteBag:
         return database
 
     def _restrict(self) -> None:
-        """Let queries read plain tables only, for a time that is bounded, and stop when the program is to end.
+        """Allow queries on plain tables only, limit their time, and stop them when the program has to end.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class SqliteBag:
         self._database.set_progress_handler(self._look_up, _STEPS)
 
     def _look_up(self) -> bool:
-        """Return whether the running query has to stop. Signals are handled here, and would be lost in SQLite."""
+        """Return whether the running query has to stop. Signals are handled here: SQLite would lose them."""
         try:
             self._steps_left -= _STEPS
         except BaseException as err:  # noqa: BLE001 - it is raised again where the query ends
@@ -160,7 +160,7 @@ class SqliteBag:
         return self._interruption is not None or self._steps_left < 0
 
     def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
-        """Run a query with a fresh bound of work."""
+        """Run a query, with its own limit of steps."""
         self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._path.stat().st_size
         return self._database.execute(query, parameters)
 
@@ -192,11 +192,11 @@ class SqliteBag:
         try:
             return {name: (encoding, str(text)) for name, encoding, text in self._query(query).fetchmany(_MOST_TOPICS)}
         except _DAMAGE as err:
-            self.problems.say(f"its message definitions cannot be read ({err})")
+            self.problems.add(f"its message definitions cannot be read ({err})")
             return {}
 
     def _found_compression(self) -> str:
-        """Tell message compression by the first message: a serialised one never begins like a compressed one."""
+        """Return the message compression that the first message shows: serialised data never begins like compressed."""
         try:
             first = self._query("SELECT data FROM messages LIMIT 1").fetchone()
         except _DAMAGE:
@@ -213,7 +213,7 @@ class SqliteBag:
         return last
 
     def _rows_within(self, cut: Cut) -> tuple[int, int]:
-        """Return the row before the first message in a cut, and the last one in it; by the index of times, if any."""
+        """Return the row before the first message in a cut, and the last row in it; by the index of times, if any."""
         if cut == WHOLE:
             return 0, self._rows
         within = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
@@ -226,7 +226,7 @@ class SqliteBag:
         return (first - 1, last) if first is not None else (0, 0)
 
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        """Yield the messages as they are stored; where pages are damaged, go on behind them."""
+        """Yield the messages in the order they were stored; reading continues behind damaged pages."""
         batch = self._batch_query(wanted, cut)
         after, stop = self._rows_within(cut)
         count, step = _FIRST_ROWS, 1
@@ -237,7 +237,7 @@ class SqliteBag:
                 if self._interruption is not None:
                     raise self._interruption from None
                 if count == 1:
-                    self.problems.say(f"damaged ({err}); what could be read of it was read")
+                    self.problems.add(f"damaged ({err}); what could be read of it was read")
                     after, step = after + step, 2 * step
                 count = max(count // 2, 1)
                 continue
@@ -249,18 +249,18 @@ class SqliteBag:
                 continue
             self._last_row = after = max(after + 1, last)
             if block is None:
-                self.problems.say("rows without a time or a message left out")
+                self.problems.add("rows without a time or a message left out")
                 continue
             yield with_possible_times(block, self.problems)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
     def _rows_cut_off(self) -> frozenset[int]:
-        """Return the rows that lie across the end of a file that ends inside a page: SQLite reads zeros behind it.
+        """Return the rows across the end of a file that ends inside a page: SQLite reads zeros behind the end.
 
         Notes
         -----
-        A message that is longer than a page and has its tail there is not found; what is needed is shorter.
+        A message longer than a page whose last part is there is not found; the messages that icrtool uses are shorter.
         """
         size = self._path.stat().st_size
         with self._path.open("rb") as stream:
@@ -271,20 +271,20 @@ class SqliteBag:
                 return frozenset()
             stream.seek(size - size % page_bytes)
             page = stream.read()
-        self.problems.say("cut off; what could be read of it was read")
+        self.problems.add("cut off; what could be read of it was read")
         return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
     def _batch_query(self, wanted: frozenset[int], cut: Cut) -> Callable[[int, int], tuple[Block | None, int | None]]:
-        """Return what reads up to so many messages behind a row.
+        """Return a function of a row and a count that reads up to that many messages behind the row.
 
-        It gives them, None where they cannot be joined, and their last row, None where no row is left.
+        It returns them (None where they cannot be joined) and their last row (None where no row is left).
 
         Notes
         -----
-        SQLite joins the messages of a batch itself, without one Python object each and with the interpreter free. What
-        it cannot join (a column holds any type) is left to a batch of one.
+        SQLite joins the messages of a batch itself, without one Python object for each and without the interpreter
+        lock. Rows that it cannot join (a column may hold any type) are read in batches of one.
         """
-        # The ids are integers from the database itself; a parameter list has SQLite's limit of variables.
+        # The ids are integers from the database itself; as parameters they could exceed SQLite's limit of variables.
         topics, lost = _numbers(wanted), _numbers(self._rows_cut_off())
         within = ""
         if cut != WHOLE:
@@ -313,14 +313,14 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def _allow(action: int, first: str | None, second: str | None, _: str | None, view: str | None) -> int:
-    """Say whether SQLite may do something: read a recorder's tables, and call a few functions."""
+    """Return whether SQLite may do an action: reading a recorder's tables and calling a few functions is allowed."""
     reads = action == sqlite3.SQLITE_READ and (first in _TABLES or not first) and view is None
     calls = action == sqlite3.SQLITE_FUNCTION and second in _FUNCTIONS
     return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
 
 
 def _packed(row: Row) -> Block | None:
-    """Return the messages of a joined row, None where some are no messages or have no time."""
+    """Return the messages of a joined row, None where some of them are not bytes or have no time."""
     *texts, data, _, count = row
     try:
         topics, times, sizes = (np.fromstring(str(text), np.int64, sep=",") for text in texts)
@@ -344,7 +344,7 @@ def _table_rows(page: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _variable_integer(page: bytes, at: int) -> tuple[int, int]:
-    """Return SQLite's integer of one to nine bytes at a place, and the place behind it."""
+    """Return SQLite's integer of one to nine bytes at an offset, and the offset behind it."""
     value = 0
     for byte in page[at : at + 8]:
         value, at = value << 7 | byte & 0x7F, at + 1
@@ -354,5 +354,5 @@ def _variable_integer(page: bytes, at: int) -> tuple[int, int]:
 
 
 def is_sqlite(stream: BinaryIO) -> bool:
-    """Say whether a stream begins like an SQLite database."""
+    """Return whether a stream begins like an SQLite database."""
     return stream.read(len(MAGIC)) == MAGIC

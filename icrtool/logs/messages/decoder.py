@@ -1,4 +1,4 @@
-"""The compiled loop that runs a layout's program over raw messages."""
+"""CDR decoder: the compiled loop that runs the program of a layout over raw messages."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from icrtool.records.tables import Bools, Ints
 
 _MAX_NESTING = 8
 _MOST_REMEMBERED = 512
-"""Ranges and columns of a message's shape; of messages with more, each one is walked."""
+"""Ranges and columns remembered of a message's shape; messages with more are all decoded step by step."""
 
 _STEPS_PER_BYTE, _LEAST_STEPS, MOST_STEPS = 4, 256, 1 << 24
-"""Steps of the program that a message may take: those without a byte of their own are the ends of loops, and loops
-over elements of no size, which would go on for ever. The last bounds the time of one message to some 0.1 s."""
+"""Steps of the program that one message may take: per byte, and at most. Loops over elements of size zero would never
+end. The second limit keeps the time of one message below about 0.1 s."""
 
 _ZERO, _FOUR, _AS_BEFORE = (cast(int, np.int64(value)) for value in (0, 4, -1))
-"""With a type: of a function that is called with a plain number numba compiles a copy for that number."""
+"""Typed: numba compiles another copy of a function for every plain number that it is called with."""
 
 _ITS_PLACE = _ZERO
-"""`_AS_BEFORE` and this stand in place of a size: for what is the same in all messages of a shape, and for the place
-of a text."""
+"""Special values of a size: `_AS_BEFORE` for a value that is the same in all messages of a shape, this one for the
+offset of a text."""
 
 _CDR_LITTLE, _CDR_BIG = 1, 0
 _FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
@@ -113,7 +113,7 @@ def remember_column(taken: Ints, used: int, place: int, size: int, column: int) 
 
 @njit
 def has_shape(data: Bytes, begin: int, model: int, same: Ints, ranges: int) -> bool:
-    """Say whether the message at `begin` equals the one at `model` in the ranges of bytes that make its shape."""
+    """Return whether the message at `begin` equals the one at `model` in the ranges of bytes that make its shape."""
     for k in range(ranges):
         place, stop = same[k, 0], same[k, 1]
         while place + 8 <= stop:
@@ -143,27 +143,27 @@ def fill_row(
 
 
 @njit
-def walk(
+def decode(
     data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools
 ) -> None:
-    """Fill a row of `table` (n, columns) per message; `readable` (n,) says which messages had the program's shape.
+    """Fill a row of `table` (n, columns) per message, and `readable` (n,): whether the message fits the program.
 
     Nothing is read outside [start, end); a message that is shorter than its layout, or of an encapsulation that is
     not plain CDR, is not readable.
     """
-    walk_new_shapes(data, start, end, program, cdr, table, readable, np.empty(len(start), np.bool_))
+    decode_new_shapes(data, start, end, program, cdr, table, readable, np.empty(len(start), np.bool_))
 
 
 @njit
-def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
+def decode_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
     data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools,
-    walked: Bools,
+    new_shape: Bools,
 ) -> None:  # fmt: skip
-    """Do what `walk` does; `walked` (n,) says which messages the program ran over.
+    """Decode as `decode` does; `new_shape` (n,) is set for the messages that the program was run over.
 
-    The messages of a topic are alike: their strings and sequences are as long, and their strings the same, as those of
-    the message before. The bytes that say so are remembered while the program runs over a message. Where they are the
-    same in the next one, its numbers are at the same places, and are taken from there.
+    The messages of a topic are alike: most have the same strings, and sequences of the same lengths, as the message
+    before. The bytes that hold them are remembered while the program runs over a message. Where the next message has
+    the same bytes there, its numbers are at the same offsets, and are copied from there.
     """
     returns, left, column_base, iteration = (
         np.zeros(_MAX_NESTING, np.int64), np.zeros(_MAX_NESTING, np.int64),
@@ -173,12 +173,12 @@ def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, com
     ranges, columns, model, big = _ZERO, _ZERO, _AS_BEFORE, _ZERO
     for m in range(len(start)):
         at, stop, base = start[m], end[m], start[m]
-        walked[m] = False
+        new_shape[m] = False
         readable[m] = True
         if model >= 0 and stop - at >= end[model] - start[model] and has_shape(data, at, start[model], same, ranges):
             fill_row(data, at, big, taken, columns, model, m, table)
             continue
-        walked[m] = True
+        new_shape[m] = True
         ranges, columns, model, big = _ZERO, _ZERO, m, _ZERO
         if cdr:
             if stop - at < 4 or data[at] != 0 or data[at + 1] > _CDR_LITTLE:
@@ -246,7 +246,7 @@ def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, com
                 if count == 0:
                     step = program[step, 6]
                     continue
-                # An element takes a byte at least: elements of no fields would loop for free.
+                # Count at least one byte for an element: a loop over elements without fields must end, too.
                 if depth >= _MAX_NESTING or count > stop - at:
                     readable[m] = False
                     break
@@ -283,11 +283,11 @@ def walk_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, com
             model = -1
 
 
-def walk_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[NDArray[np.uint64], Bools]:
+def decode_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[NDArray[np.uint64], Bools]:
     """Return the table (n, columns) of a layout's fields for messages in `data`, and which of them were readable."""
     table = empty_table(layout, len(start))
-    readable, walked = np.empty((2, len(start)), np.bool_)
-    walk_into(layout, data, start, end, table, readable, walked)
+    readable, new_shape = np.empty((2, len(start)), np.bool_)
+    decode_into(layout, data, start, end, table, readable, new_shape)
     return table, readable
 
 
@@ -296,20 +296,20 @@ def empty_table(layout: Layout, rows: int) -> NDArray[np.uint64]:
     return np.zeros((layout.columns, rows), np.uint64).T
 
 
-def walk_into(
-    layout: Layout, data: Bytes, start: Ints, end: Ints, table: NDArray[np.uint64], readable: Bools, walked: Bools
+def decode_into(
+    layout: Layout, data: Bytes, start: Ints, end: Ints, table: NDArray[np.uint64], readable: Bools, new_shape: Bools
 ) -> None:
-    """Fill `table` (n, columns) from messages in `data`; say which were readable, and which had another shape.
+    """Fill `table` (n, columns) from messages in `data`, and mark which were readable and which had a new shape.
 
     Parameters
     ----------
     readable : bool (n,), set where a message had the layout's shape
-    walked : bool (n,), not set where a message has the lengths and the texts of the one before
+    new_shape : bool (n,), not set where a message has the lengths and the texts of the one before
     """
     if layout.program[:, 2].max(initial=0) > len(data):
-        # A fixed array that is longer than all messages together: a definition that is not theirs. Its length times
-        # the size of an element may be more than an integer holds.
+        # A fixed array longer than all messages together: the definition is of another type. Its length times the size
+        # of an element may overflow an integer.
         readable[:] = False
-        walked[:] = True
+        new_shape[:] = True
     else:
-        walk_new_shapes(data, start, end, layout.program, layout.cdr, table, readable, walked)
+        decode_new_shapes(data, start, end, layout.program, layout.cdr, table, readable, new_shape)

@@ -13,12 +13,12 @@ from icrtool.records.text import LONGEST_NAME, shortened
 
 _SEPARATOR = "=" * 80 + "\n"
 LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
-"""Of a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
+"""Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
 _TIME: Definitions = {
     f"builtin_interfaces/msg/{name}": ([], [("sec", (BASE, ("int32", 0))), ("nanosec", (BASE, ("uint32", 0)))])
     for name in ("Time", "Duration")
 }
-"""ROS 1's time and duration have no definition of their own; a definition text may leave ROS 2's out."""
+"""Time and duration: ROS 1 has no definitions of them; in ROS 2 a definition text may leave them out."""
 
 
 def definitions_of(channel: Channel) -> tuple[Definitions, str]:
@@ -44,7 +44,7 @@ def definitions_of(channel: Channel) -> tuple[Definitions, str]:
 
 
 def _is_complete(types: Definitions) -> bool:
-    """Say whether every type that a field refers to is among the types."""
+    """Return whether every type that a field refers to is among the types."""
     for _, fields in types.values():
         for _, (node, detail) in fields:
             inner = detail[0] if int(node) > NAME else (node, detail)

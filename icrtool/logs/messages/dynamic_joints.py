@@ -1,8 +1,8 @@
-"""Lists within a list: control_msgs/DynamicJointState, brought to the columns of a JointState.
+"""Convert control_msgs/DynamicJointState, which has lists within a list, to the columns of a JointState.
 
-The message holds one InterfaceValue a joint, and each of these holds lists of its own. In the bytes a sequence is its
-length and then its elements, one after the other: with the number of joints known it reads like a number and that many
-plain fields. So messages are sorted by their number of joints, and each kind goes through the compiled walk.
+The message has one InterfaceValue per joint, and each of these has lists of its own. A sequence is stored as its
+length, then its elements. With the number of joints known, it reads like a number followed by that many plain fields.
+So the messages are grouped by their number of joints, and each group is decoded by the compiled loop.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import walk_messages
+from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables
@@ -23,7 +23,7 @@ from icrtool.records.text import LogText
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
 MOST_JOINTS = 100
 MOST_INTERFACES = 32
-"""A message that claims more is taken for damaged; of more interfaces a joint the first ones are looked at."""
+"""A message with more joints is treated as damaged; of more interfaces per joint only the first ones are read."""
 
 _LISTS = "interface_values"
 _JOINTS = "number of joints"
@@ -77,7 +77,7 @@ class DynamicJointCollector:
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
         places = np.flatnonzero(chosen)
-        table, readable = walk_messages(self._counter, block.data, block.start[places], block.end[places])
+        table, readable = decode_messages(self._counter, block.data, block.start[places], block.end[places])
         joints = self._counter.numbers(table, _JOINTS)
         readable &= joints <= MOST_JOINTS
         self._unreadable += len(readable) - int(np.count_nonzero(readable))
@@ -86,7 +86,7 @@ class DynamicJointCollector:
             alike[places[readable & (joints == number)]] = True
             collector = self._collector(int(number))
             collector.feed(block, alike)
-            # Taken at once: the names of all interfaces of a long log are many times what is kept of them.
+            # Converted at once: the names of all interfaces of a long log take many times the memory of the result.
             self._tables.append(_as_joint_state(collector.table(), int(number)))
 
     def table(self) -> TopicTable:
@@ -140,12 +140,12 @@ def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
 
 
 def _interface(table: TopicTable, joint: str, quantity: str) -> NDArray[np.float64]:
-    """Return the values (n,) that stand at the place of an interface's name, NaN where the name is not listed."""
+    """Return the values (n,) of the interface with a name, NaN where a message does not list the name."""
     (names, texts), values = table.words(f"{joint}interface_names[*]"), table.column(f"{joint}values[*]")
-    told = np.full(len(table), np.nan)
+    column = np.full(len(table), np.nan)
     if quantity not in texts:
-        return told
+        return column
     for place in range(min(names.shape[1], values.shape[1])):
         here = names[:, place] == texts.index(LogText(quantity))
-        told[here] = values[here, place]
-    return told
+        column[here] = values[here, place]
+    return column

@@ -1,8 +1,8 @@
-"""Where the wanted fields of a message type are: its definition compiled to a small program for `walk`.
+"""Where the wanted fields of a message type are: its definition compiled to a small program for `decode`.
 
-A serialized message has no index: a field's place depends on the strings and sequences before it. The program says
-what to step over and what to take, so one compiled loop (`icrtool.logs.messages.decoder`) reads a whole topic without
-an object per message, whatever the strings' lengths do from message to message.
+A serialized message has no index: the offset of a field depends on the strings and sequences before it. The program
+lists what to skip and what to copy. One compiled loop (`icrtool.logs.messages.decoder`) then reads a topic without a
+Python object per message, also where the lengths of strings change from message to message.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SIZES = {
 }  # fmt: skip
 _STRING_COLUMNS = 3
 LONGEST_UNROLLED = 4096
-"""A fixed array of which elements are taken is no longer than this: a covariance has 36."""
+"""Longest fixed array of which elements are copied: a covariance has 36."""
 
 DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_COLUMNS = 32, 20_000, 1 << 31, 1 << 16
 """Bounds of a definition: messages within one another, fields in all, elements of a fixed array, columns taken.
@@ -45,7 +45,7 @@ Real definitions reach a depth of 6 and some hundred fields; a definition that r
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """Where a wanted field lands in the table that `walk` fills.
+    """Where a wanted field is in the table that `decode` fills.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Layout:
 
 
 def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
-    """Give raw 64-bit words their meaning: a new array of float64 or int64."""
+    """Return raw 64-bit words as a new array of float64 or int64."""
     if kind == "float64":
         return raw.copy("K").view(np.float64)
     if kind == "float32":
@@ -112,7 +112,7 @@ def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
 
 
 class _Compiler:
-    """Walks a definition once and writes the program."""
+    """Reads a definition once and writes the program."""
 
     def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool, capacity: int) -> None:
         self._definitions = definitions
@@ -289,12 +289,12 @@ def compile_layout(
     message_type : ``package/Name``
     wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
         ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots
-    capacity : elements taken of a sequence; `counts` tells when a message held more
+    capacity : elements copied of a sequence; `Layout.counts` shows where a message holds more
 
     Raises
     ------
     DefinitionError
-        A type in it whose definition is missing, or a field type that cannot be stepped over.
+        The definition of a type in it is missing, or a field has a type that cannot be skipped.
     """
     package, _, name = message_type.partition("/")
     compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr", capacity=capacity)

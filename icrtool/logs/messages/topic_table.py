@@ -1,4 +1,4 @@
-"""A topic as columns: raw messages in, block by block; one table out."""
+"""Collects the raw messages of a topic, block by block, into one table of columns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import empty_table, walk_into
+from icrtool.logs.messages.decoder import decode_into, empty_table
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.tables import Ints
@@ -21,14 +21,14 @@ _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
 
 _ROWS_AT_ONCE = 16_384 + 8
-"""Not a power of two: the columns would be such a distance apart, and fall on the same few lines of the cache."""
+"""Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
 _FIRST_ROWS = 64
-"""Rows that a topic begins with; they double as its messages come: a log may hold thousands of topics."""
+"""Rows of a topic's first table; the next ones have twice as many: a log may hold thousands of topics."""
 
 _LARGEST_TABLE = 1 << 22
 _MOST_BYTES_AT_ONCE = 1 << 24
-"""Numbers in a table of rows, and bytes of messages that one compiled call goes through: it cannot be interrupted."""
+"""Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,18 +103,18 @@ class TopicTable:
 
 @dataclass(slots=True)
 class _Rows:
-    """Walked messages of one layout, not columns yet: some thousand at a time are turned into columns.
+    """Decoded messages of one layout that are not columns yet: several thousand at a time become columns.
 
     Attributes
     ----------
-    table : (rows, columns) as `walk` fills it; times_ns, readable, walked : (rows,)
+    table : (rows, columns) as `decode` fills it; times_ns, readable, new_shape : (rows,)
     filled : rows in use
     """
 
     table: NDArray[np.uint64] = field(default_factory=lambda: np.empty((0, 0), np.uint64))
     times_ns: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     readable: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    walked: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    new_shape: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
     filled: int = 0
 
     @classmethod
@@ -176,29 +176,29 @@ class TopicCollector:
 
     def _feed(self, block: Block, start: Ints, end: Ints, times: Ints) -> None:
         """Add some messages of a block."""
-        new = self._walk(block, start, end, times)
+        new = self._decode(block, start, end, times)
         most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
         if self._capacity < min(most, self.largest_capacity):
             self._settle()
             self._rows, self._capacity = _Rows(), min(most, self.largest_capacity)
             self._compile()
-            new = self._walk(block, start, end, times)
+            new = self._decode(block, start, end, times)
         for path, slot in self.layout.slots.items():
             if slot.kind == "string":
                 self._learn_texts(path, new, block)
         self._rows.filled += len(start)
 
-    def _walk(self, block: Block, start: Ints, end: Ints, times_ns: Ints) -> NDArray[np.uint64]:
-        """Walk messages into the rows behind the filled ones; return those rows that are not like the one before."""
+    def _decode(self, block: Block, start: Ints, end: Ints, times_ns: Ints) -> NDArray[np.uint64]:
+        """Decode messages into the rows behind the filled ones; return those of a new shape."""
         if self._rows.filled + len(start) > len(self._rows.table):
             self._settle()
             if len(self._rows.table) < max(len(start), self._more_rows()):
                 self._rows = _Rows.empty(self.layout, max(len(start), self._more_rows()))
         rows = slice(self._rows.filled, self._rows.filled + len(start))
-        table, readable, walked = self._rows.table[rows], self._rows.readable[rows], self._rows.walked[rows]
-        walk_into(self.layout, block.data, start, end, table, readable, walked)
+        table, readable, new_shape = self._rows.table[rows], self._rows.readable[rows], self._rows.new_shape[rows]
+        decode_into(self.layout, block.data, start, end, table, readable, new_shape)
         self._rows.times_ns[rows] = times_ns
-        return table[readable & walked]
+        return table[readable & new_shape]
 
     def _more_rows(self) -> int:
         """Return the rows of the next table: twice those of the present one, within bounds."""
@@ -210,16 +210,16 @@ class TopicCollector:
         slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
         counts = self.layout.counts(new, path)
         for i in range(min(slot.repeat, int(counts.max(initial=0)))):
-            told = new[counts > i, slot.column + i * slot.stride :]
-            codes, first = np.unique(told[:, 2], return_index=True)
+            entries = new[counts > i, slot.column + i * slot.stride :]
+            codes, first = np.unique(entries[:, 2], return_index=True)
             for code, row in zip(codes.tolist(), first.tolist(), strict=True):
                 if code not in texts:
-                    place, length = int(told[row, 0]), int(told[row, 1])
+                    place, length = int(entries[row, 0]), int(entries[row, 1])
                     raw = block.data[place : place + length].tobytes()
                     texts[code] = LogText(raw.decode("utf-8", "replace"))
 
     def _settle(self) -> None:
-        """Turn the filled rows into columns, and have them free again."""
+        """Turn the filled rows into columns, and free the rows."""
         rows, filled = self._rows, self._rows.filled
         if not filled:
             return
@@ -303,7 +303,7 @@ def _merged(group: list[TopicTable]) -> TopicTable:
     order = np.argsort(times, kind="stable")
     columns: dict[str, NDArray[Any]] = {}
     texts: dict[str, list[LogText]] = {}
-    # Publishers may have been built from different versions of the type: what all of them tell is kept.
+    # Publishers may have been built from different versions of the type: the columns that all have are kept.
     for path in group[0].columns:
         if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):
             continue

@@ -1,4 +1,4 @@
-"""How a receiver says that it solved its position: fixed, float or other, by status, flags, mode or words."""
+"""How a receiver solved its position: RTK fixed, RTK float or other, from its status, flags, mode or position type."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, Bytes, Ints
 
 GBAS = 2
-"""NavSatStatus: fixed or float, the drivers do not agree; without any of these the status tells nothing."""
+"""NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
 
 GPSFIX_STATUS = {
     0: OTHER_FIX, 1: OTHER_FIX, GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
@@ -25,13 +25,13 @@ SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OT
 
 NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49: FIXED_FIX, 50: FIXED_FIX,
                  51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
-"""Position types of NovAtel as novatel_oem7_msgs numbers them; all others do without fixed or float ambiguities."""
+"""Position types of NovAtel, numbered as in novatel_oem7_msgs; all others have neither fixed nor float ambiguities."""
 
 
 def class_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -> Bytes | None:
-    """Read ``status.status`` (n,): that of NavSatFix, or by `codes`; None where it tells nothing.
+    """Return the class (n,) by ``status.status``, of NavSatFix or by `codes`; None where the status states no class.
 
-    Drivers of NavSatFix that know only "fix" say 0 whatever they have: without a single GBAS nothing is told.
+    Many drivers of NavSatFix write 0 for every fix: a log without a single GBAS (2) states no class.
     """
     values = table.find("status.status")
     if values is None:
@@ -41,23 +41,23 @@ def class_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -
         if not (status == GBAS).any():
             return None
         return np.where(status == GBAS, RTK_FIX, OTHER_FIX).astype(np.uint8)
-    told = _looked_up(status, codes, NOT_STATED)
-    informative = (told == FIXED_FIX) | (told == FLOAT_FIX) | (told == RTK_FIX)
-    return told if informative.any() else None
+    classes = _looked_up(status, codes, NOT_STATED)
+    informative = (classes == FIXED_FIX) | (classes == FLOAT_FIX) | (classes == RTK_FIX)
+    return classes if informative.any() else None
 
 
 def class_by_carrier(flags: Ints | None) -> Bytes | None:
-    """Read the carrier solution of u-blox flags (n,)."""
+    """Return the class (n,) by the carrier solution in u-blox flags (n,)."""
     return None if flags is None else _looked_up((flags >> 6) & 3, UBLOX_CARRIER, NOT_STATED)
 
 
 def class_by_mode(modes: Ints | None) -> Bytes | None:
-    """Read the mode of a Septentrio block (n,)."""
+    """Return the class (n,) by the mode of a Septentrio block (n,)."""
     return None if modes is None else _looked_up(modes & 0x0F, SEPTENTRIO_MODE, OTHER_FIX)
 
 
 def class_by_type(table: TopicTable, path: str) -> Bytes | None:
-    """Read a NovAtel position type (n,), a word (``NARROW_INT``) or a number."""
+    """Return the class (n,) by a NovAtel position type, which is a word (``NARROW_INT``) or a number."""
     if path in table.texts:
         codes, texts = table.words(path)
         by_word = [_of_word(text) for text in texts]
@@ -75,7 +75,7 @@ def _of_word(text: str) -> int:
 
 
 def _looked_up(values: Ints, codes: Mapping[int, int], otherwise: int) -> Bytes:
-    told = np.full(len(values), otherwise, np.uint8)
+    classes = np.full(len(values), otherwise, np.uint8)
     for value, code in codes.items():
-        told[values == value] = code
-    return told
+        classes[values == value] = code
+    return classes

@@ -1,4 +1,4 @@
-"""The gyro of a log: the turn rate of an inertial unit, whoever tells the heading."""
+"""The gyro of a log: the turn rate of an inertial unit, whichever topic is used for the heading."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
 GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *GYRO_AXES)
 
 FASTEST_RADPS = math.radians(1000.0)
-"""A rate beyond this is no robot's."""
+"""No robot turns faster than this [rad/s]."""
 
 MOST_BAD = 0.01
-"""A topic with a larger share of rates that are no numbers is not used."""
+"""A topic is not used where a larger share of its rates is not finite."""
 
 
 def find_gyro(
@@ -32,8 +32,8 @@ def find_gyro(
     Parameters
     ----------
     tables : all topics that were read
-    wheels_topic, heading_topic : a unit that also tells the heading comes first, then one in the wheels' namespace,
-        then the one with more samples
+    wheels_topic, heading_topic : the unit that is also the source of the heading is preferred, then one in the wheels'
+        namespace, then the one with more samples
     clock : the clock of the other streams
     """
     home = wheels_topic.strip("/").split("/")[0]

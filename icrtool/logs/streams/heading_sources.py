@@ -1,4 +1,4 @@
-"""Messages that tell where the robot points: yaw in ENU, compass headings, antenna baselines."""
+"""Messages that hold the robot's heading: yaw in ENU, compass headings, antenna baselines."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class HeadingSource:
 
     Attributes
     ----------
-    yaw_rad : (n,) as told: counter-clockwise from east where `convention` is ``enu``, else clockwise from north
-    variance : (n,) [rad^2], NaN where not told
+    yaw_rad : (n,) as recorded: counter-clockwise from east where `convention` is ``enu``, else clockwise from north
+    variance : (n,) [rad^2], NaN where not stated
     usable : (n,)
     convention_why : how the convention is known
     yaw_rate_radps : (n,) counter-clockwise turn rate of a gyro in the same message, None without one
@@ -74,7 +74,7 @@ class HeadingSource:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to use, even when it is asked for."""
+        """Whether no row can be used, even where the topic is configured."""
         return not self.usable.any()
 
     def heading_rad(self, convention: Convention) -> Floats:
@@ -87,7 +87,7 @@ Reader = Callable[[TopicTable], HeadingSource]
 
 
 def no_heading(table: TopicTable, problem: str) -> HeadingSource:
-    """Return the source that a topic is when it cannot be read."""
+    """Return an empty source for a topic that cannot be read, with the reason."""
     unknown, nothing = np.full(len(table), np.nan), np.zeros(len(table), np.bool_)
     return HeadingSource(
         table.topic, table.message_type, stamp_rows(table), unknown, unknown, nothing, "enu", "", problem=problem
@@ -111,9 +111,9 @@ def _constant(yaw: Floats, usable: Bools) -> bool:
 
 
 def _orientation(path: str, covariance: str, place: int, score: float, what: str, *, stuffed: bool = False) -> Reader:
-    """Read an orientation; `place` is that of the yaw variance in the covariance.
+    """Return a reader of an orientation; `place` is the index of the yaw variance in the covariance.
 
-    `stuffed`: drivers of GNSS receivers put a compass angle into the quaternion as if it were a yaw.
+    `stuffed`: some drivers of GNSS receivers write a compass angle into the quaternion as if it were a yaw.
     """
 
     def read(table: TopicTable) -> HeadingSource:
@@ -126,13 +126,13 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
             convention, why = "ned", "compass angle as yaw"
         lowered, problem = score, ""
         if covariance and place == 8 and np.all(table.floats(f"{covariance}[0]") == -1.0):
-            problem = "tells no orientation (covariance -1, REP-145)"
+            problem = "holds no orientation (covariance -1, REP-145)"
         elif not usable.any():
             problem = "no valid quaternion"
         elif _constant(yaw, usable):
             problem = "its orientation never changes"
         elif GOAL_WORDS.search(table.topic):
-            problem = "its name says that it is a goal, not a measurement"
+            problem = "its name is that of a goal, not of a measurement"
         if _RAW_WORDS.search(table.topic):
             lowered -= 10.0
         return HeadingSource(
@@ -150,12 +150,12 @@ def _odometry(table: TopicTable) -> HeadingSource:
 
 
 def _azimuth(table: TopicTable) -> HeadingSource:
-    """Read an Azimuth of the compass stack: the message says unit, orientation and reference itself."""
+    """Return the headings of an Azimuth of the compass stack: the message states unit, orientation and reference."""
     factor = np.where(table.column("unit") == 1, np.pi / 180.0, 1.0)
     yaw = table.column("azimuth") * factor
     orientation = table.column("orientation")
     ned = bool(np.median(orientation) == 1)
-    # Rows of the other orientation are turned over: pi/2 - yaw does it both ways.
+    # Rows of the other orientation are converted: pi/2 - yaw, in both directions.
     yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
     codes = table.floats("reference")
     reference = _REFERENCES.get(float(np.median(codes)), "unknown") if len(codes) else "unknown"
@@ -163,13 +163,13 @@ def _azimuth(table: TopicTable) -> HeadingSource:
     usable = np.isfinite(yaw)
     return HeadingSource(
         table.topic, table.message_type, stamp_rows(table), yaw, np.where(variance > 0, variance, np.nan), usable,
-        "ned" if ned else "enu", "the message says so", None, 95.0, f"azimuth, {reference} north",
+        "ned" if ned else "enu", "stated in the message", None, 95.0, f"azimuth, {reference} north",
         "" if usable.any() else "no finite azimuth",
     )  # fmt: skip
 
 
 def _relposned(table: TopicTable) -> HeadingSource:
-    """Read ublox_msgs/NavRELPOSNED9 (or the older NavRELPOSNED): the bearing of the antenna baseline."""
+    """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED9 (or the older NavRELPOSNED)."""
     flags = table.column("flags")
     if table.find(*_HEADING) is not None:
         needed = _RELPOS_VALID | _HEADING_VALID
@@ -194,15 +194,15 @@ def _degrees(
     path: str, deviation: str, score: float, what: str, status: str = "",
     accepted: frozenset[str] | frozenset[int] = frozenset[int](),
 ) -> Reader:  # fmt: skip
-    """Read a heading in degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
+    """Return a reader of degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
 
     def read(table: TopicTable) -> HeadingSource:
-        told = table.column(path).astype(np.float64)
+        degrees = table.column(path).astype(np.float64)
         std = np.radians(table.floats(deviation))
-        usable = np.abs(told) <= LARGEST_DEG
+        usable = np.abs(degrees) <= LARGEST_DEG
         if status:
             usable = usable & solved(table, status, accepted)
-        heading = np.radians(np.where(np.abs(told) <= LARGEST_DEG, told, np.nan))
+        heading = np.radians(np.where(np.abs(degrees) <= LARGEST_DEG, degrees, np.nan))
         return HeadingSource(
             table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
             "ned", "degrees clockwise from north", None, score, what, "" if usable.any() else "no valid heading",
@@ -212,7 +212,7 @@ def _degrees(
 
 
 def _septentrio(deviation: str, mode: str, score: float, what: str) -> Reader:
-    """Read a Septentrio attitude: ENU unless `use_ros_axis_orientation` was turned off, which no message tells."""
+    """Return a reader of a Septentrio attitude: ENU unless `use_ros_axis_orientation` was off; no message states it."""
     read_degrees = _degrees("heading", deviation, score, what)
 
     def read(table: TopicTable) -> HeadingSource:

@@ -1,4 +1,4 @@
-"""The joints that a configuration names, held against those that messages list."""
+"""Checks the joints that a configuration names against those that messages list."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEYS: tuple[_Key, _Key] = ("left_joints", "right_joints")
 
 
 def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], config: Config) -> None:
-    """Refuse a configured joint that no message of the wheels' topic lists: the others would pass for its side.
+    """Refuse a configured joint that no message of the wheels' topic lists: its side would be the mean of fewer wheels.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
     """
     if not _keys_given(config):
         return
-    # None of the topics with joints had those asked for, if what was chosen has none: tell of the one that came closest
+    # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
     listing = [motion for motion in candidates if motion.joints]
     if chosen is not None and chosen.joints:
         listing = [chosen]
@@ -43,7 +43,7 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
 
 
 def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
-    """Say that configured joints are of no use with messages that list none."""
+    """Return a warning for every configured joint list that is not used, because the messages list no joints."""
     if chosen.joints:
         return []
     why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"

@@ -1,4 +1,4 @@
-"""From a quaternion to the yaw of a robot's nose: level sensors, sensors on their side, components in another order."""
+"""Yaw from quaternions: of level sensors, of sensors mounted on their side, and with components in another order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UPRIGHT_COSINE = math.cos(math.radians(45.0))
 
 LEVEL_COSINE = math.cos(math.radians(30.0))
 TILTED_SHARE = 0.01
-"""A robot on the ground keeps some axis of its sensor upright but for this share of the time."""
+"""Largest share of the time in which no axis of the sensor is upright, for a robot on the ground."""
 
 CLEAR_CORRELATION = 0.5
 STRETCHES = 200
@@ -25,14 +25,14 @@ ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
     ((1, 2, 3, 0), "its quaternion is written w first: read as w, x, y, z"),
     ((3, 1, 2, 0), "its quaternion has x and w swapped: swapped back"),
 )
-"""Places of x, y, z, w among the four fields, where a driver filled them in another order."""
+"""Positions of x, y, z, w among the four fields, where a driver filled them in another order."""
 
 
 def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
-    """Return yaw [rad], which rows are rotations, and a note where the sensor is not mounted upright.
+    """Return yaw [rad] (n,), which rows are rotations (n,), and a note where the sensor is not mounted upright.
 
-    Yaw is that of the sensor's x axis seen from above. A sensor on its side has another axis level all the time: that
-    axis is used then, and points somewhere at a fixed angle to the robot's nose.
+    Yaw is that of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level all the
+    time: that axis is used, and has a constant angle to the robot's forward axis.
 
     Parameters
     ----------
@@ -58,16 +58,16 @@ def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, B
     vertical = _vertical(x, y, z, w)
     level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
     note = (
-        f"mounted on its side: its {'xyz'[level]} axis is level and stands for the nose, at an angle still to be found"
+        f"mounted on its side: its {'xyz'[level]} axis is level and is used as heading, with an offset to be estimated"
     )
     return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
 
 
 def _written_order(unit: Floats, yaw_rate_radps: Floats | None) -> tuple[Sequence[int], str]:
-    """Return where x, y, z, w stand, and a note where that is not their place.
+    """Return the positions of x, y, z, w, and a note where they are not in this order.
 
-    A robot on the ground keeps one axis of its sensor upright, whatever the mounting. Where none is, and another order
-    of the components has a level sensor all the time, that order is meant.
+    On the ground one axis of the sensor stays upright, whatever the mounting. If no axis does, and another order of the
+    components gives a level sensor all the time, that order is used.
     """
     as_named = (0, 1, 2, 3)
     some = unit[:: max(1, len(unit) // MOST_LOOKED_AT)]
@@ -94,14 +94,14 @@ def _vertical(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
 
 
 def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
-    """Say whether yaw turns the way the gyro does; True without a gyro that turns."""
+    """Return whether yaw changes correlate with the gyro's; True where there is no gyro or it does not turn."""
     if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
         return True
     x, y, z, w = unit.T
     yaw = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
     # Over many samples: from one to the next there is more noise than turning.
     edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
-    turned, told = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
-    if len(turned) < 3 or float(np.ptp(turned)) == 0 or float(np.ptp(told)) == 0:
+    turned, measured = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
+    if len(turned) < 3 or float(np.ptp(turned)) == 0 or float(np.ptp(measured)) == 0:
         return False
-    return float(np.corrcoef(turned, told)[0, 1]) > CLEAR_CORRELATION
+    return float(np.corrcoef(turned, measured)[0, 1]) > CLEAR_CORRELATION

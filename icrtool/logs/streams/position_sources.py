@@ -1,4 +1,4 @@
-"""Messages that tell where the robot is: geodetic fixes, or positions that are metric already."""
+"""Messages that hold the robot's position: geodetic fixes, or positions that are metric already."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DEGREES = 180.0 / math.pi
 STATUS_UNKNOWN = -2
 SEPTENTRIO_UNKNOWN = 65535
 HIGHEST_M = 20_000.0
-"""A height beyond this stands for "unknown"; the median of the others is taken then."""
+"""A height beyond this means "unknown"; it is replaced by the median of the others."""
 
 SOLVED, SOLVED_CODES = frozenset({"SOL_COMPUTED"}), frozenset({0})
 INS_SOLVED = frozenset({"INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE"})
@@ -54,7 +54,7 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
 GOOD_STD_M = 0.3
-"""Better than this a fix is RTK or nearly so, and the first choice as reference."""
+"""A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +65,10 @@ class PositionSource:
     ----------
     geodetic : (n, 3) latitude, longitude [deg], ellipsoidal height [m]; None where metric
     metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
-    variance : (n, 3) north, east, covariance of both [m^2]; NaN where not told
+    variance : (n, 3) north, east, covariance of both [m^2]; NaN where not stated
     usable : (n,) rows to use; `rejected` counts the others by reason
-    has_orientation : the same message tells the heading in the same frame
-    stated_class : uint8 (n,) how the position was solved, None where no message says
+    has_orientation : the same message holds the heading in the same frame
+    stated_class : uint8 (n,) how the position was solved, None where no message states it
     """
 
     topic: str
@@ -87,7 +87,7 @@ class PositionSource:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to use, even when it is asked for."""
+        """Whether no row can be used, even where the topic is configured."""
         return not self.usable.any()
 
 
@@ -95,7 +95,7 @@ Reader = Callable[[TopicTable], PositionSource]
 
 
 def no_position(table: TopicTable, problem: str) -> PositionSource:
-    """Return the source that a topic is when it cannot be read."""
+    """Return an empty source for a topic that cannot be read, with the reason."""
     nothing = np.zeros(len(table), np.bool_)
     return PositionSource(
         table.topic, table.message_type, stamp_rows(table), None, None, _no_variance(table), nothing, problem=problem
@@ -106,7 +106,7 @@ def _geodetic(
     table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
     stated_class: Bytes | None = None,
 ) -> PositionSource:  # fmt: skip
-    """Build a source from latitude, longitude, height; drop rows without a fix, not finite, or at 0, 0."""
+    """Return a source of latitude, longitude, height; rows without a fix, not finite, or at 0, 0 are not usable."""
     rejected: dict[str, int] = {}
     usable = np.ones(len(table), np.bool_)
     latitude, longitude = geodetic[:, 0], geodetic[:, 1]
@@ -124,9 +124,9 @@ def _geodetic(
             rejected[reason] = count
         usable &= ~bad
     height = geodetic[:, 2]
-    told = np.abs(height) < HIGHEST_M
-    known = told & usable
-    filled = np.where(told, height, float(np.median(height[known])) if known.any() else 0.0)
+    plausible = np.abs(height) < HIGHEST_M
+    known = plausible & usable
+    filled = np.where(plausible, height, float(np.median(height[known])) if known.any() else 0.0)
     std = (
         float(np.sqrt(np.nanmedian(variance[usable, :2]))) if np.isfinite(variance[usable, :2]).any() else float("nan")
     )
@@ -145,14 +145,14 @@ def _no_variance(table: TopicTable) -> Floats:
 
 
 def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
-    """Return latitude and longitude, which the type must have, and height, as told (n, 3)."""
+    """Return latitude and longitude, which the type must have, and height, as recorded (n, 3)."""
     return np.column_stack([table.column(latitude), table.column(longitude), table.floats(height)]).astype(np.float64)
 
 
 def _enu_variance(table: TopicTable) -> Floats:
-    """Return north, east, covariance of the row-major 3 x 3 ENU covariance; NaN where it is not told."""
+    """Return north, east, covariance of the row-major 3 x 3 ENU covariance; NaN where it is unknown."""
     variance = np.column_stack([table.floats(f"position_covariance[{i}]") for i in (4, 0, 1)])
-    # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or put any there.
+    # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or write arbitrary ones.
     unknown = table.floats("position_covariance_type") == 0
     variance[unknown | ~(variance[:, 0] > 0) | ~(variance[:, 1] > 0)] = np.nan
     return variance
@@ -161,7 +161,7 @@ def _enu_variance(table: TopicTable) -> Floats:
 def _without_fix(table: TopicTable) -> Bools:
     """Return the rows (n,) with a negative status: -1 no fix, -2 unknown (the default of ROS 2).
 
-    A driver that never leaves the default tells no status at all.
+    A driver that never changes the default states no status: no row is returned.
     """
     status = table.floats("status.status")
     return np.zeros(len(table), np.bool_) if np.all(status == STATUS_UNKNOWN) else np.asarray(status < 0)
@@ -169,8 +169,8 @@ def _without_fix(table: TopicTable) -> Bools:
 
 def _navsatfix(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    told = class_by_status(table)
-    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", told)
+    fix_class = class_by_status(table)
+    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", fix_class)
 
 
 def _gpsfix(table: TopicTable) -> PositionSource:
@@ -183,19 +183,19 @@ def _gpsfix(table: TopicTable) -> PositionSource:
         variance[:, column] = np.where(unknown, from_radius, variance[:, column])
     variance[unknown, 2] = np.where(np.isfinite(from_radius[unknown]), 0.0, np.nan)
     geodetic = _place(table, "latitude", "longitude", "altitude")
-    told = class_by_status(table, GPSFIX_STATUS)
-    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", told)
+    fix_class = class_by_status(table, GPSFIX_STATUS)
+    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", fix_class)
 
 
 def _accuracy(std: Floats) -> Floats:
-    """Return the variance of an accuracy that is the same to all sides (n, 3)."""
+    """Return the variances (n, 3) of an accuracy (n,) [m] that is equal in all directions."""
     return _deviations(std, std)
 
 
 def _deviations(north: Floats, east: Floats) -> Floats:
-    told = (north > 0) & (east > 0)
+    positive = (north > 0) & (east > 0)
     with np.errstate(over="ignore"):
-        return np.where(told[:, None], np.column_stack([north**2, east**2, np.zeros(len(north))]), np.nan)
+        return np.where(positive[:, None], np.column_stack([north**2, east**2, np.zeros(len(north))]), np.nan)
 
 
 def _bits(table: TopicTable, *paths: str) -> Ints | None:
@@ -212,8 +212,8 @@ def _navpvt(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     flags = _bits(table, "flags")
     no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
-    variance, told = _accuracy(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
-    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", told)
+    variance, fix_class = _accuracy(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
+    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
 
 
 def _navhpposllh(table: TopicTable) -> PositionSource:
@@ -227,7 +227,7 @@ def _navhpposllh(table: TopicTable) -> PositionSource:
 
 
 def _septentrio(mode: str, what: str, score: float) -> Reader:
-    """Read a Septentrio block: latitude and longitude in rad; the low bits of the mode are 0 without a solution."""
+    """Return a reader of a Septentrio block: angles in rad; low bits of the mode 0: no solution."""
 
     def read(table: TopicTable) -> PositionSource:
         geodetic = _place(table, "latitude", "longitude", "height")
@@ -259,38 +259,38 @@ def _novatel(
     place: tuple[str, str, str], deviations: tuple[str, str], status: str, accepted: frozenset[str] | frozenset[int],
     kind: str, what: str, score: float,
 ) -> Reader:  # fmt: skip
-    """Read a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
+    """Return a reader of a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
 
     def read(table: TopicTable) -> PositionSource:
         geodetic = _place(table, *place)
         geodetic[:, 2] += np.nan_to_num(table.floats("undulation"))
         variance = _deviations(*(table.floats(name) for name in deviations))
-        told = class_by_type(table, kind)
-        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, told)
+        fix_class = class_by_type(table, kind)
+        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, fix_class)
 
     return read
 
 
 def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> Reader:
-    """Read a pose: x is east and y north of the topic's own frame, wherever that points."""
+    """Return a reader of a pose: x is taken as east and y as north, in the topic's own frame."""
 
     def read(table: TopicTable) -> PositionSource:
         x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
         variance = _no_variance(table)
         if covariance:
             var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
-            told = (var_x > 0) & (var_y > 0)
-            variance[told] = np.column_stack([var_y, var_x, cov])[told]
+            positive = (var_x > 0) & (var_y > 0)
+            variance[positive] = np.column_stack([var_y, var_x, cov])[positive]
         usable = np.isfinite(x) & np.isfinite(y)
         named = (
             bool(REFERENCE_WORDS.search(table.topic)) or table.text("header.frame_id").lstrip("/") in REFERENCE_FRAMES
         )
         problem = "" if usable.any() else "no finite position"
         if GOAL_WORDS.search(table.topic):
-            problem = problem or "its name says that it is a goal, not a measurement"
+            problem = problem or "its name is that of a goal, not of a measurement"
         elif not named and (odometry or "odom" in table.topic.lower()):
             problem = (
-                problem or "its name and frame do not say that it is a reference, not the wheels' own dead reckoning"
+                problem or "its name and frame do not show a position reference: it may be the wheels' dead reckoning"
             )
         count = int(np.count_nonzero(~usable))
         return PositionSource(

@@ -1,4 +1,4 @@
-"""Which topic feeds which role: every candidate with its reasons, and the choice."""
+"""Choose the topic for each role: wheels, position and heading; each candidate with its reasons."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ NEEDS: dict[Role, str] = {
 ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}
 
 SAME_NAMESPACE = 8.0
-"""A candidate in the namespace of the wheels is the same robot's."""
+"""Added to the score of a candidate in the namespace of the wheels: it belongs to the same robot."""
 
 COMPLETE = 5.0
-"""For each other role that the wheels' own namespace can fill: of two robots, the one with all it takes."""
+"""Added for each other role that the wheels' namespace can fill: of two robots, the one with all sensors is chosen."""
 
 WORTHY = 40.0
-"""Wheels of this score are a robot's; below, they are commands and other sensors' velocities."""
+"""Wheel topics of this score or more are measured; below it they are commands or velocities of other sensors."""
 
 SAME_MESSAGE = 100.0
 """Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
@@ -45,7 +45,7 @@ MOST_LISTED = 40
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """All sources found, best first by role; `unread` says of other topics of known types why they are none."""
+    """All sources found, best first by role; `unread`: why other topics of known types cannot be sources."""
 
     wheels: tuple[WheelMotion, ...]
     gnss: tuple[PositionSource, ...]
@@ -55,7 +55,7 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The source of each role, and in words why it was chosen; `heading` is None where no topic states one."""
+    """The source of each role, and the reason for the choice as text; `heading` is None where no topic holds one."""
 
     wheels: WheelMotion
     gnss: PositionSource
@@ -64,7 +64,7 @@ class Choice:
 
 
 def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
-    """Return, by channel id, the fields that some role may need; channels of no use are absent."""
+    """Return, by channel id, the fields that some role may need; other channels are absent."""
     topics, wanted = config.topics, {}
     pairs = _pairs(channels, topics)
     for channel in channels:
@@ -100,7 +100,7 @@ def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
-    """Read every decoded topic in each role it may have; rank by type, content and namespace."""
+    """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
     topics = config.topics
     gnss = _read_all(tables, POSITION_TYPES, topics.gnss, no_position)
     heading = _read_all(tables, HEADING_TYPES, topics.heading, no_heading)
@@ -135,7 +135,7 @@ def _read_all(
     configured: str | None,
     unusable: Callable[[TopicTable, str], Source],
 ) -> list[Source]:
-    """Read the topics of one role; one whose type in this log lacks a field that is needed becomes unusable."""
+    """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
     sources = []
     for table in tables:
         if table.message_type in types and configured in (None, table.topic) and len(table):
@@ -166,9 +166,9 @@ def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[Whee
 
 
 def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:
-    """Say of topics without a message to use whether there were any."""
+    """Return, for each topic without a usable message, a text: no message, or none that can be read."""
     return {
-        table.topic: f"none of its {table.unreadable} messages has its type's shape"
+        table.topic: f"none of its {table.unreadable} messages fits its message type"
         if table.unreadable
         else "no message"
         for table in tables
@@ -177,11 +177,11 @@ def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:
 
 
 def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: TopicsConfig) -> PositionSource:
-    """Refuse the position of the message whose twist stands for the wheels: a reference knows more than they do."""
+    """Refuse the position of the message whose twist is used for the wheels: a reference must be independent."""
     own = bool(wheels) and not wheels[0].problem and wheels[0].twist is not None and wheels[0].topic == source.topic
     if not own or topics.gnss == source.topic or source.problem:
         return source
-    return replace(source, problem="its twist stands for the wheels; a reference is independent of them")
+    return replace(source, problem="its twist is used for the wheels; a reference must be independent of them")
 
 
 def _ranked(
@@ -190,7 +190,7 @@ def _ranked(
     bonus: Callable[[str], float],
     others: frozenset[str] = frozenset(),
 ) -> list[Source]:
-    """Sort: usable before not, this robot's before others', then by score and bonus."""
+    """Return the sources sorted: usable ones first, this robot's before those of others, then by score and bonus."""
 
     def rank(source: Source) -> tuple[bool, bool, float]:
         forced = configured is not None and source.topic == configured
@@ -255,7 +255,7 @@ def _pair_name(topics: TopicsConfig) -> str | None:
 
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
-    """Hold a configured pair against the log."""
+    """Refuse a configured pair of wheel topics that the log does not have or that cannot be used."""
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     for side in ("left", "right"):
         topic = getattr(topics, f"wheel_{side}")
@@ -282,7 +282,7 @@ def _check_configured(
     log: str,
     channels: Sequence[Channel],
 ) -> None:
-    """Hold a configured topic against the log. One with a mere doubt about it is used, as it was asked for."""
+    """Refuse a configured topic that the log does not have or that has no usable row; other problems do not count."""
     if configured is None:
         return
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
@@ -310,7 +310,7 @@ def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> 
 
 
 def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
-    """Say of the candidates for some roles why they were refused."""
+    """Return, by topic, why candidates for some roles were refused."""
     by_role: dict[Role, Sequence[WheelMotion | PositionSource | HeadingSource]] = {
         "wheels": found.wheels,
         "gnss": found.gnss,
@@ -325,7 +325,7 @@ def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
 
 
 def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[str]:
-    """Return the log's topics with their types, those that came into question first."""
+    """Return the log's topics with their types, refused candidates first."""
     entries: dict[str, str] = {}
     for channel in channels:
         reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
@@ -336,12 +336,12 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
 
 
 def common_clock(delays_s: Sequence[float | None]) -> Literal["header", "log"]:
-    """Choose one clock for streams that are used together.
+    """Return the clock for streams that are used together: header stamps or log time.
 
     `delays_s` holds, by stream, log time minus header stamp, None where there are no header stamps. Where some
     stream has only log times and another's header is far from them, all go by log time.
     """
-    told = [delay for delay in delays_s if delay is not None]
-    if len(told) == len(delays_s):
+    known = [delay for delay in delays_s if delay is not None]
+    if len(known) == len(delays_s):
         return "header"
-    return "log" if any(abs(delay) > 0.1 for delay in told) else "header"
+    return "log" if any(abs(delay) > 0.1 for delay in known) else "header"

@@ -1,4 +1,4 @@
-"""Which clock to believe: the stamp in a message's header, or the time it was logged."""
+"""The clock of a topic: the stamp in the message's header, or the time at which it was logged."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StampedRows:
 
     Attributes
     ----------
-    header_ns : (n,) header stamps, None where they are absent or not sane
+    header_ns : (n,) header stamps, None where they are absent or cannot be used
     log_ns : (n,) log times
     note : why the header's are not used, empty when they are
     delay_ns : median of log time minus header stamp, 0 without header stamps
@@ -40,7 +40,7 @@ class StampedRows:
 
 
 def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
-    """Judge the header stamps of a topic: non-zero, near log time, increasing."""
+    """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
     log_ns = table.log_time_ns
     if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
@@ -51,7 +51,7 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     delay = int(np.median(log_ns - header))
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
-    # A few stamps of another clock (a first message at 0) are put where their log times say.
+    # A few stamps of another clock (a first message at 0) are replaced by their log times.
     header = np.where(np.abs(log_ns - header - delay) > NEAR_NS, log_ns - delay, header)
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
@@ -60,7 +60,7 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
 
 
 def increasing(stamps: Ints) -> tuple[Ints, int, int]:
-    """Return the rows that make stamps strictly increasing, and how many went back or stood still.
+    """Return the rows that make stamps strictly increasing, how many went back, and how many were equal.
 
     Rows are sorted by stamp; of rows with the same stamp the last one stays.
     """

@@ -1,4 +1,4 @@
-"""Where the antenna sits, from the transforms a robot publishes on ``/tf_static``."""
+"""Position of the antenna on the robot, from the transforms on ``/tf_static``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrtool.records.tables import Floats
 TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
 LARGEST_LEVER_ARM_M = 5.0
-"""A transform that puts an antenna further away than this is not that of a robot."""
+"""No antenna is further from the body origin than this [m]: such a transform is ignored."""
 
 _PREFIX = "transforms[*]."
 _TRANSLATION = tuple(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz")
@@ -25,12 +25,12 @@ Transforms = dict[str, tuple[str, Floats, Floats]]
 
 
 def is_static(channel: Channel) -> bool:
-    """Say whether a channel carries static transforms."""
+    """Return whether a channel carries static transforms."""
     return channel.message_type in TYPES and channel.topic.rstrip("/").endswith("tf_static")
 
 
 def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[float, float] | None:
-    """Return the antenna's place in the body frame, forward and right [m]; None where the log does not say.
+    """Return the antenna's position in the body frame, forward and right [m]; None where the log has no transform.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def _plain(frame: str) -> str:
 
 
 def _transforms(tables: Sequence[TopicTable]) -> Transforms:
-    """Collect the transforms of all messages; the last one of a child counts."""
+    """Return the transforms of all messages; of several for one child frame, the last."""
     found: Transforms = {}
     for table in tables:
         if not all(path in table.columns for path in FIELDS):

@@ -1,4 +1,4 @@
-"""Left from right by name: joints of one message, and pairs of topics."""
+"""Find left and right by name: joints of one message, and pairs of topics."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNO
 _OTHER_JOINTS = re.compile(
     r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
-"""Words of a joint's name, whole ones: a Panther's wheels do not pan."""
+"""Words in the name of a joint that is not a wheel. Only complete words count: "panther" is not "pan"."""
 
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
@@ -34,7 +34,7 @@ def _words(name: str) -> list[str]:
 
 
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Return the places of the left and of the right wheel joints among the names of a message."""
+    """Return the positions of the left and of the right wheel joints among the names of a message."""
     usable = [i for i, name in enumerate(names) if side_of(name) and not _belongs_elsewhere(name)]
     named = [i for i in usable if _WHEEL_WORDS.search(names[i])]
     chosen = named or usable
@@ -46,7 +46,7 @@ def _belongs_elsewhere(name: str) -> bool:
 
 
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
-    """Return the topic whose name is `left_topic` with left turned into right; None when there is none."""
+    """Return the topic whose name is `left_topic` with left replaced by right; None when there is none."""
     existing = set(topics)
     for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
         if old in left_topic:
@@ -62,7 +62,7 @@ def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
 
 
 def _stands_alone(name: str, place: int) -> bool:
-    """Say whether a letter begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
+    """Return whether a letter begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
     before = name[place - 1] if place else "/"
     after = name[place + 1] if place + 1 < len(name) else "/"
     begins = not before.isalpha() or (before.islower() and name[place].isupper())

@@ -1,4 +1,4 @@
-"""Wheels that come as one topic a side: numbers without a header, two messages to pair."""
+"""Wheels recorded as one topic per side: messages without header, paired by log time."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from icrtool.logs.streams.wheel_sources import COMMANDED, Unit, WheelMotion, mot
 from icrtool.records.tables import Bools, Floats
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
-"""Types that come as one topic a side."""
+"""Message types that hold one number of one side."""
 
 _SPEED_WORDS = re.compile(r"vel|speed|rate|rpm|twist", re.IGNORECASE)
 _PLACE_WORDS = re.compile(r"tick|count|enc|pos|angle|travel|dist|odo", re.IGNORECASE)
 _BITS = {"std_msgs/Int16": 16, "std_msgs/Int32": 32, "std_msgs/UInt32": 32, "std_msgs/Int64": 64}
 _HOLD_NS = 500_000_000
-"""A side that ends earlier than the other is held for this long at most."""
+"""A side that ends before the other is held for this long at most [s]."""
 
 
 def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMotion:
-    """Join a left and a right topic without headers: the right one is taken at the left one's stamps.
+    """Return the wheel motion of a left and a right topic without headers, at the left one's stamps.
 
     Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
     """
@@ -50,7 +50,7 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
         return unusable("the two sides were not recorded at the same time")
     moments, stamps = left.log_time_ns[both], StampedRows(None, left.log_time_ns[both], "no header", 0)
     integer = left.message_type in _BITS
-    if _tells_position(left.topic, values[0], config, integer=integer):
+    if _is_position(left.topic, values[0], config, integer=integer):
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         other = np.interp(moments, right.log_time_ns, values[1])
         why = f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}"
@@ -61,12 +61,12 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
 
 
 def _half_interval(table: TopicTable) -> int:
-    """Two messages of one control cycle are logged one after the other: half an interval joins them."""
+    """Return half the median interval [ns]: messages of one control cycle are logged closer together than this."""
     return int(np.median(np.diff(table.log_time_ns))) // 2 if len(table) > 1 else 0
 
 
 def _while_both(left: TopicTable, right: TopicTable) -> Bools:
-    """Return the left rows (n,) recorded while the right side was: a side held for longer would feign a turn."""
+    """Return the left rows (n,) recorded while the right side was, too: a side held for long would look like a turn."""
     slack = max(_half_interval(left), _half_interval(right))
     first, last = right.log_time_ns[0] - slack, right.log_time_ns[-1] + max(slack, _HOLD_NS)
     both: Bools = np.logical_and(left.log_time_ns >= first, left.log_time_ns <= last)
@@ -81,8 +81,8 @@ def _unwrapped(values: NDArray[Any], bits: int | None) -> Floats:
     return np.concatenate([[0], np.cumsum(steps)]).astype(np.float64) + float(values[0])
 
 
-def _tells_position(topic: str, values: Floats, config: Config, *, integer: bool) -> bool:
-    """Say whether a pair's numbers are travelled positions (ticks, angles), not speeds."""
+def _is_position(topic: str, values: Floats, config: Config, *, integer: bool) -> bool:
+    """Return whether a pair's numbers are positions (ticks, angles), not speeds."""
     if config.wheels.quantity != "auto":
         return config.wheels.quantity in ("position", "counts")
     if _SPEED_WORDS.search(topic):

@@ -1,4 +1,4 @@
-"""Messages that tell how the wheels move, each brought to one form: two sides, position or speed, or a body twist."""
+"""Messages that hold the motion of the wheels, in one form: position or speed of two sides, or a body twist."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ _FUSED = re.compile(
     r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
     re.IGNORECASE,
 )
-"""Odometry and twists that other sensors have a part in: better than nothing."""
+"""Names of odometry and twists that are fused with other sensors: used only where there is nothing better."""
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
-"""Positions that stay within a turn, and step over nearly all of it this often, are told modulo a turn."""
+"""Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
 
 NEVER_MOVES = 60.0
-"""Taken off the score of wheels that stand still all the time: another topic that moves is the robot's."""
+"""Subtracted from the score of wheels that never move: another topic that moves is preferred."""
 
 SIDEWAYS_SHARE = 0.2
-"""A twist that goes this much sideways and never turns is a velocity east and north, not the body's."""
+"""A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class WheelMotion:
-    """What a topic, or a pair of topics, says of the wheels.
+    """The motion of the wheels in a topic, or in a pair of topics.
 
     Attributes
     ----------
-    position_left, position_right : (n,) travelled since some start, in `position_unit`; None where not told
-    speed_left, speed_right : (n,) in `speed_unit` per second; None where not told
-    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only the body's is told
-    score : how well the type suits; `why` says it in words
+    position_left, position_right : (n,) travelled since some start, in `position_unit`; None where not recorded
+    speed_left, speed_right : (n,) in `speed_unit` per second; None where not recorded
+    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
+    score : how suitable the type is; `why` is the reason as text
     problem : why it cannot be used, empty when it can
     joints : the joints that its messages list by name, where they do
     """
@@ -70,7 +70,7 @@ class WheelMotion:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to use, even when it is asked for."""
+        """Whether no row can be used, even where the topic is configured."""
         return self.twist is None and self.position_left is None and self.speed_left is None
 
 
@@ -79,28 +79,34 @@ _Paths = tuple[str, str, str]
 
 Sides = tuple[Floats | None, Floats | None]
 Reader = Callable[[TopicTable, Config], WheelMotion]
-_UNTOLD: Sides = (None, None)
+_NOT_RECORDED: Sides = (None, None)
 
 
 def no_motion(table: TopicTable, problem: str) -> WheelMotion:
-    """Return the motion that a topic is when it cannot be read."""
+    """Return an empty motion for a topic that cannot be read, with the reason."""
     return WheelMotion(table.topic, table.message_type, stamp_rows(table), problem=problem)
 
 
 def motion_of(
-    topic: str, message_type: str, stamps: StampedRows, position: Sides = _UNTOLD, speed: Sides = _UNTOLD,
+    topic: str, message_type: str, stamps: StampedRows, position: Sides = _NOT_RECORDED, speed: Sides = _NOT_RECORDED,
     twist: Floats | None = None, units: tuple[Unit, Unit] = ("rad", "rad"), score: float = 0.0, why: str = "",
     problem: str = "",
 ) -> WheelMotion:  # fmt: skip
-    """Build a motion from left and right; what is told of one side only, or nowhere finite, is left out."""
-    told = [pair if all(side is not None and bool(np.isfinite(side).any()) for side in pair) else _UNTOLD
+    """Return a motion of left and right; a quantity of one side only, or without a finite value, is left out."""
+    recorded = [pair if all(side is not None and bool(np.isfinite(side).any()) for side in pair) else _NOT_RECORDED
             for pair in (position, speed)]  # fmt: skip
-    values = [side for pair in told for side in pair if side is not None] + ([twist] if twist is not None else [])
+    values = [side for pair in recorded for side in pair if side is not None] + ([twist] if twist is not None else [])
     if not values and not problem:
-        problem = "tells neither position nor speed of both sides"
-    if values and not any(_changes(side) for side in told[0]) and not any(_nonzero(v) for v in (*told[1], twist)):
+        problem = "has neither position nor speed of both sides"
+    if (
+        values
+        and not any(_changes(side) for side in recorded[0])
+        and not any(_nonzero(v) for v in (*recorded[1], twist))
+    ):
         score, why = score - NEVER_MOVES, f"{why}, never moves"
-    return WheelMotion(topic, message_type, stamps, *told[0], units[0], *told[1], units[1], twist, score, why, problem)
+    return WheelMotion(
+        topic, message_type, stamps, *recorded[0], units[0], *recorded[1], units[1], twist, score, why, problem
+    )
 
 
 def _changes(side: Floats | None) -> bool:
@@ -116,34 +122,34 @@ def _header(*paths: str) -> tuple[str, ...]:
 
 
 def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
-    """Return the mean over the joints of each side that ever say something; None where none does."""
+    """Return the mean over the joints of each side that have finite values; None where none has."""
     means: list[Floats | None] = []
     for places in (left, right):
-        told = [place for place in places if np.isfinite(values[:, place]).any()]
-        means.append(values.T[told].astype(np.float64).mean(axis=0) if told else None)
+        finite = [place for place in places if np.isfinite(values[:, place]).any()]
+        means.append(values.T[finite].astype(np.float64).mean(axis=0) if finite else None)
     return means[0], means[1]
 
 
 def _unwound(positions: Floats) -> Floats:
-    """Return joint positions [rad] (n, k); those told within one turn, as angles that go on.
+    """Return joint positions [rad] (n, k); those recorded modulo one turn are unwrapped.
 
-    Before sides are averaged: a front and a rear wheel do not begin a turn at the same time.
+    This is done before a side is averaged: a front and a rear wheel do not begin a turn at the same time.
     """
     unwound = positions
     for place, column in enumerate(positions.T):
         if not float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf)) <= ONE_TURN_RAD:
             continue
-        told = np.flatnonzero(np.isfinite(column))
-        steps = np.abs(np.diff(column[told]))
+        finite = np.flatnonzero(np.isfinite(column))
+        steps = np.abs(np.diff(column[finite]))
         wraps = steps > np.pi
         if np.count_nonzero(wraps) >= FEWEST_WRAPS and float(steps[wraps].min()) > LEAST_WRAP_RAD:
             unwound = unwound.copy("K") if unwound is positions else unwound
-            unwound[told, place] = np.unwrap(column[told])
+            unwound[finite, place] = np.unwrap(column[finite])
     return unwound
 
 
 def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what: str) -> WheelMotion:
-    """Read messages that list joints by name, in any order; another publisher's joints may come in between."""
+    """Return the motion of messages that list joints by name, in any order; other joints may be listed in between."""
     codes, texts = table.words(paths[0])
     left, right = _wheels_among(texts, config)
     if not (left and right):
@@ -160,9 +166,10 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
         return no_motion(table, "left and right wheels come in different messages")
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
-    told, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
+    positions, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
     position, speed = (
-        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)]) for values in (_unwound(told), speeds)
+        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)])
+        for values in (_unwound(positions), speeds)
     )
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
     return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
@@ -184,7 +191,7 @@ def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
     A mean over wheels that changes its members would jump.
     """
     listed = np.zeros((lefts + rights, len(wheels)), np.bool_).T
-    for rows, wheel, _ in _told_wheels(wheels):
+    for rows, wheel, _ in _listed_wheels(wheels):
         listed[rows, wheel] = True
     both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
     sets = listed[both]
@@ -195,16 +202,16 @@ def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
 
 
 def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats:
-    """Return what each message tells of each wheel (n, count), NaN where nothing."""
-    told = np.full((count, len(wheels)), np.nan).T
+    """Return the value of each wheel in each message (n, count), NaN where it is not listed."""
+    by_wheel = np.full((count, len(wheels)), np.nan).T
     if values is not None:
-        for rows, wheel, place in _told_wheels(wheels[:, : values.shape[1]]):
-            told[rows, wheel] = values[rows, place]
-    return told
+        for rows, wheel, place in _listed_wheels(wheels[:, : values.shape[1]]):
+            by_wheel[rows, wheel] = values[rows, place]
+    return by_wheel
 
 
-def _told_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
-    """Yield rows, and the wheel, or that of each row, which they list at a place."""
+def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
+    """Yield rows, the wheel that they list (one, or one per row), and its position in the list."""
     for place, listed in enumerate(wheels.T):
         if len(listed) and (listed == listed[0]).all():
             if listed[0] >= 0:
@@ -224,7 +231,7 @@ def _by_name(paths: _Paths, score: float, what: str) -> Reader:
 def _by_place(
     paths: tuple[str, str], left: list[int], right: list[int], why: str, stamp: str = "header.stamp"
 ) -> Reader:
-    """Read messages whose lists of positions and of speeds have the sides at fixed places."""
+    """Return a reader of messages whose lists of positions and of speeds have each side at fixed positions."""
     length = max(left + right) + 1
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
@@ -241,7 +248,7 @@ def _by_place(
 
 
 def _segway(prefix: str) -> Reader:
-    """Read the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
+    """Return a reader of the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         def sides(quantity: str) -> Sides:
@@ -264,27 +271,27 @@ def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score
     forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
     problem = ""
     if not _nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
-        problem = "goes sideways and never turns: a velocity east and north, not the body's"
+        problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
     return motion_of(
         table.topic, table.message_type, stamp_rows(table), twist=twist, score=score, why=why, problem=problem
     )
 
 
 def _scout(table: TopicTable, _: Config) -> WheelMotion:
-    """Read scout_msgs/ScoutStatus: the body twist the base reports (its motor rpm is integer, before the gearbox)."""
-    why = "the base's own speed and turn rate, undone with the track width"
+    """Return the body twist in scout_msgs/ScoutStatus (its motor rpm is integer, and before the gearbox)."""
+    why = "the base's own speed and turn rate, converted to wheel speeds with the track width"
     return _twist_motion(table, "linear_velocity", "lateral_velocity", "angular_velocity", 70.0, why)
 
 
 def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Reader:
-    """Read a body twist; `fused` is taken off where the topic's name says that other sensors have a part in it."""
+    """Return a reader of a body twist; `fused` is subtracted from the score of a topic named as fused with others."""
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         lowered = score - (fused if _FUSED.search(table.topic) else 0.0)
-        why = f"{what}, undone with the track width"
+        why = f"{what}, converted to wheel speeds with the track width"
         motion = _twist_motion(table, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", lowered, why)
         if REFERENCE_WORDS.search(table.topic) and not motion.problem:
-            return replace(motion, problem="its name says that it is a reference's, not the wheels'")
+            return replace(motion, problem="its name is that of a position reference, not of wheels")
         return motion
 
     return read

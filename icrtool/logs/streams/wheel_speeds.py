@@ -1,4 +1,4 @@
-"""From what a topic says of the wheels (position or speed, or a body twist) to speeds of both sides in its unit."""
+"""Convert the wheel motion of a topic (position, speed or body twist) to speeds of both sides, in its unit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST_NOT_FINITE = 0.01
 
 
 def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[str]]:
-    """Turn wheel motion into speeds held over each interval, in the unit of the log.
+    """Return wheel speeds held over each interval, in the unit of the log, and warnings.
 
     Returns
     -------
@@ -24,7 +24,7 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
     Raises
     ------
     ConfigError
-        A body twist without the width that it was made with, or a quantity that the topic does not have.
+        A body twist whose track width is not configured, or a configured quantity that the topic does not have.
     DataError
         Fewer than two usable samples.
     """
@@ -63,7 +63,9 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
         width = _twist_width_m(config)
         if width is None:
             raise ConfigError(
-                "robot.track_width_m", f"needed to undo the body twist of {motion.topic}", "give it, or --robot NAME"
+                "robot.track_width_m",
+                f"needed to convert the body twist of {motion.topic} to wheel speeds",
+                "give it, or --robot NAME",
             )
         speed, turn = motion.twist.T
         return speed - turn * width / 2, speed + turn * width / 2, "m", False
@@ -72,11 +74,11 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
     speeds = _both(motion.speed_left, motion.speed_right)
     by_position = positions is not None and wanted != "velocity" and (wanted != "auto" or _alive(positions, speeds))
     if wanted in ("position", "counts") and positions is None:
-        raise ConfigError("wheels.quantity", f"{motion.topic} tells no {wanted}", "leave it on auto")
+        raise ConfigError("wheels.quantity", f"{motion.topic} has no {wanted}", "leave it on auto")
     if speeds is not None and not by_position:
         return *speeds, motion.speed_unit, False
     if positions is None or wanted == "velocity":
-        raise ConfigError("wheels.quantity", f"{motion.topic} tells no velocity of both sides", "leave it on auto")
+        raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
     unit: Unit = "counts" if wanted == "counts" else motion.position_unit
     return *positions, unit, True
 
@@ -87,12 +89,12 @@ def _twist_width_m(config: Config) -> float | None:
 
 
 def _assumptions(motion: WheelMotion, config: Config) -> list[str]:
-    """Say what was taken for granted of a body twist, and where it can be set."""
+    """Return a warning with the width assumed for a body twist, and the option that sets it."""
     if motion.twist is None or config.wheels.twist_width_m is not None:
         return []
-    undone = f"undone with {config.robot.track_width_m:g} m (robot.track_width_m)"
-    advice = "where its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
-    return [f"{motion.topic} tells a body twist: {undone}; {advice}, or the ICRs come out too close"]
+    undone = f"converted to wheel speeds with {config.robot.track_width_m:g} m (robot.track_width_m)"
+    advice = "if its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
+    return [f"{motion.topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together"]
 
 
 def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | None:
@@ -100,7 +102,7 @@ def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | 
 
 
 def _alive(positions: tuple[Floats, Floats], speeds: tuple[Floats, Floats] | None) -> bool:
-    """Say whether the positions move where the speeds do: some drivers leave the position at zero."""
+    """Return whether the positions change where the speeds do: some drivers leave the position at zero."""
     finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
     if np.count_nonzero(finite) < len(finite) / 2:
         return False

@@ -1,4 +1,4 @@
-"""Serialised messages to files: one function a container, all topics merged in time order."""
+"""Write serialised messages to a file: one function per container; all topics merged in time order."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def write_db3(
 
 
 def _drop_definitions(database: Path) -> None:
-    """Bring a database back to schema 3 of rosbag2 (ROS 2 Humble), the last without message definitions."""
+    """Convert a database to schema 3 of rosbag2 (ROS 2 Humble), the last one without message definitions."""
     connection = sqlite3.connect(database)
     try:
         connection.executescript(

@@ -1,4 +1,4 @@
-"""Write a robot log from columns: what `icrtool simulate`, the sample logs and the tests record with."""
+"""Write a robot log from columns; used by `icrtool simulate`, the sample logs and the tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
     Parameters
     ----------
     path : the file to make (``mcap``, ``bag``), or the directory (``db3``); it must not exist
-    columns : sensor columns in the charter's frame
+    columns : sensor columns in the frames of `icrtool`
     options : container, message types and conventions
 
     Returns
@@ -30,8 +30,9 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
 
     Raises
     ------
-    OutputError : `path` exists or cannot be written. It then stays as it was: the log is written next to it under
-        another name and moved there once it is whole.
+    OutputError
+        `path` exists or cannot be written. No incomplete file stays: the log is written next to it under another name,
+        and renamed when it is complete.
 
     Notes
     -----

@@ -1,7 +1,7 @@
-"""Columns to serialised messages: one template a topic, its changing bytes overwritten for all messages at once.
+"""Serialise columns to messages: one template per topic, its changing bytes overwritten for all messages at once.
 
-Serialising 800,000 messages one by one takes minutes. The layout of these types is fixed once the lengths of their
-strings are, so a topic is one byte matrix. Where a field stands is found by changing it in the template.
+Serialising 800,000 messages one by one takes minutes. The layout of these types is fixed when the lengths of their
+strings are, so a topic is one byte matrix. The offset of a field is found by changing its value in the template.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+
+from icrtool.logs.messages.definitions import bundled_definitions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,16 +33,12 @@ FRONT_AND_REAR_JOINTS = (
     "rear_right_wheel_joint",
 )
 
-JACKAL_DEFINITIONS = {
-    "jackal_msgs/msg/DriveFeedback": (
-        "float32 current\nfloat32 duty_cycle\nfloat32 bridge_temperature\nfloat32 motor_temperature\n"
-        "float32 measured_velocity\nfloat32 measured_travel\nbool driver_fault\n"
-    ),
-    "jackal_msgs/msg/Feedback": (
-        "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
-        "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"
-    ),
-}
+JACKAL_TYPES = ("jackal_msgs/msg/DriveFeedback", "jackal_msgs/msg/Feedback")
+ROS1_JACKAL_FEEDBACK = (
+    "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
+    "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"
+)
+"""The ROS 1 form has two temperatures that the ROS 2 form, which is bundled, does not have (docs.ros.org/en/api)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,21 +70,21 @@ class _Plan:
 
 @cache
 def load_typestore(*, ros1: bool) -> Typestore:
-    """Return the message types of ROS Noetic or of ROS 2 Jazzy, jackal_msgs included."""
+    """Return the message types of ROS Noetic or of ROS 2 Jazzy, with those of jackal_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
-    for name, text in JACKAL_DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
+    types = {name: bundled_definitions()[name] for name in JACKAL_TYPES}
+    if ros1:
+        types |= get_types_from_msg(ROS1_JACKAL_FEEDBACK, "jackal_msgs/msg/Feedback")
+    store.register(types)
     return store
 
 
 def serialise_topics(columns: SensorColumns, options: WriteOptions, store: Typestore) -> tuple[TopicMessages, ...]:
-    """Turn the columns into the messages of every topic that has any.
+    """Return the messages of every topic that has any, in the order wheels, position, heading.
 
-    Returns
-    -------
-    topics, in the order wheels, position, heading: the order of messages with equal stamps
+    Messages with equal stamps are written in this order.
     """
     plans = (*_plan_wheels(columns, options), _plan_position(columns), _plan_heading(columns, options))
     prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
@@ -194,7 +192,7 @@ def _plan_position(columns: SensorColumns) -> _Plan:
 
 
 def _plan_heading(columns: SensorColumns, options: WriteOptions) -> _Plan:
-    # World and body turn over together: in ENU the body's z is up, in NED it is down (REP-145).
+    # World and body frame change together: in ENU the body's z is up, in NED it is down (REP-145).
     enu = options.heading == "enu"
     yaw = np.pi / 2 - columns.heading_rad if enu else columns.heading_rad
     changing = _header_stamp(columns.heading_stamp_ns) | {
@@ -267,7 +265,7 @@ def _put(message: object, path: str, value: object) -> None:
 
 
 def _find_slot(encode: Callable[[], NDArray[np.uint8]], message: object, path: str, dtype: np.dtype[Any]) -> slice:
-    """Return the bytes of the scalar at `path`: those that change when it does. It is zero before and after."""
+    """Return the byte range of the scalar at `path`, which is zero before and after: the bytes that change with it."""
     blank = encode()
     _put(message, path, np.frombuffer(b"\x11" * dtype.itemsize, dtype=dtype)[0])
     changed = np.flatnonzero(encode() != blank)

@@ -1,4 +1,4 @@
-"""What a robot log is written from: columns in the charter's frame, and how the robot would have recorded them."""
+"""Input of the log writer: sensor columns in the frames of `icrtool`, and how a robot would have recorded them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ COMPRESSIONS: dict[Container, tuple[Compression, ...]] = {
     "bag": ("none", "bz2", "lz4"),
     "db3": ("none", "zstd", "zstd-file"),
 }
-"""What each container offers. For db3, ``zstd`` compresses message by message, ``zstd-file`` the closed file."""
+"""Compressions of each container. For db3, ``zstd`` compresses message by message, ``zstd-file`` the closed file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorColumns:
-    """What the sensors of one drive said: y right, heading clockwise from north (the charter).
+    """Measurements of the sensors on one drive, in the frames of `icrtool`: y right, heading clockwise from north.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class SensorColumns:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WriteOptions:
-    """How the robot recorded its drive.
+    """How a log is recorded: container, message types and conventions.
 
     Attributes
     ----------
@@ -82,11 +82,11 @@ class WriteOptions:
         is ``imu_link_ned`` (REP-145)
     namespace : put before every topic (``/j100_0042``)
     compression : one of `COMPRESSIONS` of the container
-    wheel_radius_m : turns metres into radians and counts
-    track_width_m : b: what a wheel controller divides by for its angular velocity [m]
+    wheel_radius_m : converts metres to radians and counts
+    track_width_m : b, by which a wheel controller divides for its angular velocity [m]
     counts_per_rev : encoder counts of one wheel revolution
     heading_std_deg : written as the orientation's covariance
-    definitions : False writes only the types' names, as ROS 2 Humble and older do (not possible in a ROS 1 bag)
+    definitions : False: only the names of the types are written, as in ROS 2 Humble and older (not in a ROS 1 bag)
     """
 
     container: Container = "mcap"

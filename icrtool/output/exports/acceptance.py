@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
-from icrtool.output.atomic_file import whole_file
+from icrtool.output.atomic_file import atomic_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
 from icrtool.output.text_format import run_title
 
@@ -38,7 +38,7 @@ def write_junit(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
     for total in ("tests", "failures", "errors"):
         suites.set(total, str(sum(int(suite.get(total, "0")) for suite in suites)))
     ET.indent(suites)
-    with whole_file(path) as partial:
+    with atomic_file(path) as partial:
         partial.write_bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
@@ -60,7 +60,7 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
             parts.append(f"## {_escaped(name)}\n\nCould not be used: {_escaped(str(outcome))}\n")
         else:
             parts.append(format_markdown(outcome))
-    with whole_file(path) as partial:
+    with atomic_file(path) as partial:
         partial.write_bytes("\n".join(parts).encode("utf-8", errors="backslashreplace"))
 
 

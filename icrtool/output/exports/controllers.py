@@ -1,4 +1,4 @@
-"""A run's calibration as configuration for other people's controllers and filters: YAML with comments, or JSON."""
+"""A calibration as configuration for other people's controllers and filters: YAML with comments, or JSON."""
 
 from __future__ import annotations
 
@@ -10,31 +10,38 @@ from datetime import UTC, datetime
 from typing import Literal, get_args
 
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers
+from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers, export_numbers
+from icrtool.calibration.record import Calibration
+from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.text_format import TABLE_WIDTH
 
-Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json"]
+Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
 TARGETS: tuple[Target, ...] = get_args(Target)
 
 EXPORT_SCHEMA = "icrtool/export/1"
 
 NOT_PLANAR = 0.001
-"""Variance of z, roll and pitch, of which a plane says nothing: the value the controller's own documentation gives."""
+"""Variance of z, roll and pitch, which a plane does not show: the value the controller's own documentation gives."""
 
 ODOMETRY_USED = (6, 11)
 """Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
 
 
-def format_export(numbers: ExportNumbers, target: Target) -> str:
+def format_export(calibration: Calibration, target: Target) -> str:
     """Return the text to paste, no line end.
 
     Notes
     -----
     Keys as documented by ros2_controllers (diff_drive_controller parameters), Clearpath (robot.yaml,
     ``platform.extras.ros_parameters``), Husarion (``WH0x_controller.yaml``), nav2 (AMCL) and robot_localization.
+
+    Raises
+    ------
+    DataError
+        The drives were too short to measure covariances, which every target but ``icr`` holds.
     """
-    return _WRITERS[target](numbers)
+    return format_twist(calibration) if target == "icr" else _WRITERS[target](export_numbers(calibration))
 
 
 def _json(numbers: ExportNumbers) -> str:
@@ -83,7 +90,7 @@ def _nav2(numbers: ExportNumbers) -> str:
         f"    odom0_config: [{', '.join('true' if used in ODOMETRY_USED else 'false' for used in range(15))}]",
         "    odom0_differential: false",
         "    odom0_relative: false",
-        "# AMCL: shares of variance of turn by turn, turn by way, way by way, way by turn",
+        "# AMCL: shares of variance of turn by turn, turn by distance, distance by distance, distance by turn",
         "amcl:",
         "  ros__parameters:",
         '    robot_model_type: "nav2_amcl::DifferentialMotionModel"',
@@ -107,33 +114,37 @@ def _controller(numbers: ExportNumbers, indent: int) -> list[str]:
     ):
         lines.append(f"{key}: {value:.4f}  # ± {std:.4f}")
     lines += [
-        f"# after {POSE_AFTER_M:g} m of way; x forward, y left, z, roll, pitch, yaw",
+        f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {_diagonal(numbers.pose_variance)}",
-        f"# of velocities over {TWIST_OVER_M:g} m of way",
+        f"# of velocities over {TWIST_OVER_M:g} m",
         f"twist_covariance_diagonal: {_diagonal(numbers.twist_variance)}",
     ]
     return [" " * indent + line for line in lines]
 
 
 def _header(numbers: ExportNumbers) -> list[str]:
-    """Return the comments above: where the numbers come from, and what they cannot say."""
+    """Return the comments above: where the numbers come from, and what they cannot express."""
     right, left, x = numbers.icrs_m
     std_right, std_left, std_x = numbers.icr_std_m
     robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
-    origin = f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {numbers.way_m:.0f} m{robot}"
+    distance_m = numbers.way_m
+    origin = (
+        f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {distance_m:.0f} m{robot}, "
+        f"fitted {numbers.created[:10]}"
+    )
     icrs = (
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+.3f} ± {std_x:.3f} m (body: x forward, y right)"
     )
-    judged = (
-        f"95 % of the ends after {POSE_AFTER_M:g} m on wheels alone, with these numbers and held out of their fit, "
-        f"lie within {numbers.p95_m:.2f} m"
+    held_out = (
+        f"held out of the fit, wheels alone, after {POSE_AFTER_M:g} m: 95 % within {numbers.p95_m:.2f} m with these "
+        f"numbers, {numbers.full_p95_m:.2f} m with the whole model ({numbers.model}; icrtool export --for icr)"
     )
     lost = (
         f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
     )
-    sentences = [origin, icrs, judged, lost, *(f"WARNING: {_one_line(doubt)}" for doubt in numbers.doubts)]
+    sentences = [origin, icrs, held_out, lost, *(f"WARNING: {_one_line(warning)}" for warning in numbers.doubts)]
     return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
 
 
@@ -155,6 +166,8 @@ def _number(value: float) -> str:
 
 
 def _date(numbers: ExportNumbers) -> str:
+    if not numbers.begin_ns:
+        return "at an unknown date"
     return datetime.fromtimestamp(numbers.begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 

@@ -37,7 +37,7 @@ AFTER: dict[str, Any] = {
 
 def draw_calibration(calibration: Calibration) -> Figure:
     """Draw where windows of way miss the fixes, and how much their turns miss the heading, before and after."""
-    misses = calibration.misses
+    misses = calibration.residuals
     figure = new_figure(
         calibration.name,
         f"{calibration.windows} windows of way, predicted by wheels and heading: what is left",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from icrtool.calibration.findings import Calibration
 from icrtool.errors import OutputError
-from icrtool.output.atomic_file import check_place, whole_file
+from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.figures.drawing_process import matplotlib_unsaid
 from icrtool.output.run_directory import PLOT_FORMATS
 
@@ -33,7 +33,7 @@ def write_picture(calibration: Calibration, file: Path) -> None:
         The file cannot be written.
     """
     form = file.suffix.removeprefix(".").lower()
-    with whole_file(file) as partial, matplotlib_unsaid():
+    with atomic_file(file) as partial, matplotlib_unsaid():
         from icrtool.output.figures.calibration import draw_calibration
         from icrtool.output.figures.style import save, style
 

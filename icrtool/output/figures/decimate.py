@@ -10,7 +10,7 @@ LINE_POINTS = 2400
 """Points of a drawn line: some three per pixel column of every figure."""
 
 SAMPLED_ROWS = 40_000
-"""Rows enough to tell the range of a column for drawing."""
+"""Rows enough to find the range of a column for drawing."""
 
 
 def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:

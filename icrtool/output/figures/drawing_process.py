@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 Write = Callable[..., None]
-"""Called with a directory, formats, and what to draw; a function of a module, so that a process can be told it."""
+"""Called with a directory, formats, and what to draw; a function of a module, which another process can import."""
 
 Draw = Callable[..., None]
 """Called with a `Write` and what it draws."""
@@ -39,7 +39,7 @@ class Drawer(Protocol):
 
 @contextmanager
 def matplotlib_unsaid() -> Iterator[None]:
-    """Leave unsaid what matplotlib says of a home directory it cannot write: that is not our user's trouble."""
+    """Suppress what matplotlib prints about a home directory it cannot write: it does not concern our user."""
     logger = logging.getLogger("matplotlib")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -167,7 +167,7 @@ def _signals_held() -> Iterator[None]:
 
 
 def _begin() -> None:
-    """Leave an interrupt to the parent, and what matplotlib says of an unwritable home directory unsaid."""
+    """Leave an interrupt to the parent, and suppress what matplotlib prints about an unwritable home directory."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):

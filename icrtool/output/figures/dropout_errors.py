@@ -23,14 +23,19 @@ WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.6, 2.3
 PENS = {"icr": ICR, "no_slip": NO_SLIP}
 MARKERS = {"icr": "o", "no_slip": "s"}
 BANDS = {"icr": "#a6c4e0", "no_slip": "#f6d3a8"}
+CONSTANT_COLORS = ("#1b7837", "#762a83", "#8c510a", "#01665e", "#c51b7d")
+"""Of the recommended model and of calibrations, in the order of the report."""
+
 FINAL = Pen("0.35", width=0.9)
+BUDGET = Pen("#b2182b", (0, (1.5, 2.0)), 1.0)
+HISTOGRAM_LABELS = {"icr": "ICR", "no_slip": "no slip"}
 P95 = Pen("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
 DASH = (0, (4.0, 2.0))
 FLATTENING = 2.5
 HISTOGRAM_IN_P95 = 2.0
-"""A histogram is shown up to this many times p95; what lies beyond is said in words."""
+"""A histogram is shown up to this many times p95; what lies beyond is stated in words."""
 
 
 def draw_summary(title: str, report: DropoutReport) -> Figure:
@@ -48,13 +53,16 @@ def draw_summary(title: str, report: DropoutReport) -> Figure:
     )
     panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
     figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.05), wspace=0.28)
-    for axes, shown in zip(panels, (("no_slip", "icr"), ("icr",)), strict=False):
+    constant = _constant_models(report)
+    for axes, shown in zip(panels, (("no_slip", "icr", *constant), ("icr", *constant)), strict=False):
+        for budget in dict.fromkeys(one.budget_m for one in report.budgets):
+            axes.axhline(budget, **BUDGET.keywords())
         if (final := report.result("icr_final")) is not None:
             for values, dash in ((final.summary.p95, "-"), (final.summary.expected, DASH)):
                 axes.plot(report.horizons_m, values, color=FINAL.color, linewidth=FINAL.width, linestyle=dash)
         for name in shown:
             if (result := report.result(name)) is not None:
-                _draw_model(axes, result, report.horizons_m)
+                _draw_model(axes, result, report.horizons_m, *_look(report, name))
         for one in _shown_outages(report):
             axes.plot([one.distance_m], [one.end_error_m], **_real_mark())
         axes.set_xlim(0, report.horizons_m[-1] * 1.02)
@@ -70,7 +78,8 @@ def draw_summary(title: str, report: DropoutReport) -> Figure:
 def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figure:
     """Draw the share of trials by error at one horizon, a panel a model, with the expected value and 95 % marked."""
     h = int(np.flatnonzero(report.horizons_m == horizon_m)[0])
-    results = [result for name in PENS if (result := report.result(name)) is not None]
+    shown = (*PENS, *_constant_models(report))
+    results = [result for name in shown if (result := report.result(name)) is not None]
     figure = new_figure(
         title,
         f"Open-loop error after {horizon_m:g} m, {int(report.counts.trials[h]):,} trials",
@@ -81,7 +90,7 @@ def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figur
     margins = inches(figure, left=0.7, right=0.2, top=0.85, bottom=0.9)
     figure.subplots_adjust(**margins, hspace=0.6)
     for axes, result in zip(panels, results, strict=True):
-        _draw_bins(axes, result, h)
+        _draw_bins(axes, result, h, _look(report, result.name)[0])
         axes.set_xlabel("Error [m]")
     keys = [Line2D([], [], label="95 % of the trials", **P95.keywords())]
     keys.append(Line2D([], [], label="expected value", **MEAN.keywords()))
@@ -89,8 +98,22 @@ def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figur
     return figure
 
 
+def _constant_models(report: DropoutReport) -> tuple[str, ...]:
+    """Return the recommended model and the calibrations that the report has rows of."""
+    fixed = {*PENS, "icr_final"}
+    return tuple(result.name for result in report.results if result.name not in fixed)
+
+
+def _look(report: DropoutReport, name: str) -> tuple[str, str, str]:
+    """Return colour, marker and colour of the band of a model."""
+    if name in PENS:
+        return PENS[name].color, MARKERS[name], BANDS[name]
+    color = CONSTANT_COLORS[_constant_models(report).index(name) % len(CONSTANT_COLORS)]
+    return color, "D" if name == "recommended" else "^", "0.8"
+
+
 def _flattened(report: DropoutReport) -> bool:
-    """Say whether no slip is so much worse that the ICR curves need a panel of their own."""
+    """Return whether no slip is so much worse that the ICR curves need a panel of their own."""
     icr, no_slip = report.result("icr"), report.result("no_slip")
     if icr is None or no_slip is None or not np.isfinite(no_slip.summary.p95).any():
         return False
@@ -101,31 +124,33 @@ def _shown_outages(report: DropoutReport) -> list[Outage]:
     return [one for one in report.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
 
 
-def _draw_model(axes: Axes, result: ModelResult, horizons: Floats) -> None:
+def _draw_model(axes: Axes, result: ModelResult, horizons: Floats, color: str, marker: str, band: str) -> None:
     """Draw 95 % (filled marks, solid) and expected error (open marks, dashed) of a model with their intervals."""
     summary, intervals = result.summary, result.intervals
-    color, marker = PENS[result.name].color, MARKERS[result.name]
     look: dict[str, Any] = {"color": color, "marker": marker, "markersize": 4.5, "linewidth": 1.3, "markevery": 1}
     for low, high in (
         (intervals.p95_low, intervals.p95_high),
         (intervals.expected_low, intervals.expected_high),
     ):
-        axes.fill_between(horizons, low, high, color=BANDS[result.name], alpha=0.6, linewidth=0)
+        axes.fill_between(horizons, low, high, color=band, alpha=0.6, linewidth=0)
     axes.plot(horizons, summary.p95, **look)
     axes.plot(horizons, summary.expected, linestyle=DASH, markerfacecolor="white", **look)
 
 
 def _summary_keys(report: DropoutReport, *, real: bool) -> list[Line2D | Patch]:
     keys: list[Line2D | Patch] = []
-    for name, label in (("icr", "ICR"), ("no_slip", "no slip")):
-        if report.result(name) is not None:
-            look: dict[str, Any] = {"color": PENS[name].color, "marker": MARKERS[name], "markersize": 4.5}
+    for name in ("icr", "no_slip", *_constant_models(report)):
+        if (result := report.result(name)) is not None:
+            label, (color, marker, _) = HISTOGRAM_LABELS.get(name, result.label), _look(report, name)
+            look: dict[str, Any] = {"color": color, "marker": marker, "markersize": 4.5}
             keys.append(Line2D([], [], label=f"{label}, 95 %", **look))
             keys.append(Line2D([], [], label=f"{label}, expected", linestyle=DASH, markerfacecolor="white", **look))
     if report.result("icr_final") is not None:
         keys.append(Line2D([], [], label="final ICRs, 95 %", **FINAL.keywords()))
         keys.append(Line2D([], [], label="final ICRs, expected", color=FINAL.color, linewidth=0.9, linestyle=DASH))
     keys.append(Patch(color="0.8", linewidth=0, label="95 % interval"))
+    if report.budgets:
+        keys.append(Line2D([], [], label="budget", **BUDGET.keywords()))
     if real:
         keys.append(Line2D([], [], label="real outage", **_real_mark()))
     return keys
@@ -135,17 +160,17 @@ def _real_mark() -> dict[str, Any]:
     return {"linestyle": "none", "marker": "X", "color": "black", "markersize": 7, "zorder": 5, "clip_on": False}
 
 
-def _draw_bins(axes: Axes, result: ModelResult, h: int) -> None:
+def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str) -> None:
     """Draw the bins of one model at horizon number `h`, its expected value and 95 % with their numbers."""
     summary, bins = result.summary, result.histograms[h]
     p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
     width = float(bins.right[0] - bins.left[0])
     end = min(HISTOGRAM_IN_P95 * p95, float(bins.right[-1])) if p95 > 0 else width
     edges = np.append(bins.left, bins.right[-1])
-    fill_bins(axes, edges, bins.percent, color=PENS[result.name].color, alpha=0.75)
+    fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
     axes.axvline(p95, **P95.keywords())
     axes.axvline(expected, **MEAN.keywords())
-    label = {"icr": "ICR", "no_slip": "no slip"}[result.name]
+    label = HISTOGRAM_LABELS.get(result.name, result.label)
     axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
     facts = f"expected {length_text(expected)},  95 % within {length_text(p95)},  max {length_text(largest)}"
     axes.set_title(facts, loc="right", pad=4.0)

@@ -48,7 +48,7 @@ class ReportFigures:
                 path = report.reference_north_m, report.reference_east_m
                 self._draw(write_figure, "outages", title, *path, report.outages)
         width_known = report.run_summary["config"]["robot"]["track_width_m"] is not None
-        wanted = HISTOGRAM_MODELS if width_known else HISTOGRAM_MODELS[:1]
+        wanted = [*(HISTOGRAM_MODELS if width_known else HISTOGRAM_MODELS[:1]), *report.expected]
         if not self._histograms_drawn and all(report.result(model) is not None for model in wanted):
             self._histograms_drawn = True
             trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))

@@ -158,8 +158,8 @@ def _turn_text(drive: ExampleTrial) -> str:
     return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
 
 
-def _mark(face: str) -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": face, "markersize": 5.5}
+def _mark(fill: str) -> dict[str, Any]:
+    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": 5.5}
 
 
 def _end(pen: Pen) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _fit_to_box(norths: Floats, easts: Floats) -> tuple[tuple[float, float], tup
 
 def _outages_text(outages: Sequence[Outage]) -> str:
     """Return how many outages of each kind there are, and the largest end error of each."""
-    said = []
+    parts = []
     for kind in ("forced", "real"):
         ours = [one for one in outages if one.kind == kind]
         if ours:
@@ -193,12 +193,12 @@ def _outages_text(outages: Sequence[Outage]) -> str:
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
             span = duration_text(lengths[0])
             span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
-            said.append(f"{len(ours)} {kind} of {span}, end error up to {length_text(worst)}")
-    return "Outages: " + "; ".join(said)
+            parts.append(f"{len(ours)} {kind} of {span}, end error up to {length_text(worst)}")
+    return "Outages: " + "; ".join(parts)
 
 
 def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, float], points_per_metre: float) -> None:
-    """Write each outage's number and end error beside its end where there is room; the tables have them all.
+    """Write each outage's number and end error beside its end where it fits; the tables have them all.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ BINS = 30
 
 
 def draw_icr_estimates(run: Run) -> Figure:
-    """Draw the three ICR estimates over time with ±2σ, their 10-90 % rise, b/2 where known, and GNSS outages.
+    """Draw the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
@@ -73,7 +73,7 @@ def draw_icr_estimates(run: Run) -> Figure:
         for axes, span in zip(row, spans, strict=True):
             _draw_estimate(axes, run, column, span, first=axes is row[0])
         row[0].set_ylabel(NAMES[column])
-        row[0].set_title(_rise_text(run, column), loc="left", pad=4.0)
+        row[0].set_title(_convergence_text(run, column), loc="left", pad=4.0)
         row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
         axes.set_xlabel(f"Time [{TimeAxis.for_span(end - begin).unit}]")
@@ -109,17 +109,17 @@ def draw_icr_clusters(run: Run) -> Figure:
 
 
 def _spans_s(run: Run) -> list[tuple[float, float]]:
-    """Return begin and end [s] of the panels: the rise of all three estimates and what follows, or all in one."""
+    """Return begin and end [s] of the panels: all three estimates converging and what follows, or all in one."""
     duration = float(run.table.t_s[-1])
-    rises = [rise for rise in run.convergence_s.values() if rise is not None]
-    first, last = min((rise[0] for rise in rises), default=0.0), max((rise[1] for rise in rises), default=0.0)
+    found = [span for span in run.convergence_s.values() if span is not None]
+    first, last = min((span[0] for span in found), default=0.0), run.settled_s
     margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
     begin, end = max(first - margin, 0.0), last + margin
     return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
 
 
 def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float], *, first: bool) -> None:
-    """Draw one estimate over a span; the `first` panel also has b/2 and the rise."""
+    """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
     table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
     t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
@@ -135,7 +135,7 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
-        spread += _draw_rise(axes, run, column, unit)
+        spread += _draw_convergence(axes, run, column, unit)
     else:
         spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
     middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
@@ -144,16 +144,16 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     axes.locator_params(axis="y", nbins=5)
 
 
-def _draw_rise(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
-    """Draw b/2 and the begin and end of the rise; return where they are [m]."""
+def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
+    """Draw b/2 and the begin and end of the convergence; return where they are [m]."""
     heights: list[float] = []
     if (width := run.track_width_m) is not None:
         heights.append(SIDES[column] * width / 2)
         axes.axhline(heights[0], **HALF_WIDTH.keywords())
-    if (rise := run.convergence_s[column]) is not None:
-        for second, face in zip(rise, ("white", "black"), strict=True):
+    if (span := run.convergence_s[column]) is not None:
+        for second, fill in zip(span, ("white", "black"), strict=True):
             height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
-            axes.plot([second / unit_s], [height], markerfacecolor=face, **_mark())
+            axes.plot([second / unit_s], [height], markerfacecolor=fill, **_mark())
             heights.append(height)
     return heights
 
@@ -162,9 +162,9 @@ def _mark() -> dict[str, Any]:
     return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
-def _rise_text(run: Run, column: str) -> str:
-    rise = run.convergence_s[column]
-    return f"10–90 % in {rise[1] - rise[0]:.1f} s" if rise is not None else "hardly moved from its start"
+def _convergence_text(run: Run, column: str) -> str:
+    span = run.convergence_s[column]
+    return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "hardly moved from its start"
 
 
 def _final_text(run: Run, column: str) -> str:
@@ -177,9 +177,9 @@ def _estimate_keys(run: Run) -> list[Line2D | Patch]:
         Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
         Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
     ]
-    if any(rise is not None for rise in run.convergence_s.values()):
+    if any(span is not None for span in run.convergence_s.values()):
         keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
-        keys.append(Line2D([], [], label="90 % of the way", **_mark()))
+        keys.append(Line2D([], [], label="90 % of the change", **_mark()))
     if run.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     if run.changes_s:

@@ -36,7 +36,7 @@ ROWS: dict[StudyName, Rows] = {
     "turn-radius": (("settle_{icr}_s", "Within 10 % after [s]", True), ("inverted", "Ends inverted [%]", False)),
     "input-noise": (("error_{icr}_m", "ICR error [m]", True),),
     "input-bias": (("error_{icr}_m", "ICR error [m]", True),),
-    "gnss": (("rms_{icr}_m", "ICR error, rms [m]", True), ("blind", "Blind 10 m, p95 [m]", False)),
+    "gnss": (("rms_{icr}_m", "ICR error, rms [m]", True), ("open_loop", "10 m without GNSS, p95 [m]", False)),
     "rate": (("error_{icr}_m", "ICR error [m]", True),),
 }
 LOGARITHMIC = frozenset({"gnss", "rate"})
@@ -102,8 +102,8 @@ def draw_sweep(result: StudyResult) -> Figure:
 
 def _error_range(result: StudyResult) -> tuple[float, float]:
     """Return a range [m] that shows all medians; bars of settings where a run went astray are cut at the frame."""
-    told = [level["metrics"][f"error_{icr}_m"]["p50"] for level in result.levels for icr in ICR_NAMES]
-    finite = [value for value in told if np.isfinite(value)]
+    medians = [level["metrics"][f"error_{icr}_m"]["p50"] for level in result.levels for icr in ICR_NAMES]
+    finite = [value for value in medians if np.isfinite(value)]
     reach = max(LEAST_RANGE_M, float(np.ptp([*finite, 0.0])))
     return min([*finite, 0.0]) - 0.3 * reach, max([*finite, 0.0]) + 0.3 * reach
 
@@ -115,7 +115,7 @@ def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_ic
             axes.axhline(0.0, color="0.6", linewidth=0.8)
         for icr, pen in ICR_PENS.items():
             _bars(axes, x, [level["metrics"][metric.format(icr=icr)] for level in levels], pen, ICR_MARKS[icr])
-    elif metric == "blind":
+    elif metric == "open_loop":
         _bars(axes, x, [level["metrics"]["blind_icr_10m_p95_m"] for level in levels], Pen("#1b7837"), "D")
         no_slip = [level["metrics"]["blind_no_slip_10m_p95_m"]["p50"] for level in levels]
         axes.plot(x, no_slip, color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), linewidth=1.5)
@@ -126,8 +126,8 @@ def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_ic
         axes.set_ylim(-4, 104)
 
 
-def _bars(axes: Axes, x: Floats, told: list[dict[str, Any]], pen: Pen, mark: str) -> None:
-    middle, low, high = (np.array([one[name] for one in told]) for name in ("p50", "p5", "p95"))
+def _bars(axes: Axes, x: Floats, found: list[dict[str, Any]], pen: Pen, mark: str) -> None:
+    middle, low, high = (np.array([one[name] for one in found]) for name in ("p50", "p5", "p95"))
     span = np.array([middle - low, high - middle])
     axes.errorbar(
         x, middle, span, color=pen.color, linestyle=pen.dash, linewidth=pen.width, marker=mark, markersize=3.5,
@@ -141,8 +141,8 @@ def _keys(result: StudyResult) -> list[Line2D]:
         for icr, pen in ICR_PENS.items()
     ]
     if result.request.name == "gnss":
-        keys.append(Line2D([], [], color="#1b7837", marker="D", markersize=3.5, label="blind, final ICRs"))
-        keys.append(Line2D([], [], color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), label="blind, no slip"))
+        keys.append(Line2D([], [], color="#1b7837", marker="D", markersize=3.5, label="open loop, final ICRs"))
+        keys.append(Line2D([], [], color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), label="open loop, no slip"))
     return keys
 
 
@@ -165,9 +165,9 @@ def draw_input_source(result: StudyResult) -> Figure:
     names = [f"{level['value']}\n{level['series']}" for level in result.levels]
     for shift, icr in zip((-0.15, 0.0, 0.15), ICR_NAMES, strict=True):
         x = np.arange(len(names), dtype=np.float64) + shift
-        told = [level["metrics"][f"error_{icr}_m"] for level in result.levels]
+        found = [level["metrics"][f"error_{icr}_m"] for level in result.levels]
         pen = ICR_PENS[icr]
-        _bars(bottom, x, told, Pen(pen.color, "none", pen.width), ICR_MARKS[icr])
+        _bars(bottom, x, found, Pen(pen.color, "none", pen.width), ICR_MARKS[icr])
     bottom.axhline(0.0, color="0.6", linewidth=0.8)
     bottom.set_xticks(np.arange(len(names)), names)
     bottom.set_ylabel("ICR error [m]")

@@ -20,7 +20,7 @@ COLORS = ("#2166ac", "#b2182b", "0.25")
 NAMES = ("y right", "y left", "x")
 MARKERS = ("o", "s", "^")
 MARKS = 9
-"""Marks on a line, so that the three are told apart without colours."""
+"""Marks on a line, so that the three are distinguished without colours."""
 PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b", "0.3", "#762a83")
 PATH_DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 1.5, 1.2, 1.5)), (0, (1, 1)), (0, (8, 3)))
 LEAST_VIEW_M = 0.6
@@ -54,9 +54,9 @@ def draw_convergence(result: StudyResult) -> Figure:
         chosen &= np.array(result.columns["value"]) == level["value"]
         times = np.sort(np.asarray(result.columns["settle_s"])[chosen])
         share = 100 * np.arange(1, len(times) + 1) / len(times)
-        told = np.isfinite(times)
+        settled = np.isfinite(times)
         below.step(
-            np.maximum(times[told], 0.01), share[told], where="post", color=PATH_COLORS[place % 6],
+            np.maximum(times[settled], 0.01), share[settled], where="post", color=PATH_COLORS[place % 6],
             linestyle=PATH_DASHES[place % 6],
             label=level["value"] if len(request.presets) == 1 else f"{level['value']}, {level['series']}",
         )  # fmt: skip
@@ -91,7 +91,7 @@ def draw_icr_change(result: StudyResult) -> Figure:
         draw_bands(row[1], zoom, curves["true_icrs"][:2], np.zeros(1))
         preset, what = name.split(" ", 1)
         row[0].set_title(
-            f"preset {preset}, {'covariance inflated' if what == 'inflated' else 'filter not told'}", loc="left"
+            f"preset {preset}, {'covariance inflated' if what == 'inflated' else 'filter not informed'}", loc="left"
         )
         row[0].set_ylabel("ICRs [m]")
     panels[-1][0].set_xlabel("Time [s]")

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from icrtool.records.tables import Floats
+from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,6 +24,12 @@ if TYPE_CHECKING:
 PNG_DPI = 130
 
 TITLE_CHARACTERS_PER_INCH = 9.5
+
+WEIGHTS = ("regular", "bold")
+"""Weights of the titles' font."""
+
+MISSING = "\u25a1"
+"""Drawn for a character that the font lacks."""
 
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
@@ -60,7 +68,7 @@ SAVE: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Pen:
-    """How a line is told apart: by dash and by luminance, so that a grey print still reads."""
+    """How a line is distinguished: by dash and by luminance, so that a grey print still reads."""
 
     color: str
     dash: str | tuple[float, tuple[float, ...]] = "-"
@@ -87,7 +95,7 @@ MEAN = Pen("black", (0, (5, 2)), 1.1)
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc says."""
+    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc sets."""
     settings = cast(dict[str, Any], mpl.rcParams)
     defaults = cast(dict[str, Any], mpl.rcParamsDefault)
     with mpl.rc_context():
@@ -103,9 +111,22 @@ def new_figure(title: str, subtitle: str, *, width_in: float, height_in: float) 
     left = 0.09 / width_in
     if len(title) > (most := int(TITLE_CHARACTERS_PER_INCH * width_in)):
         title = f"{title[: most // 2]}…{title[-most // 2 :]}"
-    figure.text(left, 1 - 0.09 / height_in, title, fontsize=10.5, fontweight="bold", va="top", ha="left")
-    figure.text(left, 1 - 0.30 / height_in, subtitle, fontsize=8.5, color="0.3", va="top", ha="left")
+    at: dict[str, Any] = {"va": "top", "ha": "left", "parse_math": False}
+    figure.text(left, 1 - 0.09 / height_in, drawable(title), fontsize=10.5, fontweight="bold", **at)
+    figure.text(left, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
     return figure
+
+
+def drawable(text: str) -> str:
+    """Return a text from a log, a path or a configuration with a box for every character that the font lacks.
+
+    Control characters and undecodable bytes become their Python escapes. Draw it with ``parse_math=False``: a ``$`` in
+    a name begins no formula.
+    """
+    regular, bold = (font_manager.get_font(font_manager.findfont(f"DejaVu Sans:{weight}")) for weight in WEIGHTS)
+    return "".join(
+        c if regular.get_char_index(ord(c)) and bold.get_char_index(ord(c)) else MISSING for c in escaped(text)
+    )
 
 
 def inches(figure: Figure, *, left: float, right: float, top: float, bottom: float) -> dict[str, float]:

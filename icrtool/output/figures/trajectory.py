@@ -59,7 +59,7 @@ SLIP_LOOK: dict[str, Any] = {
     "linestyle": "none", "zorder": 4.6,
 }  # fmt: skip
 REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
-"""Markers by class: shape and luminance tell them apart."""
+"""Markers by class: shape and luminance distinguish them."""
 
 
 def draw_trajectory(run: Run, odometry: Odometry) -> Figure:

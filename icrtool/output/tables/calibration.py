@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from icrtool.calibration.findings import Calibration, Finding
+from icrtool.calibration.findings import Calibration, Parameter
 
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
@@ -17,8 +17,8 @@ def format_calibration(calibration: Calibration) -> str:
     lines = [
         calibration.name,
         "",
-        f"drive       {facts.way_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left",
-        f"compared    {calibration.windows} windows of way, {calibration.stretches} independent stretches",
+        f"drive       {facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left",
+        f"compared    {calibration.windows} windows of driven distance, {calibration.stretches} independent stretches",
         "",
         f"{'parameter':<36}{'value ± std':<24}verdict",
     ]
@@ -29,7 +29,7 @@ def format_calibration(calibration: Calibration) -> str:
     return "\n".join(lines)
 
 
-def value_text(finding: Finding) -> str:
+def value_text(finding: Parameter) -> str:
     """Return value and standard deviation with their unit; a dash where there is none."""
     if not math.isfinite(finding.value):
         return "–"

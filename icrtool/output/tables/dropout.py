@@ -11,19 +11,24 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.tables.model_comparison import format_ladder
 from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title
-from icrtool.records.dropout import BudgetDistance, ModelResult, Outage, TurningSplit
+from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
 
 LABEL = 26
 MODEL = 15
 """Columns of the left margin; of them, for a model's name."""
 CELL = 18
 
+LISTED_HORIZONS = 4
+"""More horizons than this without a trial are printed as a range."""
+
+
+STARTS_TEXT = {"moving": "the moving ones", "all": "each"}
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
 
 NEAR_HORIZONS_M = 1.5
-"""Between horizons that are further apart an interpolated distance is said to be one."""
+"""Between horizons that are further apart an interpolated distance is marked as one."""
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -31,12 +36,12 @@ def format_dropout(report: DropoutReport) -> str:
     drive = report.run_summary["drive"]
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-    lines = [
-        run_title(report.run_summary),
-        f"without GNSS, wheel speeds only, from each of {report.states:,} states; {driven}{reference}",
-        "",
-    ]
+    starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
+    lines = [run_title(report.run_summary), f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}", ""]
+    if sentences := headline(report):
+        lines += [*wrap(" ".join(sentences), TABLE_WIDTH), ""]
     lines += _error_lines(report)
+    lines += [*_calibration_lines(report), *_reference_lines(report), *_learned_lines(report)]
     lines += ["", *_count_lines(report)]
     lines += [_turning_line(one) for one in report.by_turning]
     lines += [
@@ -73,15 +78,41 @@ def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> flo
     return value if np.isfinite(value) else None
 
 
+def headline(report: DropoutReport) -> list[str]:
+    """Return what is recommended: the model, how far it goes without GNSS, what a controller is given."""
+    calibration, reached = report.calibration, {one.model: one for one in reversed(report.budgets)}
+    if calibration is None or (best := reached.get("recommended")) is None:
+        return []
+    count, numbers = len(calibration.fitted.parameters), calibration.controller_numbers()
+    interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
+    without = f"; without slip model: {_reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    radii = f"left/right wheel radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
+    parameters = "one parameter" if count == 1 else f"{count} parameters"
+    model = f"{calibration.fitted.model.label} ({parameters}, model {calibration.recommended})"
+    return [
+        f"Recommended: {model}, tested on distance it was not fitted to.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {_reach_text(best)}{interval}{without}.",
+        f"Controller: wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}, {radii}.",
+    ]
+
+
+def _calibration_lines(report: DropoutReport) -> list[str]:
+    return [
+        f"{one.label}: {one.model} from {one.logs} {'log' if one.logs == 1 else 'logs'}, {one.created[:10]}, "
+        f"{one.fitted_text}"
+        for one in report.calibrations
+    ]
+
+
 def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     """Return a sentence a budget: how far each model stays within it."""
     if not budgets:
-        return ["no trial is as long as the shortest horizon: nothing can be said of budgets"]
+        return ["no trial is as long as the shortest horizon: no budget can be evaluated"]
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
         more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)}{more}")
+        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)} ({first.label}){more}")
     return lines
 
 
@@ -114,10 +145,13 @@ def _reach_text(one: BudgetDistance) -> str:
 def _error_lines(report: DropoutReport) -> list[str]:
     shown = shown_horizons(report)
     lines = [_row("distance without GNSS", [f"{report.horizons_m[h]:g} m" for h in shown])]
-    for result in report.results:
+    # what is recommended first; the paper's models follow
+    for result in sorted(report.results, key=lambda one: one.name != "recommended"):
         summary, intervals = result.summary, result.intervals
         lines.append(
-            _row(f"{result.label:<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown])
+            _row(
+                f"{_short(result.label):<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown]
+            )
         )
         spans = [_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown]
         lines.append(_row(f"{'':<{MODEL}}  interval", spans))
@@ -155,13 +189,86 @@ def _count_lines(report: DropoutReport) -> list[str]:
         ("not counted: log ends", counts.short),
         ("  across a wheel gap", counts.gap),
         ("  ends in GNSS outage", counts.outage),
+        ("  from standstill", counts.standing),
     ):
         if column[shown].any():
             lines.append(_row(label, [f"{int(column[h]):,}" for h in shown]))
     if report.standing > NOTED_STANDING * report.states:
         share = 100 * report.standing / report.states
-        lines.append(f"the robot stood at {share:.0f} % of the states: their trials are near copies of one another")
+        counted = "each standstill is one start" if report.starts == "moving" else "each is a start (--starts all)"
+        lines.append(f"the robot stood at {share:.0f} % of the states: {counted}")
+    return lines + _empty_lines(report)
+
+
+def why_no_trial(report: DropoutReport, h: int) -> str | None:
+    """Return why a horizon has no trial, None where it has some."""
+    counts = report.counts
+    if not len(counts.trials) or counts.trials[h]:
+        return None
+    driven = distance_text(report.run_summary["drive"]["distance_m"])
+    reasons = (
+        (counts.short[h], f"less than that is left of the {driven} driven"),
+        (counts.gap[h], "the path crosses a gap in the wheel data"),
+        (counts.outage[h], "it ends in a GNSS outage"),
+        (counts.standing[h], "the robot stands"),
+    )
+    if counts.short[h] == report.states:
+        return reasons[0][1]
+    return ", ".join(f"{why} ({int(count):,} starts)" for count, why in reasons if count)
+
+
+def _empty_lines(report: DropoutReport) -> list[str]:
+    """Return a line for each reason why horizons are empty."""
+    horizons: dict[str, list[str]] = {}
+    for h, horizon in enumerate(report.horizons_m):
+        if (why := why_no_trial(report, h)) is not None:
+            horizons.setdefault(why, []).append(f"{horizon:g}")
+    lines = []
+    for why, lengths in horizons.items():
+        span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
+        lines += wrap(f"no trial of {span} m: {why}", TABLE_WIDTH, subsequent_indent="  ")
     return lines
+
+
+def _reference_lines(report: DropoutReport) -> list[str]:
+    """Return the rows of the reference's own error, and how much of the momentary ICRs' error it can be."""
+    own, icr = report.reference_error, report.result("icr")
+    if own is None or not np.isfinite(own.p95).any():
+        return []
+    shown = shown_horizons(report)
+    lines = [
+        _row(f"{'reference alone':<{MODEL}} {label}", [_error_text(float(values[h]), report, h) for h in shown])
+        for label, values in (("95 %", own.p95), ("expected", own.expected))
+    ]
+    h = int(np.argmin(np.where(np.isfinite(own.p95), np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
+    if icr is not None:
+        lines.append(
+            f"of the {metres_text(float(icr.summary.p95[h]))} of the momentary ICRs (95 %, "
+            f"{report.horizons_m[h]:g} m) up to {metres_text(float(own.p95[h]))} can be the reference's own error"
+        )
+    return lines
+
+
+def _learned_lines(report: DropoutReport) -> list[str]:
+    """Return the errors of the momentary ICRs before and after the ICRs were first learned."""
+    split, shown = report.by_learning, shown_horizons(report)
+    if split is None:
+        return []
+    if split.learned_s is None or split.distance_m is None:
+        return ["the ICRs were never learned: their standard deviations hardly fell in this drive"]
+    if not split.before.trials[shown].any():
+        return []
+    when = f"{duration_text(split.learned_s)}, {distance_text(split.distance_m)}"
+    return [
+        f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]",
+        *(
+            _row(
+                f"  {name}",
+                [f"{_bare(part.p95[h])} / {_bare(part.expected[h])}" if part.trials[h] else "-" for h in shown],
+            )
+            for name, part in (("before", split.before), ("after", split.after))
+        ),
+    ]
 
 
 def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]:
@@ -181,6 +288,11 @@ def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]
     return lines
 
 
+def _short(label: str) -> str:
+    """Return a label that fits into its column."""
+    return label if len(label) <= MODEL else f"{label[: MODEL - 1]}…"
+
+
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
     return f"{metres_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
 
@@ -189,6 +301,10 @@ def _span_text(low_m: float, high_m: float) -> str:
     if not math.isfinite(low_m):
         return "too short"
     return f"{metres_text(low_m).removesuffix(' m')}-{metres_text(high_m)}"
+
+
+def _bare(metres: float) -> str:
+    return metres_text(float(metres)).removesuffix(" m")
 
 
 def _row(label: str, cells: Sequence[str]) -> str:

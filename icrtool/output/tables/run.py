@@ -70,7 +70,8 @@ def _stream_lines(run: Run) -> list[str]:
     rows: list[Row] = [("stream", "topic", "type", "rate", "samples", "clock")]
     for stream in run.summary["streams"]:
         kind = stream["message_type"].replace("/msg/", "/")
-        rate, count = f"{stream['rate_hz']:.1f} Hz", f"{stream['count']:,}"
+        hz = stream["rate_hz"]
+        rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
         rows.append((stream["role"], stream["topic"], kind, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
     widths[0] = LABEL - 2

@@ -1,11 +1,11 @@
-"""A study as text: what was found by setting, and beside it what the paper says."""
+"""A study as text: what was found by setting, and beside it what the paper reports."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from icrtool.simulation.studies import KINDS, Finding, StudyRequest, StudyResult
+from icrtool.simulation.studies import KINDS, StudyNumber, StudyRequest, StudyResult
 
 ERRORS = tuple(
     (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
@@ -20,7 +20,7 @@ SHOWN: dict[str, tuple[tuple[str, str], ...]] = {
     "input-noise": ERRORS + INVERTED,
     "input-bias": ERRORS + INVERTED,
     "input-source": ERRORS + INVERTED,
-    "gnss": (("rms_y_icr_right_m", "rms y right [m]"), ("blind_icr_10m_p95_m", "blind 10 m [m]"), *INVERTED),
+    "gnss": (("rms_y_icr_right_m", "rms y right [m]"), ("blind_icr_10m_p95_m", "10 m without GNSS [m]"), *INVERTED),
     "rate": ERRORS,
 }
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
@@ -63,23 +63,23 @@ def _level_lines(result: StudyResult) -> list[str]:
     return [*lines, f"{'errors [m]: ' if errors else ''}median [5 %, 95 %] over the runs"]
 
 
-def _cell(name: str, told: dict[str, Any], runs: int) -> str:
+def _cell(name: str, found: dict[str, Any], runs: int) -> str:
     if name == "inverted":
-        return f"{100 * told['mean']:.0f} %"
-    if not told["count"]:
+        return f"{100 * found['mean']:.0f} %"
+    if not found["count"]:
         return "never"
     form = "+.3f" if name.startswith("error") else ".3g"
-    never = f", never in {runs - told['count']}" if told["count"] < runs else ""
-    return f"{told['p50']:{form}} [{told['p5']:{form}}, {told['p95']:{form}}]{never}"
+    never = f", never in {runs - found['count']}" if found["count"] < runs else ""
+    return f"{found['p50']:{form}} [{found['p5']:{form}}, {found['p95']:{form}}]{never}"
 
 
-def _finding_lines(findings: tuple[Finding, ...], beside: str) -> list[str]:
+def _finding_lines(findings: tuple[StudyNumber, ...], beside: str) -> list[str]:
     rows = [("", "ours", beside), *((one.what, finding_text(one), one.paper) for one in findings)]
     first, second = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
     return [f"{what:<{first}}  {ours:<{second}}  {paper}" for what, ours, paper in rows]
 
 
-def finding_text(finding: Finding) -> str:
+def finding_text(finding: StudyNumber) -> str:
     """Return our number as ``1.23 s``, or ``0.5-1.23 s``, or median with percentiles."""
     if any(math.isnan(value) for value in finding.ours):
         return "never"

@@ -31,7 +31,7 @@ from icrtool.records.tables import (
     StreamChoice,
     WheelSamples,
 )
-from icrtool.simulation.drives import Drive, Sensors
+from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.record import simulate
 from support.drives import EPOCH_NS as START_NS
 from support.drives import ICRS, make_log
@@ -173,7 +173,7 @@ def test_preset_paper_counts_classes_and_changes_no_noise() -> None:
 
 
 def test_what_a_log_file_says_of_its_fixes_reaches_the_filter(tmp_path: Path) -> None:
-    recorded, _ = simulate(Drive(duration_s=60.0), Sensors(), seed=1)
+    recorded, _ = simulate(DrivePlan(duration_s=60.0), Sensors(), seed=1)
     columns = recorded.columns()
     plain = (columns["gnss_stamp_ns"] - columns["gnss_stamp_ns"][0]) / 1e9 > 50.0
     columns["gnss_status"] = np.where(plain, 0, 2)

@@ -139,9 +139,7 @@ def test_left_and_right_mirrored_give_the_same_events() -> None:
     assert sensors.gyro is not None
     mirrored = replace(
         sensors,
-        wheels=replace(
-            sensors.wheels, v_left_mps=sensors.wheels.v_right_mps, v_right_mps=sensors.wheels.v_left_mps
-        ),
+        wheels=replace(sensors.wheels, left=sensors.wheels.right, right=sensors.wheels.left),
         fixes=replace(sensors.fixes, east_m=-sensors.fixes.east_m),
         headings=replace(sensors.headings, heading_rad=-sensors.headings.heading_rad),
         gyro=replace(sensors.gyro, rate_radps=-sensors.gyro.rate_radps),

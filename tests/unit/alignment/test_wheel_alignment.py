@@ -11,7 +11,7 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
-from icrtool.simulation.drives import Drive, Sensors, move, sense
+from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
 from support.drives import ICRS, make_log
@@ -95,7 +95,7 @@ def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
 def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:
     """With a side turned round, the origin's small circle would look like driving."""
     icrs, sensors = (0.5, -0.75, -0.25), Sensors(input_noise_mps=0.03)
-    truth = move(Drive(icrs_m=icrs, path=PathPlan("spins", 0.4), duration_s=90.0), 0.01)
+    truth = drive_plan(DrivePlan(icrs_m=icrs, path=PathPlan("spins", 0.4), duration_s=90.0), 0.01)
     log = readings_log(sense(truth, sensors, 90.0, np.random.default_rng(0)), sensors)
     run = fit(log, CONFIG)
     # The ICRs do lie to one side of the origin; nothing is said of wheels and heading.

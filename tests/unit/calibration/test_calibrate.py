@@ -96,7 +96,7 @@ def test_a_circle_one_way_does_not_tell_antenna_from_offset() -> None:
     found = calibrate(simulate(0, path="circle"), CONFIG)
     for key in ("antenna_forward_minus_x_icr_m", "heading_offset_deg"):
         assert found.finding(key).verdict == "not shown"
-        assert "one way only: add as many turns to the left" in found.finding(key).note
+        assert "add as many turns to the left" in found.finding(key).note
     assert not any(setting.key.startswith("frames.") for setting in found.settings)
 
 
@@ -127,7 +127,7 @@ def test_a_late_heading_is_proposed_as_a_setting_and_one_on_time_is_not() -> Non
     late = calibrate(simulate(0, heading_delay=0.3), CONFIG)
     settings = {setting.key: setting for setting in late.settings}
     assert settings["frames.heading_delay_s"].value == pytest.approx(0.3, abs=0.02)
-    assert settings["frames.heading_delay_s"].why == "heading late against the wheels"
+    assert settings["frames.heading_delay_s"].why.startswith("heading lags")
 
 
 def test_a_heading_that_looks_early_is_no_setting_for_it_is_the_wheels_that_are_answered_late() -> None:
@@ -148,7 +148,7 @@ def test_a_stray_stamp_decades_away_costs_no_memory() -> None:
 
 
 def test_too_short_a_drive_is_refused() -> None:
-    with pytest.raises(DataError, match=r"windows of 1\.0 m of way"):
+    with pytest.raises(DataError, match=r"windows of 1\.0 m"):
         calibrate(simulate(0, seconds=8.0), CONFIG)
 
 

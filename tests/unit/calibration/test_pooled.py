@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from icrtool.calibration.held_out import choose, hold_out, plan_folds
-from icrtool.calibration.pooled import CalibrationResult, calibrate, calibrated_errors, recording_of
+from icrtool.calibration.pooled import CalibrationResult, block_predictor, calibrate, predictor, recording_of
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
 from icrtool.motion.fit import Pool
 from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.motion.trials import Trials, cut_trials, trial_errors, twist_rates
 from icrtool.output.calibration_file import open_calibration, write_calibration
 from icrtool.output.tables.held_out import format_result
 from support.drives import make_log
@@ -34,7 +34,7 @@ def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def result() -> CalibrationResult:
-    return calibrate(logs(gyro=True), "made", 0.1)
+    return calibrate(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
 
 
 def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) -> None:
@@ -122,7 +122,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
     assert step == pytest.approx(
         np.hypot(*calibration.twist(log.wheels.v_left_mps[0], log.wheels.v_right_mps[0])[:2]) * 0.02
     )
-    icrs, covariance = calibration.warm_start()
+    icrs, covariance, _ = astuple(calibration.warm_start())
     assert icrs[0] > 0.0 > icrs[1]
     assert np.all(np.linalg.eigvalsh(covariance) > -1e-12)
     del v_y
@@ -131,14 +131,52 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
 def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
     new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
     trials = cut_trials(new, (5.0, 10.0), all_starts=True)
-    errors = calibrated_errors(result.calibration, new, trials)
+    errors = predictor(result.calibration, new)(trials)
     np.testing.assert_array_equal(np.isfinite(errors), trials.ends >= 0)
     assert np.nanmean(errors[:, 1]) < 0.5
-    assert np.nanmean(calibrated_errors(result.calibration, new, trials, with_gyro=True)[:, 1]) < 0.5
+    assert np.nanmean(predictor(result.calibration, new, with_gyro=True)(trials)[:, 1]) < 0.5
     assert not result.calibration.fitted_to(new.sha256)
     assert result.calibration.fitted_to("log 1")
     with pytest.raises(ConfigError, match="width"):
-        calibrated_errors(result.calibration, replace(new, width_m=1.0), trials)
+        predictor(result.calibration, replace(new, width_m=1.0))
+
+
+def test_a_trial_is_predicted_without_the_blocks_that_it_touches() -> None:
+    """Against fits made here, with all windows dropped that share distance with the trial's blocks."""
+    recording = logs(1)[0]
+    table, _ = hold_out([recording], SOME, (5.0, 10.0, 20.0))
+    edges = [fold.begin_m for fold in table.folds][1:]
+    distance = recording.drive.distance
+    trials = cut_trials(recording, (20.0, 90.0), all_starts=True)
+    errors = block_predictor(recording, table)(trials)
+    windows = cut_windows(recording)
+    for first, last in ((1, 1), (1, 2)):
+        begin, end = table.folds[first].begin_m, table.folds[last].end_m
+        starts = np.searchsorted(edges, distance, side="right")
+        row = np.flatnonzero(
+            (trials.ends[:, 0] >= 0) & (starts == first)
+            & (np.searchsorted(edges, distance[trials.ends[:, 0]], side="left") == last)
+        )[3]  # fmt: skip
+        model = MODELS[table.chosen[first]]
+        clear = np.tile((windows.end_m <= begin) | (windows.start_m >= end), 2)
+        fit_apart = Pool([windows], [WIDTH_M], model).fit(clear)
+        rates = twist_rates(recording, model, fit_apart.parameters)
+        one = Trials(trials.starts[[row]], trials.ends[[row]])
+        expected = trial_errors(recording, one, rates, float(fit_apart.constants[0, 1]))
+        assert errors[row, 0] == pytest.approx(expected[0, 0], rel=0.02, abs=1e-3)
+        # the fit to everything gives another error: the comparison above can fail
+        whole = twist_rates(recording, model, table.fits[model.name].parameters)
+        assert trial_errors(recording, one, whole)[0, 0] != pytest.approx(expected[0, 0], rel=1e-3)
+
+
+def test_a_trial_across_all_blocks_has_no_error() -> None:
+    recording = make_recording(SIX, TRUTH, 1, 60.0)
+    table, _ = hold_out([recording], SOME, (5.0, 10.0))
+    trials = cut_trials(recording, (5.0, 30.0), all_starts=True)
+    errors = block_predictor(recording, table)(trials)
+    assert len(table.folds) == 2
+    assert np.isfinite(errors[:, 0]).any()
+    assert not np.isfinite(errors[:, 1]).any() or len(table.folds) > 2
 
 
 def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:

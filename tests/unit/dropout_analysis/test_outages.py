@@ -5,17 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from icrtool.config import load_config
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.run import STATE_COLUMNS, Run, WarmStart
-from support.barn import simulate
+from icrtool.kernels.filter_records import GATED, RECOVERED, USED
+from icrtool.logs import read_log
+from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, drive_of
+from support.barn import OUTAGE_S, START_NS, configured, simulate
 from support.matrix_filter import step_state
+
+SPEEDS = ("v_left_mps", "v_right_mps")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +51,8 @@ def test_spaced_outages_leave_half_of_the_drive_to_learn(clean: Run) -> None:
 def test_no_spaced_outage_begins_where_the_robot_stands(clean: Run) -> None:
     t, way = clean.table.t_s, clean.table.distance_m
     stood = np.interp(np.where(t < 20, t, np.maximum(t - 20, 20)), t, way)
-    parked = replace(clean, table=replace(clean.table, distance_m=stood))
+    speeds = {name: np.where((t > 20) & (t < 40), 0.0, getattr(clean.table, name)) for name in SPEEDS}
+    parked = replace(clean, table=replace(clean.table, distance_m=stood, **speeds))
     spans = seconds(parked, plan_outages(parked, 2.0))
     assert len(spans) > 3
     for begin, end in spans:
@@ -154,15 +161,18 @@ def test_a_run_with_terrain_changes_is_made_again_with_them(clean: Run) -> None:
     assert len(force_outages(changing, plan_outages(changing, 5.0, (20.0,)))) == 1
 
 
-def test_a_real_outage_is_judged_at_reacquisition(run: Run) -> None:
+def test_a_real_outage_is_compared_with_the_fixes_that_ended_it(run: Run) -> None:
     (outage,), table = real_outages(run), run.table
     (begin, end), origin = run.outages_ns[0], table.stamp_ns[0]
     assert (outage.kind, outage.begin_s, outage.end_s) == ("real", (begin - origin) / 1e9, (end - origin) / 1e9)
     first, last = np.searchsorted(table.stamp_ns, [begin, end])
     assert outage.distance_m == pytest.approx(table.distance_m[last] - table.distance_m[first])
-    miss = np.hypot(outage.north_m[-1] - table.north_m[last], outage.east_m[-1] - table.east_m[last])
-    assert outage.end_error_m == outage.max_error_m == pytest.approx(miss)
-    assert 0 < miss < 1.0
+    fix = int(np.flatnonzero(run.gnss.stamp_ns == end)[0])
+    fixes = run.sensors.fixes
+    error = np.hypot(outage.north_m[-1] - fixes.north_m[fix], outage.east_m[-1] - fixes.east_m[fix])
+    # several fixes of 0.01 m are compared, and the path drifts on for a second
+    assert outage.end_error_m == outage.max_error_m == pytest.approx(error, abs=0.05)
+    assert 0 < error < 1.0
     assert len(outage.north_m) == last - first + 1
 
 
@@ -174,3 +184,41 @@ def test_a_real_outage_that_never_ends_or_spans_a_wheel_gap_has_no_miss(run: Run
     across = replace(run, outages_ns=np.array([[gap - 10**9, gap + 10**9]]))
     assert real_outages(across) == ()
     assert end > begin
+
+
+def test_an_outage_lasts_until_a_fix_is_used_again_and_its_error_is_that_of_the_fixes() -> None:
+    # The fixes after the outage are 3 m away from where the filter drove to: it rejects them for a second.
+    log = simulate()
+    away = (log.gnss.stamp_ns - START_NS) / 1e9 >= OUTAGE_S[1]
+    moved = fit(replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + 3.0 * away)), configured())
+    stamps, code = moved.gnss.stamp_ns, moved.gnss.code
+    (begin, end), origin = moved.outages_ns[0], moved.table.stamp_ns[0]
+    inside = (stamps > begin) & (stamps < end)
+    assert (code[inside] == GATED).all()
+    assert inside.any()
+    assert code[stamps == end] == RECOVERED
+    (outage,) = (one for one in real_outages(moved) if one.begin_s == (begin - origin) / 1e9)
+    assert outage.end_error_m == pytest.approx(3.0, abs=0.15)
+    # No trial ends where the filter was without fixes; from the outage's end on it is where the fixes are.
+    drive = drive_of(moved)
+    assert drive.in_outage[np.searchsorted(moved.table.stamp_ns, stamps[inside])].all()
+    first, fix = np.searchsorted(moved.table.stamp_ns, end), np.searchsorted(stamps, end)
+    assert not drive.in_outage[first]
+    assert abs(drive.north[first] - moved.sensors.fixes.north_m[fix]) < 0.1
+
+
+def test_the_end_error_of_a_real_outage_is_near_the_truth(shared_logs: Path) -> None:
+    log = shared_logs / "simulated" / "tracked_trouble"
+    config = load_config(robot="jackal")
+    run = fit(read_log(log, config), config)
+    outage = max(real_outages(run), key=lambda one: one.end_s - one.begin_s)
+    truth = np.load(log.with_name(f"{log.name}.truth.npz"))
+    # Fixes and truth have the same axes; the datum is where they differ.
+    fixes, seconds = run.sensors.fixes, (run.sensors.fixes.stamp_ns - run.table.stamp_ns[0]) / 1e9
+    before = (run.gnss.code == USED) & (seconds < outage.begin_s)
+    off = []
+    for name, measured, path in (("z_north", fixes.north_m, outage.north_m), ("z_east", fixes.east_m, outage.east_m)):
+        datum = np.median(measured[before] - np.interp(seconds[before], truth["t"], truth[name]))
+        off.append(path[-1] - datum - np.interp(outage.end_s, truth["t"], truth[name]))
+    assert np.hypot(*off) > 0.5
+    assert outage.end_error_m == pytest.approx(np.hypot(*off), rel=0.05)

@@ -14,11 +14,12 @@ import pytest
 import icrtool
 from icrtool.config import DropoutConfig
 from icrtool.dropout_analysis import trials as module
+from icrtool.dropout_analysis.starts import first_learned
 from icrtool.dropout_analysis.trials import Model, configured_horizons_m, dropout, models_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.kernels.trials import FrozenIcrs
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import ICR_COLUMNS, Run, drive_of
 
 EQUAL_M = 1e-9
 """What the fast algorithm promises against direct integration."""
@@ -103,6 +104,7 @@ def test_starts_that_are_no_trial_are_counted_by_kind(run: Run) -> None:
         assert {kind: int(getattr(counts, kind)[h]) for kind in kinds} == kinds
         assert all(kinds.values())
         assert sum(kinds.values()) == len(table)
+        assert not counts.standing.any()
 
 
 def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., Run]) -> None:
@@ -192,6 +194,73 @@ def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..
     assert report.counts.trials.tolist() == [0]
     assert np.isnan(report.results[0].summary.p95).all()
     assert np.isnan(report.summary.p95_pct).all()
+
+
+@pytest.fixture
+def stopping(run: Run) -> Run:
+    """The drive with two stops put into it: 40 and 400 states at which the robot stands."""
+    rows = np.concatenate([np.arange(0, 300), np.full(40, 300), np.arange(300, 1200), np.full(400, 1200),
+                           np.arange(1200, len(run.table))])  # fmt: skip
+    columns = {name: column[rows].copy() for name, column in run.table.columns().items()}
+    stood = np.append(np.diff(rows) == 0, False)
+    step = np.append(np.diff(run.table.stamp_ns), 0)[rows]
+    step[stood] = 20_000_000
+    stamps = run.table.stamp_ns[0] + np.concatenate([[0], np.cumsum(step[:-1])])
+    columns |= {"stamp_ns": stamps, "t_s": (stamps - stamps[0]) / 1e9}
+    columns |= {name: np.where(stood, 0.0, columns[name]) for name in ("v_left_mps", "v_right_mps")}
+    outages = np.interp(run.outages_ns, run.table.stamp_ns, stamps[np.searchsorted(rows, np.arange(len(run.table)))])
+    return replace(
+        run, table=replace(run.table, **columns), in_gap=run.in_gap[rows] & ~stood, outages_ns=outages.astype(np.int64)
+    )
+
+
+def test_a_standstill_counts_once_whatever_its_length(run: Run, stopping: Run) -> None:
+    without, moving = dropout(run, HORIZONS_M), dropout(stopping, HORIZONS_M)
+    every = dropout(stopping, HORIZONS_M, starts="all")
+    np.testing.assert_array_equal(moving.counts.trials, without.counts.trials)
+    np.testing.assert_array_equal(moving.counts.standing, 440)
+    np.testing.assert_array_equal(every.counts.trials, without.counts.trials + 440)
+    for ours, theirs in zip(moving.results, without.results, strict=True):
+        np.testing.assert_allclose(np.array(ours.summary), np.array(theirs.summary), rtol=0, atol=EQUAL_M)
+    for report in (moving, every):
+        assert sum(int(column[0]) for column in report.counts) == report.states == len(stopping.table)
+        assert report.standing == 440
+    assert not np.allclose(every.results[0].summary.p95, moving.results[0].summary.p95, rtol=1e-3)
+
+
+def test_trials_before_and_after_the_icrs_were_learned_are_all_trials(run: Run) -> None:
+    report, errors = gathered(run)
+    split, icr, table = report.by_learning, report.result("icr"), run.table
+    assert split is not None
+    assert icr is not None
+    assert split.learned_s is not None
+    np.testing.assert_array_equal(split.before.trials + split.after.trials, icr.summary.trials)
+    early = table.t_s < split.learned_s
+    for h, horizon in enumerate(HORIZONS_M):
+        for part, rows in ((split.before, early), (split.after, ~early)):
+            tried = errors["icr", horizon][rows]
+            tried = tried[~np.isnan(tried)]
+            assert part.trials[h] == len(tried)
+            assert part.p95[h] == pytest.approx(np.percentile(tried, 95))
+            assert part.expected[h] == pytest.approx(tried.mean())
+
+
+def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, make_run: Callable[..., Run]) -> None:
+    row = first_learned(run)
+    assert row is not None
+    assert 0 < run.table.t_s[row] < 20.0
+    stds = np.array([getattr(run.table, f"std_{name}") for name in ICR_COLUMNS])
+    settled = np.median(stds[:, stds.shape[1] // 2 :], axis=1)
+    limit = settled + 0.1 * (stds[:, 0] - settled)
+    assert (stds[:, row] <= limit).all()
+    assert (stds[:, :row] > limit[:, None]).any(axis=0).all()
+    assert first_learned(make_run(duration_s=20.0, speed_mps=0.0, troubles=False)) is None
+    known = {f"std_{name}": np.full(len(run.table), 0.02) for name in ICR_COLUMNS}
+    assert first_learned(changed(run, **known)) == 0
+    assert first_learned(changed(run, **{name: 10 * std for name, std in known.items()})) is None
+    start = {"icrs_m": [0.7, -0.7, 0.0], "covariance_m2": (1e-4 * np.eye(3)).tolist()}
+    warm = replace(run, summary={**run.summary, "filter": {**run.summary["filter"], "warm_start": start}})
+    assert first_learned(warm) == 0
 
 
 def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:

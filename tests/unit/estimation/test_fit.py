@@ -17,7 +17,7 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import PositionFixes, RobotLog, WheelSamples
-from icrtool.simulation.drives import Drive, Sensors, move, sense
+from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
 from support.drives import ICRS, make_log
@@ -172,7 +172,7 @@ def spun(seconds: float, speed_mps: float = 0.3) -> RobotLog:
     """A robot that turns on the spot: its origin goes hardly anywhere."""
     icrs, plan = (0.5, -0.5, 0.0), PathPlan("spins", speed_mps)
     sensors = Sensors(input_noise_mps=0.01)
-    truth = move(Drive(icrs_m=icrs, path=plan, duration_s=seconds), 0.01)
+    truth = drive_plan(DrivePlan(icrs_m=icrs, path=plan, duration_s=seconds), 0.01)
     return readings_log(sense(truth, sensors, seconds, np.random.default_rng(0)), sensors)
 
 
@@ -226,7 +226,7 @@ def spoilt(log: RobotLog, stream: str, column: str, value: float) -> RobotLog:
     ("stream", "column", "value", "why"),
     [
         ("wheels", "left", math.nan, "1 wheel samples are not finite numbers, the first at row 500"),
-        ("wheels", "v_right_mps", 1e160, r"a wheel speed of 1e\+160 m/s"),
+        ("wheels", "right", 1e160, r"a wheel speed of 1e\+160 m/s"),
         ("gnss", "east_m", math.inf, "1 position samples are not finite"),
         ("heading", "heading_rad", math.nan, "1 heading samples are not finite"),
         ("gnss", "var_north_m2", -1.0, "a position variance is negative, the first at row 500"),

@@ -39,8 +39,8 @@ def held_sensors(config: Config = CONFIG) -> SensorData:
         sensors,
         wheels=replace(
             sensors.wheels,
-            v_left_mps=np.interp(source, wheel_t, sensors.wheels.v_left_mps),
-            v_right_mps=np.interp(source, wheel_t, sensors.wheels.v_right_mps),
+            left=np.interp(source, wheel_t, sensors.wheels.left),
+            right=np.interp(source, wheel_t, sensors.wheels.right),
         ),
         fixes=replace(
             sensors.fixes,

@@ -16,7 +16,7 @@ from icrtool.output.figures.icrs import draw_icr_estimates
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import Drive, Icrs, Sensors, move, sense
+from icrtool.simulation.drives import DrivePlan, Icrs, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
 
@@ -45,9 +45,9 @@ def drive(
         wandering = 0.6 * wandering + 0.8 * slip * WIDTH_M * rng.standard_normal(3)
         slips.append((float(t), tuple(icrs + wandering)))
     path = replace(path, phase_rad=rng.uniform(0, 6))
-    plan = Drive(icrs_m=ICRS, changes=tuple(slips) if slip else changes, path=path, duration_s=duration_s)
+    plan = DrivePlan(icrs_m=ICRS, changes=tuple(slips) if slip else changes, path=path, duration_s=duration_s)
     sensors = Sensors(input_noise_mps=0.03)
-    return readings_log(sense(move(plan, 0.01), sensors, duration_s, rng), sensors)
+    return readings_log(sense(drive_plan(plan, 0.01), sensors, duration_s, rng), sensors)
 
 
 @cache

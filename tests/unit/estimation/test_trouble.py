@@ -13,7 +13,7 @@ import pytest
 import icrtool
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap"
 CONFIG = icrtool.load_config(robot="segway-rmp400")
@@ -96,10 +96,11 @@ def parked(log: RobotLog) -> RobotLog:
     standing = np.zeros(still)
     return replace(
         log,
-        wheels=WheelSamples(
-            stamps["wheels"],
-            np.concatenate([standing, wheels.v_left_mps]),
-            np.concatenate([standing, wheels.v_right_mps]),
+        wheels=replace(
+            wheels,
+            stamp_ns=stamps["wheels"],
+            left=np.concatenate([standing, wheels.left]),
+            right=np.concatenate([standing, wheels.right]),
         ),
         gnss=PositionFixes(
             stamps["gnss"],
@@ -115,23 +116,23 @@ def parked(log: RobotLog) -> RobotLog:
 
 def held(log: RobotLog) -> RobotLog:
     row = np.arange(len(log.wheels.stamp_ns)) // 10 * 10
-    return with_wheels(log, log.wheels.v_left_mps[row], log.wheels.v_right_mps[row])
+    return with_wheels(log, log.wheels.left[row], log.wheels.right[row])
 
 
 def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
-    return replace(log, wheels=WheelSamples(log.wheels.stamp_ns, left, right))
+    return replace(log, wheels=replace(log.wheels, left=left, right=right))
 
 
 def swapped(log: RobotLog) -> RobotLog:
-    return with_wheels(log, log.wheels.v_right_mps, log.wheels.v_left_mps)
+    return with_wheels(log, log.wheels.right, log.wheels.left)
 
 
 def one_side_backwards(log: RobotLog) -> RobotLog:
-    return with_wheels(log, -log.wheels.v_left_mps, log.wheels.v_right_mps)
+    return with_wheels(log, -log.wheels.left, log.wheels.right)
 
 
 def twice(log: RobotLog) -> RobotLog:
-    return with_wheels(log, 2 * log.wheels.v_left_mps, 2 * log.wheels.v_right_mps)
+    return with_wheels(log, 2 * log.wheels.left, 2 * log.wheels.right)
 
 
 def late_fixes(log: RobotLog) -> RobotLog:

@@ -8,7 +8,7 @@ import pytest
 from icrtool.kernels import window_errors as window_fit
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL, PARAMETERS, Motion, displace, march, move, rates
+from icrtool.kernels.window_errors import NEUTRAL, PARAMETERS, Motion, displace, integrate, march, rates
 
 ROUNDING_M = 1e-10
 """Prefix sums over some hundred metres lose this much to rounding."""
@@ -39,7 +39,7 @@ def test_displacements_equal_the_open_loop_path() -> None:
     heading = np.linspace(0.3, 4.0, len(t))
     drive = Drive(dt, left, right, 0 * t, 0 * t, heading, t, np.zeros(len(t), bool), np.zeros(len(t), bool))
     p = np.array([0.71, -0.64, 0.11, *NEUTRAL[3:]])
-    motion = move(t, dt, left, right, p, t)
+    motion = integrate(t, dt, left, right, p, t)
     start, end = np.array([0, 40, 250]), np.array([100, 41, 599])
     d, _, _ = displace(motion, start, end)
     for k, (s, e) in enumerate(zip(start, end, strict=True)):
@@ -50,7 +50,7 @@ def test_displacements_equal_the_open_loop_path() -> None:
 
 def test_a_lag_of_half_a_step_moves_along_the_middle_of_each_turn() -> None:
     t, dt, left, right = make_drive()
-    motion = move(t, dt, left, right, np.array([0.71, -0.64, 0.11, *NEUTRAL[3:]]), t, 0.5 * dt)
+    motion = integrate(t, dt, left, right, np.array([0.71, -0.64, 0.11, *NEUTRAL[3:]]), t, 0.5 * dt)
     omega = (left - right) / 1.35
     theta = np.concatenate([[0.0], np.cumsum(dt * omega)[:-1]])
     ahead = (0.71 * left + 0.64 * right) / 1.35
@@ -66,12 +66,12 @@ def test_derivative_equals_central_differences(column: int, lag: float) -> None:
     t, dt, left, right = make_drive()
     times = np.sort(np.random.default_rng(0).uniform(0, t[-1], 40))
     start, end = np.arange(20), np.arange(20) + 20
-    _, by, _ = displace(move(t, dt, left, right, P, times, lag * dt), start, end)
+    _, by, _ = displace(integrate(t, dt, left, right, P, times, lag * dt), start, end)
     sides = []
     for sign in (1, -1):
         q = P.copy()
         q[column] += sign * DIFFERENCE_STEP
-        sides.append(displace(move(t, dt, left, right, q, times, lag * dt), start, end)[0])
+        sides.append(displace(integrate(t, dt, left, right, q, times, lag * dt), start, end)[0])
     assert np.allclose((sides[0] - sides[1]) / (2 * DIFFERENCE_STEP), by[:, column], atol=DIFFERENCE_TOLERANCE)
 
 
@@ -80,8 +80,10 @@ def test_derivative_by_a_shift_of_time_equals_central_differences(lag: float) ->
     t, dt, left, right = make_drive()
     times = t[5:45] + 0.4 * dt[5:45]
     start, end = np.arange(20), np.arange(20) + 20
-    _, _, late = displace(move(t, dt, left, right, P, times, lag * dt), start, end)
-    ahead, behind = (displace(move(t, dt, left, right, P, times + s, lag * dt), start, end)[0] for s in (1e-6, -1e-6))
+    _, _, late = displace(integrate(t, dt, left, right, P, times, lag * dt), start, end)
+    ahead, behind = (
+        displace(integrate(t, dt, left, right, P, times + s, lag * dt), start, end)[0] for s in (1e-6, -1e-6)
+    )
     assert np.allclose((ahead - behind) / 2e-6, late, atol=DIFFERENCE_TOLERANCE)
 
 
@@ -89,7 +91,7 @@ def test_derivative_by_a_shift_of_time_equals_central_differences(lag: float) ->
 def test_kernel_equals_its_python_source(monkeypatch: pytest.MonkeyPatch, lag: float) -> None:
     t, dt, left, right = make_drive(80)
     times = np.linspace(-0.1, t[-1] + 0.1, 30)
-    compiled = move(t, dt, left, right, P, times, lag * dt)
+    compiled = integrate(t, dt, left, right, P, times, lag * dt)
     m = len(times)
     plain = Motion(np.empty(m), np.empty(m, complex), np.empty((m, 7)), np.empty((m, 7), complex), np.empty(m),
                    np.empty(m, complex))  # fmt: skip
@@ -102,7 +104,7 @@ def test_kernel_equals_its_python_source(monkeypatch: pytest.MonkeyPatch, lag: f
 def test_nothing_moves_over_a_gap() -> None:
     t = np.array([0.0, 1.0, 5.0, 6.0])
     dt = np.array([1.0, 0.0, 1.0, 0.0])
-    motion = move(
+    motion = integrate(
         t, dt, np.ones(4), np.ones(4), np.array([0.5, -0.5, *NEUTRAL[2:]]), np.array([0.5, 1.0, 3.0, 5.0, 5.5])
     )
     assert np.allclose(motion.place, [0.5, 1.0, 1.0, 1.0, 1.5])

@@ -1,4 +1,4 @@
-"""The compiled scans and the walk, run as plain Python on damaged bytes: nothing outside them is touched."""
+"""The compiled scans and the decoder, run as plain Python on damaged bytes: nothing outside them is touched."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from icrtool.kernels.compiled import njit
 from icrtool.logs.containers import record_table as records
 from icrtool.logs.containers.mcap_file import McapFile
-from icrtool.logs.messages import decoder as walk
-from icrtool.logs.messages.decoder import walk_messages
+from icrtool.logs.messages import decoder
+from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.schema import (
     BEGIN_LOOP,
     END_LOOP,
@@ -145,19 +145,19 @@ def joined(messages):
 
 @pytest.mark.parametrize("message_type", WANTED)
 @pytest.mark.parametrize("cdr", [True, False], ids=["cdr", "ros1"])
-def test_walk_of_damaged_messages_stays_inside_them(message_type, cdr):
+def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
     rng = np.random.default_rng(len(message_type))
     definitions = (STORE if cdr else get_typestore(Stores.ROS1_NOETIC)).fielddefs
     layout = compile_layout(definitions, message_type, WANTED[message_type], "cdr" if cdr else "ros1", 3)
     messages = ros_messages(rng, message_type, cdr)
-    _, whole = walk_messages(layout, *joined(messages))
+    _, whole = decode_messages(layout, *joined(messages))
     assert whole.all()
     damaged = [mutated(rng, messages[row % len(messages)]) for row in range(MUTATIONS)]
     damaged += [mutated(rng, message) for message in damaged]
-    python = as_python(walk.walk)
+    python = as_python(decoder.decode)
     for message in damaged:
         data, start, end = joined([message])
-        table, readable = walk_messages(layout, data, start, end)
+        table, readable = decode_messages(layout, data, start, end)
         plain, plain_readable = np.zeros_like(table), np.zeros_like(readable)
         # Only the message is there: a read before or behind it is a read outside.
         only = Guarded(data[start[0] : end[0]])
@@ -169,47 +169,47 @@ def test_walk_of_damaged_messages_stays_inside_them(message_type, cdr):
             np.testing.assert_array_equal(plain, table)
 
 
-def test_walk_of_an_array_longer_than_all_messages_reads_nothing():
+def test_decoding_of_an_array_longer_than_all_messages_reads_nothing():
     for count in (10**6, 1 << 61, (1 << 63) - 1):
         for operation in (SKIP, TAKE, BEGIN_LOOP):
             program = np.array([[operation, 8, count, 0, 0, 0, 1]], np.int64)
             layout = Layout(program, 4, {}, True)
-            _, readable = walk_messages(layout, *joined([b"\0\1\0\0" + bytes(64)]))
+            _, readable = decode_messages(layout, *joined([b"\0\1\0\0" + bytes(64)]))
             assert not readable.any()
 
 
 @pytest.mark.parametrize("operation", [SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE, BEGIN_LOOP])
 @pytest.mark.parametrize("claimed", [61, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF])
 @pytest.mark.parametrize("cdr", [True, False], ids=["cdr", "ros1"])
-def test_walk_refuses_a_length_that_the_message_does_not_have(operation, claimed, cdr):
+def test_decoding_refuses_a_length_that_the_message_does_not_have(operation, claimed, cdr):
     rows = [[operation, 8, -1, 0, 4, 1, 2], [END_LOOP, 0, 0, -1, 0, 0, 0]][: 2 if operation == BEGIN_LOOP else 1]
     layout = Layout(np.array(rows, np.int64), 8, {}, cdr)
     head = b"\0\1\0\0" if cdr else b""
-    _, readable = walk_messages(layout, *joined([head + claimed.to_bytes(4, "little") + bytes(56)]))
+    _, readable = decode_messages(layout, *joined([head + claimed.to_bytes(4, "little") + bytes(56)]))
     assert not readable.any()
 
 
-def test_walk_of_elements_without_fields_ends():
+def test_decoding_of_elements_without_fields_ends():
     """A loop over nothing, in a loop over nothing, in a loop over nothing: 10^27 turns if they were taken."""
     rows = [[BEGIN_LOOP, 0, 10**9, -1, 0, 0, 6]] * 3 + [[END_LOOP, 0, 0, -1, 0, 0, 0]] * 3
     layout = Layout(np.array(rows, np.int64), 1, {}, False)
-    _, readable = walk_messages(layout, *joined([bytes(64)]))
+    _, readable = decode_messages(layout, *joined([bytes(64)]))
     assert not readable.any()
 
 
 @pytest.mark.parametrize("messages", [[], [b""], [b"\0"], [b"\0\1\0"], [b"\0\1\0\0"]], ids=str)
-def test_walk_of_no_bytes_reads_nothing(messages):
+def test_decoding_of_no_bytes_reads_nothing(messages):
     layout = compile_layout(STORE.fielddefs, "std_msgs/Float64", ("data",), "cdr")
-    table, readable = walk_messages(layout, *joined(messages))
+    table, readable = decode_messages(layout, *joined(messages))
     assert table.shape == (len(messages), 1)
     assert not readable.any()
 
 
-def test_walk_reads_big_endian_messages():
+def test_decoding_reads_big_endian_messages():
     layout = compile_layout(STORE.fielddefs, "std_msgs/Float64", ("data",), "cdr")
     value = np.array([12.625])
     messages = [b"\0\0\0\0" + value.astype(">f8").tobytes(), b"\0\1\0\0" + value.astype("<f8").tobytes()]
-    table, readable = walk_messages(layout, *joined(messages))
+    table, readable = decode_messages(layout, *joined(messages))
     assert readable.all()
     np.testing.assert_array_equal(layout.numbers(table, "data"), [12.625, 12.625])
 

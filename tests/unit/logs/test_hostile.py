@@ -18,7 +18,7 @@ from icrtool.logs.containers.channel import Channel, Cut
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.cut import moment
-from icrtool.logs.messages.decoder import walk_messages
+from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.dynamic_joints import collector_for
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.records.text import LogText
@@ -69,9 +69,9 @@ def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     fields = [("l", (NAME, "x/msg/L5")), ("v", (BASE, ("float64", 0)))]
     layout = compile_layout({**inner, "x/msg/Top": ([], fields)}, "x/Top", ("v",), "ros1")
     data = np.tile(np.array([200, 0, 0, 0], np.uint8), 250)
-    walk_messages(layout, data[:0], np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
+    decode_messages(layout, data[:0], np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
     begin = time.process_time()
-    _, readable = walk_messages(layout, data, np.array([0]), np.array([len(data)]))
+    _, readable = decode_messages(layout, data, np.array([0]), np.array([len(data)]))
     assert not readable.any()
     assert time.process_time() - begin < LONGEST_S
 

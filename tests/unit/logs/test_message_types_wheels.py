@@ -173,7 +173,7 @@ def test_a_joint_that_never_says_a_number_is_left_out_of_its_side(tmp_path: Path
 def test_all_nan_joints_tell_nothing(tmp_path: Path) -> None:
     messages = [joint_state(ROS2, START_NS, WHEELS, [np.nan] * 4, [np.nan] * 4) for _ in range(5)]
     motion = wheels_of(write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState"))
-    assert motion.problem == "tells neither position nor speed of both sides"
+    assert "neither position nor speed" in motion.problem
 
 
 def test_configured_joints_go_before_names(tmp_path: Path) -> None:
@@ -327,7 +327,7 @@ def twist_table(message_type: str, topic: str, prefix: str, x: Any, y: Any, turn
 
 @pytest.mark.parametrize(
     ("topic", "problem"),
-    [("/vel", "goes sideways and never turns"), ("/gps/vel", "goes sideways"), ("/fix_velocity", "goes sideways")],
+    [("/vel", "moves sideways and never turns"), ("/gps/vel", "moves sideways"), ("/fix_velocity", "moves sideways")],
 )
 def test_a_velocity_east_and_north_is_not_taken_for_the_body(topic: str, problem: str) -> None:
     table = twist_table("geometry_msgs/TwistStamped", topic, "twist.", [1.0, 0.5], [0.5, 1.0], [0.0, 0.0])

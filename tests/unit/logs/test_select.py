@@ -251,14 +251,14 @@ def test_the_configured_topic_decides_which_robot_is_meant() -> None:
 def test_wheel_odometry_is_never_taken_as_the_position() -> None:
     for topic in ("/odom", "/husky_velocity_controller/odom", "/platform/odom/filtered", "/base_controller/odom"):
         with pytest.raises(
-            MissingStreamError, match=f"no position found; .*{topic} .*not the wheels' own dead reckoning"
+            MissingStreamError, match=f"no position found; .*{topic} .*may be the wheels' dead reckoning"
         ):
             choose([joints(), odometry(topic), imu()])
 
 
 def test_a_message_does_not_check_its_own_wheels() -> None:
     """Simulators put wheel odometry into the frame `map`: its pose is the sum of its twist."""
-    with pytest.raises(MissingStreamError, match="its twist stands for the wheels"):
+    with pytest.raises(MissingStreamError, match="its twist is used for the wheels"):
         choose([odometry("/odom", frame="map"), imu()])
     assert choose([odometry("/odom", frame="map"), joints(), imu()]).gnss.topic == "/odom"
     assert choose([odometry("/odom", frame="map"), imu()], "topics.gnss=/odom").gnss.topic == "/odom"
@@ -323,7 +323,7 @@ def test_what_came_into_question_is_listed_first_with_the_reason() -> None:
 
 def test_a_topic_whose_messages_are_all_damaged_says_so() -> None:
     nothing = TopicTable("/gps/fix", "sensor_msgs/NavSatFix", TIMES[:0], {}, {}, 7, "the log")
-    with pytest.raises(MissingStreamError, match=r"/gps/fix .*none of its 7 messages has its type's shape"):
+    with pytest.raises(MissingStreamError, match=r"/gps/fix .*none of its 7 messages"):
         choose([joints(), nothing, imu()])
 
 

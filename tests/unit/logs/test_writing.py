@@ -11,9 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icrtool.config import load_config
 from icrtool.errors import ConfigError, OutputError
+from icrtool.logs.messages.definitions import bundled_definitions, standard_definitions
+from icrtool.logs.read_log import read_log
 from icrtool.logs.writing import containers as write_containers
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.writing.messages import load_typestore, serialise_topics
 
 START_NS = 1_760_000_000_000_000_000
 RADIUS_M = 0.27
@@ -366,3 +370,31 @@ def test_impossible_options_say_what_is_possible(change, line):
 def test_columns_of_one_sensor_have_one_length():
     with pytest.raises(ValueError, match=r"SensorColumns.height_m has shape \(3,\), its stamps \(9,\)"):
         replace(make_columns(), height_m=np.zeros(3))
+
+
+@pytest.mark.parametrize("wheels", WHEELS)
+def test_ros_2_types_are_those_a_log_without_definitions_is_read_with(wheels):
+    store, known = load_typestore(ros1=False), {**standard_definitions(), **bundled_definitions()}
+    topics = serialise_topics(make_columns(), replace(OPTIONS, wheels=wheels), store)
+    assert {topic.message_type: store.fielddefs[topic.message_type][1] for topic in topics} == {
+        topic.message_type: known[topic.message_type][1] for topic in topics
+    }
+
+
+def test_the_ros_1_feedback_of_a_jackal_has_two_more_fields():
+    """Of jackal_msgs as docs.ros.org prints it for ROS 1; the ROS 2 form lacks the temperatures."""
+    of_ros1, of_ros2 = (
+        [name for name, _ in load_typestore(ros1=ros1).fielddefs["jackal_msgs/msg/Feedback"][1]]
+        for ros1 in (True, False)
+    )
+    assert [name for name in of_ros1 if name not in of_ros2] == ["pcb_temperature", "mcu_temperature"]
+
+
+def test_jackal_feedback_without_definitions_is_read_back(tmp_path):
+    columns = make_columns()
+    options = replace(OPTIONS, container="db3", wheels="jackal_feedback", definitions=False)
+    config = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}", "wheels.quantity=velocity"])
+    log = read_log(write_log(tmp_path / "drive", columns, options), config)
+    assert log.wheels.unit == "rad"
+    np.testing.assert_allclose(log.wheels.left * RADIUS_M, columns.wheel_v_left_mps, rtol=1e-6)
+    np.testing.assert_allclose(log.wheels.right * RADIUS_M, columns.wheel_v_right_mps, rtol=1e-6)

@@ -14,7 +14,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_directory import check_place, whole_directory
+from icrtool.output.atomic_directory import atomic_directory, check_place
 
 
 def marked(directory: Path) -> bool:
@@ -22,12 +22,12 @@ def marked(directory: Path) -> bool:
 
 
 def write(directory: Path, text: str = "new") -> None:
-    with whole_directory(directory, marked, kind="report") as fresh:
+    with atomic_directory(directory, marked, kind="report") as fresh:
         (fresh / "mark").write_text(text)
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
-    with whole_directory(tmp_path / "a", marked, kind="report") as fresh:
+    with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
         (fresh / "mark").write_text("new")
         assert not (tmp_path / "a").exists()
     assert (tmp_path / "a" / "mark").read_text() == "new"
@@ -85,7 +85,7 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
     write(tmp_path / "a", "old")
 
     def fill() -> None:
-        with whole_directory(tmp_path / "a", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
             (fresh / "mark").write_text("half")
             raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -98,7 +98,7 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
 def test_an_interruption_leaves_nothing_not_even_parents(tmp_path: Path, stop: type[BaseException]) -> None:
     def interrupted() -> None:
-        with whole_directory(tmp_path / "a" / "b", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a" / "b", marked, kind="report") as fresh:
             (fresh / "mark").write_text("half")
             raise stop
 
@@ -109,7 +109,7 @@ def test_an_interruption_leaves_nothing_not_even_parents(tmp_path: Path, stop: t
 
 def test_what_came_into_the_place_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     def surprised() -> None:
-        with whole_directory(tmp_path / "a", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
             (fresh / "mark").write_text("new")
             (tmp_path / "a").mkdir()
             (tmp_path / "a" / "thesis.txt").write_text("years of work")
@@ -131,7 +131,7 @@ FILES = 4
 
 
 def write_generation(directory: Path, text: str) -> None:
-    with whole_directory(directory, marked, kind="report") as fresh:
+    with atomic_directory(directory, marked, kind="report") as fresh:
         (fresh / "mark").write_text(text)
         (fresh / "sub").mkdir()
         for number in range(FILES):
@@ -195,11 +195,11 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[4])
 from icrtool.output import disk
-from icrtool.output.atomic_directory import whole_directory
+from icrtool.output.atomic_directory import atomic_directory
 if sys.argv[3] == "renames":
     disk.exchange = lambda *_: False
 for number in range(int(sys.argv[2]), 1_000_000):
-    with whole_directory(Path(sys.argv[1]), lambda place: (place / "mark").exists(), kind="report") as fresh:
+    with atomic_directory(Path(sys.argv[1]), lambda place: (place / "mark").exists(), kind="report") as fresh:
         for name in ("mark", "0.gen", "1.gen", "2.gen", "3.gen"):
             (fresh / name).write_text(str(number))
     print(number, flush=True)
@@ -238,7 +238,7 @@ def test_files_of_others_are_kept_and_reported(tmp_path: Path, where: str) -> No
 
     def write_outer(text: str) -> None:
         judge = partial(Path.__eq__, place)
-        with whole_directory(place, judge, kind="run", names=("later.html",), note=notes.append) as fresh:
+        with atomic_directory(place, judge, kind="run", names=("later.html",), note=notes.append) as fresh:
             (fresh / "outer").write_text(text)
 
     write_outer("old")
@@ -265,7 +265,7 @@ def test_a_foreign_file_where_a_directory_of_ours_is_due_is_refused(tmp_path: Pa
     (tmp_path / "a" / "plots").write_text("a file of mine")
 
     def surprised() -> None:
-        with whole_directory(tmp_path / "a", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
             (fresh / "plots").mkdir()
             (fresh / "plots" / "one.png").touch()
 
@@ -307,7 +307,7 @@ def test_the_longest_name_a_file_system_takes_can_be_replaced(tmp_path: Path) ->
 
 
 def test_what_a_living_process_writes_is_not_cleaned(tmp_path: Path) -> None:
-    with whole_directory(tmp_path / "a", marked, kind="report") as slow:
+    with atomic_directory(tmp_path / "a", marked, kind="report") as slow:
         (slow / "mark").write_text("slow")
         write(tmp_path / "a", "quick")
         assert (slow / "mark").exists()

@@ -8,19 +8,19 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_file import check_place, whole_file
+from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.exports.acceptance import write_junit, write_markdown
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
-    with whole_file(tmp_path / "a.txt") as partial:
+    with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
         assert not (tmp_path / "a.txt").exists()
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "new")]
 
 
 def write_half(file: Path, failure: BaseException) -> None:
-    with whole_file(file) as partial:
+    with atomic_file(file) as partial:
         partial.write_text("half")
         raise failure
 
@@ -53,7 +53,7 @@ def test_a_disk_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch, ca
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(disk, call, fail)
-    with pytest.raises(OutputError, match="Input/output error"), whole_file(tmp_path / "a.txt") as partial:
+    with pytest.raises(OutputError, match="Input/output error"), atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
 
@@ -63,7 +63,7 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
     for place in (tmp_path / "pipe", Path(os.devnull)):
         with pytest.raises(OutputError, match="device or pipe"):
             check_place(place)
-        with pytest.raises(OutputError, match="device or pipe"), whole_file(place):
+        with pytest.raises(OutputError, match="device or pipe"), atomic_file(place):
             pass
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
@@ -72,7 +72,7 @@ def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Pat
     (tmp_path / "real").mkdir()
     (tmp_path / "a.txt").symlink_to("real/b.txt")
     (tmp_path / "real" / ".b.12345678.partial.txt").write_text("of a killed process")
-    with whole_file(tmp_path / "a.txt") as partial:
+    with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
     assert (tmp_path / "a.txt").is_symlink()
     assert [(path.name, path.read_text()) for path in (tmp_path / "real").iterdir()] == [("b.txt", "new")]

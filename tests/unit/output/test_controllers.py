@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.calibration.controller_numbers import ExportNumbers, export_numbers
-from icrtool.errors import ConfigError
+from icrtool.calibration.controller_numbers import export_numbers
+from icrtool.calibration.from_runs import calibrate
+from icrtool.calibration.record import Calibration, FittedModel
+from icrtool.errors import ConfigError, DataError
+from icrtool.motion.models import CONTROLLER, MODELS, controller_parameters, twist, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
 
 CONTROLLER_KEYS = {
@@ -20,12 +24,12 @@ CONTROLLER_KEYS = {
 
 
 @pytest.fixture(scope="module")
-def numbers(make_run) -> ExportNumbers:
-    return export_numbers(make_run(duration_s=120.0))
+def calibration(make_run) -> Calibration:
+    return calibrate(make_run(duration_s=120.0))
 
 
-def load(numbers: ExportNumbers, target: str) -> dict:
-    return YAML(typ="safe").load(format_export(numbers, target))
+def load(calibration: Calibration, target: str) -> dict:
+    return YAML(typ="safe").load(format_export(calibration, target))
 
 
 @pytest.mark.parametrize(
@@ -36,8 +40,8 @@ def load(numbers: ExportNumbers, target: str) -> dict:
         ("husarion", ("/**", "drive_controller", "ros__parameters")),
     ],
 )
-def test_controllers_get_their_keys(numbers: ExportNumbers, target: str, path: tuple[str, ...]) -> None:
-    node = load(numbers, target)
+def test_controllers_get_their_keys(calibration: Calibration, target: str, path: tuple[str, ...]) -> None:
+    node = load(calibration, target)
     for key in path:
         node = node[key]
     assert set(node) >= CONTROLLER_KEYS
@@ -49,8 +53,8 @@ def test_controllers_get_their_keys(numbers: ExportNumbers, target: str, path: t
     assert type(node["wheel_separation"]) is float
 
 
-def test_nav2_gets_filter_and_amcl(numbers: ExportNumbers) -> None:
-    document = load(numbers, "nav2")
+def test_nav2_gets_filter_and_amcl(calibration: Calibration) -> None:
+    document = load(calibration, "nav2")
     assert [i for i, used in enumerate(document["ekf_filter_node"]["ros__parameters"]["odom0_config"]) if used] == [
         6,
         11,
@@ -59,25 +63,29 @@ def test_nav2_gets_filter_and_amcl(numbers: ExportNumbers) -> None:
     assert all(type(amcl[f"alpha{i}"]) is float and 0 < amcl[f"alpha{i}"] < 1 for i in range(1, 5))
 
 
-def test_json_holds_every_number(numbers: ExportNumbers) -> None:
-    document = json.loads(format_export(numbers, "json"))
-    assert document["separation_multiplier"] == numbers.separation_multiplier
+def test_json_holds_every_number(calibration: Calibration) -> None:
+    document = json.loads(format_export(calibration, "json"))
+    assert document["separation_multiplier"] == calibration.controller_numbers().multiplier
     assert document["schema"] == "icrtool/export/1"
 
 
-@pytest.mark.parametrize("target", [target for target in TARGETS if target != "json"])
-def test_comments_say_log_date_doubt_and_what_is_lost(numbers: ExportNumbers, target: str) -> None:
-    text = " ".join(line.removeprefix("# ") for line in format_export(numbers, target).splitlines() if line[0] == "#")
+@pytest.mark.parametrize("target", [target for target in TARGETS if target not in {"json", "icr"}])
+def test_comments_say_log_date_doubt_and_what_is_lost(calibration: Calibration, target: str) -> None:
+    text = " ".join(
+        line.removeprefix("# ") for line in format_export(calibration, target).splitlines() if line[0] == "#"
+    )
     for word in ("barn", "2025-10-09", "±", "x_icr", "not expressible here", "held out"):
         assert word in text
 
 
-def test_a_log_with_a_wild_name_stays_a_comment(numbers: ExportNumbers) -> None:
-    wild = replace(numbers, log="a\nwheel_separation: 3\n\t# b")
-    assert load(wild, "clearpath") == load(numbers, "clearpath")
+def test_a_log_with_a_wild_name_stays_a_comment(calibration: Calibration) -> None:
+    (log,) = calibration.logs
+    wild = replace(calibration, logs=(log._replace(name="a\nwheel_separation: 3\n\t# b"),))
+    assert load(wild, "clearpath") == load(calibration, "clearpath")
 
 
-def test_error_growth_is_measured(numbers: ExportNumbers) -> None:
+def test_error_growth_is_measured(calibration: Calibration) -> None:
+    numbers = export_numbers(calibration)
     along, across, yaw = numbers.pose_variance
     assert 0 < along < 0.1
     assert 0 < across < 0.1
@@ -87,4 +95,42 @@ def test_error_growth_is_measured(numbers: ExportNumbers) -> None:
 
 def test_a_run_without_width_has_no_multiplier(make_run) -> None:
     with pytest.raises(ConfigError, match=r"robot\.track_width_m"):
-        export_numbers(make_run(track_width_m=None))
+        calibrate(make_run(track_width_m=None))
+
+
+def test_without_measured_errors_only_the_twist_model_is_given(calibration: Calibration) -> None:
+    short = replace(calibration, controller=None)
+    with pytest.raises(DataError):
+        format_export(short, "nav2")
+    assert json.loads(format_export(short, "icr"))["held_out"]["p95_m"] > 0.0
+
+
+def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration) -> None:
+    """Evaluated as a robot's node would, for every term of the family: v_y and turn rate change sign, v_x does not."""
+    rng, b = np.random.default_rng(1), calibration.width_m
+    for model in MODELS.values():
+        k = len(model.terms)
+        fitted = FittedModel(model, rng.normal(size=k), np.eye(k))
+        one = replace(calibration, fitted=fitted)
+        document = json.loads(format_export(one, "icr"))
+        for v_left, v_right in ((0.4, 1.1), (-0.7, 0.9), (1.0, 1.0)):
+            symbols = dict.fromkeys(("v_x", "v_y", "yaw_rate"), 0.0)
+            v, w = (v_left + v_right) / 2, (v_right - v_left) / b
+            known = {"v": v, "w": w, "b": b, "spin": abs(v_left - v_right) / (abs(v_left) + abs(v_right)), "abs": abs}
+            for term in document["terms"]:
+                symbols[term["output"]] += term["value"] * eval(term["formula"], {"__builtins__": {}}, known)
+            v_x, v_y, omega = one.twist(v_left, v_right)
+            assert list(symbols.values()) == pytest.approx([v_x, -v_y, -omega], abs=1e-12)
+    icrs = json.loads(format_export(calibration, "icr"))["icrs"]
+    assert icrs["y_icr_right_m"] < 0.0 < icrs["y_icr_left_m"]
+
+
+def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -> None:
+    """The twist of a diff_drive_controller with the exported numbers, written out, is that of the tested model."""
+    geometry, _ = calibration.geometry()
+    numbers = calibration.controller_numbers()
+    v_left, v_right, b = 0.4, 1.1, calibration.width_m
+    left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
+    expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
+    motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
+    assert twist(CONTROLLER, controller_parameters(geometry), motion)[:, 0] == pytest.approx(expected)

@@ -20,7 +20,13 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError
-from icrtool.output.dropout_directory import is_dropout_directory, report_document, report_writer, write_tables
+from icrtool.output.dropout_directory import (
+    TRIALS_FILE,
+    is_dropout_directory,
+    report_document,
+    report_writer,
+    write_tables,
+)
 from icrtool.output.figures.drawing_process import DrawingHere
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.trials_file import trials_file
@@ -100,7 +106,18 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         "too_little_way_left",
         "across_wheel_gap",
         "ends_in_gnss_outage",
+        "from_standstill",
     }
+    assert [row["why_none"] is None for row in document["trials"]] == [row["trials"] > 0 for row in document["trials"]]
+    own, split = content.reference_error, content.by_learning
+    assert own is not None
+    assert split is not None
+    assert [row["p95_m"] for row in document["reference_error"]] == [None if np.isnan(p) else p for p in own.p95]
+    assert document["by_learning"]["learned_s"] == split.learned_s
+    for part, summary in (("before", split.before), ("after", split.after)):
+        rows = document["by_learning"][part]
+        assert [row["trials"] for row in rows] == summary.trials.tolist()
+        assert [row["p95_m"] for row in rows] == [None if np.isnan(p95) else p95 for p95 in summary.p95]
     assert document["bootstrap"]["seed"] == content.seed
     assert {"resamples", "level", "block"} <= document["bootstrap"].keys()
     assert document["tolerance_m"] <= 1e-9
@@ -109,7 +126,16 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
     assert document["gates"][2]["value_m"] is None
     assert document["passed"] is False
     assert {outage["kind"] for outage in document["outages"]} == {"forced", "real"}
-    assert document["budgets"][0].keys() == {"model", "label", "budget_m", "distance_m", "beyond", "between_m"}
+    assert document["budgets"][0].keys() == {
+        "model",
+        "label",
+        "budget_m",
+        "distance_m",
+        "beyond",
+        "between_m",
+        "low_m",
+        "high_m",
+    }
 
 
 def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutReport) -> None:
@@ -150,13 +176,16 @@ def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Ru
     assert found["max"].tolist() == expected.max_m.tolist()
 
 
-def test_a_report_replaces_an_older_one_and_leaves_no_trace(content: DropoutReport, tmp_path: Path) -> None:
-    content.write(tmp_path / "dropout", plots=())
-    (tmp_path / "dropout" / "of-the-old-one").touch()
+def test_a_report_replaces_an_older_one_and_keeps_files_of_others(content: DropoutReport, tmp_path: Path) -> None:
+    with report_writer(tmp_path / "dropout", DrawingHere(()), np.arange(3)) as writer:
+        writer.finish(content)
+    assert (tmp_path / "dropout" / TRIALS_FILE).exists()
+    (tmp_path / "dropout" / "notes.txt").touch()
     content.write(tmp_path / "dropout", plots=())
     assert [path.name for path in tmp_path.iterdir()] == ["dropout"]
     assert is_dropout_directory(tmp_path / "dropout")
-    assert not (tmp_path / "dropout" / "of-the-old-one").exists()
+    assert not (tmp_path / "dropout" / TRIALS_FILE).exists()
+    assert (tmp_path / "dropout" / "notes.txt").exists()
 
 
 def test_a_report_that_fails_leaves_the_older_one(written: Path, content: DropoutReport) -> None:

@@ -17,7 +17,14 @@ from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
 from icrtool.output.atomic_file import check_place
 from icrtool.output.exports.acceptance import format_markdown, write_junit, write_markdown
-from icrtool.output.tables.dropout import budget_lines, format_dropout, p95_at, shown_horizons
+from icrtool.output.tables.dropout import (
+    budget_lines,
+    format_dropout,
+    metres_text,
+    p95_at,
+    shown_horizons,
+    why_no_trial,
+)
 from icrtool.records.run import Run
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
@@ -72,6 +79,24 @@ def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutReport) -
     assert row_of(text, "  ends in GNSS outage")[0] == f"{counts.outage[1]:,}"
 
 
+def test_horizons_beyond_the_log_are_printed_with_the_reason(run: Run) -> None:
+    report = dropout(run, [1.0, 500.0, 700.0])
+    text = " ".join(format_dropout(report).split())
+    driven = f"{run.summary['drive']['distance_m']:.1f} m"
+    assert f"no trial of 500, 700 m: less than that is left of the {driven} driven" in text
+    assert why_no_trial(report, 0) is None
+    assert "no trial of" not in format_dropout(dropout(run, [1.0]))
+
+
+def test_the_reference_and_the_run_up_stand_in_the_table(content: DropoutReport) -> None:
+    text, own, split = format_dropout(content), content.reference_error, content.by_learning
+    assert own is not None
+    assert split is not None
+    assert row_of(text, "reference alone 95 %")[0] == f"{own.p95[1]:.3f}"
+    assert row_of(text, "  before")[:3] == [f"{split.before.p95[1]:.3f}", "/", f"{split.before.expected[1]:.3f}"]
+    assert row_of(text, "  after")[0] == f"{split.after.p95[1]:.3f}"
+
+
 def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
     (outage,), icr = content.outages, content.result("icr")
     assert icr is not None
@@ -80,8 +105,8 @@ def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutR
     assert p95_at(icr, content, 31.0) is None
     line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
     assert f"{outage.end_error_m:.3f} m" in line
-    assert usual > 1
-    assert line.endswith(f"{usual:.2f} m")
+    assert usual > 0
+    assert line.endswith(metres_text(usual))
 
 
 def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
@@ -98,15 +123,15 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
         BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True, between_m=(20.0, 20.0)),
     ]
     assert budget_lines(budgets) == [
-        "stays within 0.5 m (95 %) for 7.3 m; no slip: 2.1 m (interpolated between 1 and 20 m)",
-        "stays within 9 m (95 %) for more than 20 m",
+        "stays within 0.5 m (95 %) for 7.3 m (ICR, momentary); no slip: 2.1 m (interpolated between 1 and 20 m)",
+        "stays within 9 m (95 %) for more than 20 m (ICR, momentary)",
     ]
 
 
 def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:
     parked = make_run(duration_s=20.0, speed_mps=0.0, troubles=False, track_width_m=None)
     text = format_dropout(content_of(parked, [5.0]))
-    assert "nothing can be said of budgets" in text
+    assert "no budget can be evaluated" in text
     assert "robot.track_width_m is not known" in text
     assert "the robot stood at 100 % of the states" in text
 

@@ -133,7 +133,7 @@ def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., Run
 def test_icr_estimates_show_bands_rises_and_outage(run: Run) -> None:
     figure = drawn("icr_estimates", run)
     texts = legend_texts(figure)
-    assert texts == ["estimate", "±2σ", "10 %", "90 % of the way", "no slip (±b/2, 0)", "no usable GNSS"]
+    assert texts == ["estimate", "±2σ", "10 %", "90 % of the change", "no slip (±b/2, 0)", "no usable GNSS"]
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
     convergence = run.summary["icr"]["convergence_s"]
     assert rises == [

@@ -133,7 +133,15 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
     report = icrtool.dropout_report(stored, horizons_m=[1.0, 5.0])
     report.write(tmp_path / "report")
     names = {path.name for path in (tmp_path / "report").iterdir()}
-    assert names == {"summary.csv", "histogram.csv", "worst.csv", "ladder.csv", "report.json", "plots"}
+    assert names == {
+        "summary.csv",
+        "histogram.csv",
+        "worst.csv",
+        "ladder.csv",
+        "report.json",
+        "plots",
+        ".icrtool-files",
+    }
     assert {"summary.png", "histogram_05m.png", "worst.png", "examples_15m.png", "outages.png", "ladder.png"} == {
         path.name for path in (tmp_path / "report" / "plots").iterdir()
     }

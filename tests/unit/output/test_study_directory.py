@@ -15,10 +15,10 @@ from icrtool.errors import DataError, OutputError
 from icrtool.output.study_directory import check_study_target, write_study
 from icrtool.output.tables.study import finding_text, format_study, runs_text
 from icrtool.output.truth_file import log_and_truth, read_speeds, truth_path, write_truth
-from icrtool.simulation.drives import Drive, Sensors
+from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.record import simulate
-from icrtool.simulation.studies import STUDY_NAMES, Finding, StudyResult, default_request, run_study
+from icrtool.simulation.studies import STUDY_NAMES, StudyNumber, StudyResult, default_request, run_study
 
 WIDEST = 120
 PNG = b"\x89PNG"
@@ -106,11 +106,11 @@ def test_one_run_is_singular() -> None:
     ],
 )
 def test_numbers_are_told_with_three_digits(ours: tuple[float, ...], unit: str, text: str) -> None:
-    assert finding_text(Finding("", ours, unit)) == text
+    assert finding_text(StudyNumber("", ours, unit)) == text
 
 
 def test_the_truth_reads_back_to_the_last_bit(tmp_path: Path) -> None:
-    _, truth = simulate(Drive(duration_s=3.0), Sensors(), 0)
+    _, truth = simulate(DrivePlan(duration_s=3.0), Sensors(), 0)
     write_truth(truth, tmp_path / "truth.csv")
     table = pd.read_csv(tmp_path / "truth.csv")
     for name, values in truth.columns().items():

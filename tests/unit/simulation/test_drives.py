@@ -12,7 +12,7 @@ from icrtool.cli.drive_options import PATHS
 from icrtool.cli.study import STUDIES, VARIES
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.simulation.drives import Drive, Sensors, TrackSpeeds, check_drive, move, sample_times, sense
+from icrtool.simulation.drives import DrivePlan, Sensors, TrackSpeeds, check_drive, drive_plan, sample_times, sense
 from icrtool.simulation.paths import PATH_KINDS, PathPlan, plan_body, track_speeds
 from icrtool.simulation.record import DATUM, START_NS, record, simulate
 
@@ -41,7 +41,9 @@ def test_track_speeds_give_the_body_what_the_path_asks(kind) -> None:
 
 @pytest.mark.parametrize("kind", ["circle", "figure-eight"])
 def test_a_circle_is_driven_at_the_radius_asked_for(kind) -> None:
-    truth = move(Drive(path=PathPlan(kind, radius_m=2.0), icrs_m=(0.4, -0.4, 0.0), start_heading_rad=0.0), 0.0)
+    truth = drive_plan(
+        DrivePlan(path=PathPlan(kind, radius_m=2.0), icrs_m=(0.4, -0.4, 0.0), start_heading_rad=0.0), 0.0
+    )
     first = truth.t_s < 2 * math.pi * 2.0 / 0.4
     assert np.ptp(truth.pose[first, 0]) == pytest.approx(4.0, abs=1e-3)
     assert truth.pose[first, 1].min() == pytest.approx(0.0, abs=ROUNDING)
@@ -49,21 +51,23 @@ def test_a_circle_is_driven_at_the_radius_asked_for(kind) -> None:
 
 def test_a_lawnmower_comes_back_beside_its_first_leg() -> None:
     path = PathPlan("lawnmower", speed_mps=1.0, radius_m=1.0, leg_m=10.0)
-    truth = move(Drive(path=path, icrs_m=(0.4, -0.4, 0.0), start_heading_rad=0.0, duration_s=20 + math.pi), 0.0)
+    truth = drive_plan(
+        DrivePlan(path=path, icrs_m=(0.4, -0.4, 0.0), start_heading_rad=0.0, duration_s=20 + math.pi), 0.0
+    )
     end = truth.poses(np.array([20.0 + math.pi]))[0]
     # One held step of 1 ms at a corner of the plan turns the second leg by half a milliradian.
     np.testing.assert_allclose(end, [0.0, 2.0, math.pi], atol=0.01)
 
 
 def test_spins_turn_whole_turns_to_either_side_on_the_spot() -> None:
-    truth = move(Drive(path=PathPlan("spins"), icrs_m=(0.5, -0.75, 0.0)), 0.0)
+    truth = drive_plan(DrivePlan(path=PathPlan("spins"), icrs_m=(0.5, -0.75, 0.0)), 0.0)
     assert np.abs(truth.pose[:, :2]).max() < ROUNDING
     assert np.ptp(truth.pose[:, 2]) == pytest.approx(2 * math.pi, abs=0.01)
     assert np.abs(truth.v_left_mps).max() == pytest.approx(0.4)
 
 
 def test_the_truth_keeps_its_books() -> None:
-    truth = move(Drive(changes=((30.0, (0.6, -0.6, 0.0)),)), 0.01)
+    truth = drive_plan(DrivePlan(changes=((30.0, (0.6, -0.6, 0.0)),)), 0.01)
     np.testing.assert_allclose(np.diff(truth.travel_left_m), truth.v_left_mps[:-1] * np.diff(truth.t_s), atol=ROUNDING)
     turn = (truth.v_left_mps - truth.v_right_mps) / np.where(truth.t_s < 30.0, 1.25, 1.2)
     np.testing.assert_allclose(np.diff(truth.pose[:, 2]), turn[:-1] * np.diff(truth.t_s), atol=ROUNDING)
@@ -71,7 +75,7 @@ def test_the_truth_keeps_its_books() -> None:
 
 def test_icrs_change_at_their_time_to_the_nanosecond() -> None:
     change = 10.0003
-    truth = move(Drive(changes=((change, (0.6, -0.6, 0.0)),)), 0.0)
+    truth = drive_plan(DrivePlan(changes=((change, (0.6, -0.6, 0.0)),)), 0.0)
     row = int(np.searchsorted(truth.t_s, change))
     assert truth.t_s[row] == change
     assert truth.which[row - 1] == 0
@@ -80,21 +84,21 @@ def test_icrs_change_at_their_time_to_the_nanosecond() -> None:
 
 def test_given_track_speeds_are_driven_as_they_are() -> None:
     speeds = TrackSpeeds(np.array([0.0, 1.5, 3.2]), np.array([0.5, 0.2, 0.0]), np.array([0.1, 0.2, 0.3]))
-    truth = move(Drive(path=speeds, duration_s=4.0), 0.1)
+    truth = drive_plan(DrivePlan(path=speeds, duration_s=4.0), 0.1)
     assert truth.travel_left_m[np.searchsorted(truth.t_s, 3.2)] == pytest.approx(0.5 * 1.5 + 0.2 * 1.7, abs=ROUNDING)
     assert truth.v_right_mps[np.searchsorted(truth.t_s, 4.0)] == 0.3
 
 
 def test_the_same_seed_gives_the_same_numbers_and_another_does_not() -> None:
-    one, again, other = (simulate(Drive(duration_s=5.0), Sensors(), seed)[0].columns() for seed in (1, 1, 2))
+    one, again, other = (simulate(DrivePlan(duration_s=5.0), Sensors(), seed)[0].columns() for seed in (1, 1, 2))
     for name, values in one.items():
         np.testing.assert_array_equal(values, again[name])
     assert not np.array_equal(one["heading_rad"], other["heading_rad"])
 
 
 def test_sensors_without_error_tell_the_truth() -> None:
-    plan = Drive(duration_s=20.0)
-    truth = move(plan, 0.01)
+    plan = DrivePlan(duration_s=20.0)
+    truth = drive_plan(plan, 0.01)
     seen = sense(truth, QUIET, 20.0, rng())
     np.testing.assert_array_equal(seen.gnss_m, truth.poses(seen.gnss_t)[:, :2])
     np.testing.assert_array_equal(seen.heading_rad, truth.poses(seen.heading_t)[:, 2])
@@ -106,8 +110,8 @@ def test_sensors_without_error_tell_the_truth() -> None:
 
 
 def test_noise_has_the_size_that_was_asked_for() -> None:
-    plan = Drive(duration_s=100.0)
-    truth = move(plan, 0.01)
+    plan = DrivePlan(duration_s=100.0)
+    truth = drive_plan(plan, 0.01)
     sensors = replace(QUIET, gnss_std_m=0.3, heading_std_rad=0.05, input_noise_mps=0.1, input_bias_mps=0.02)
     seen, clean = sense(truth, sensors, 100.0, rng()), sense(truth, QUIET, 100.0, rng())
     assert (seen.gnss_m - clean.gnss_m).std() == pytest.approx(0.3, rel=NOISE_SHARE)
@@ -120,7 +124,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 def test_encoders_count_whole_counts_and_lose_none() -> None:
     sensors = Sensors(metres_per_count=0.001, heading_resolution_rad=math.radians(0.05))
-    truth = move(Drive(duration_s=20.0), 0.01)
+    truth = drive_plan(DrivePlan(duration_s=20.0), 0.01)
     seen = sense(truth, sensors, 20.0, rng())
     counts = seen.travel_left_m / 0.001
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
@@ -130,8 +134,8 @@ def test_encoders_count_whole_counts_and_lose_none() -> None:
 
 
 def test_commands_are_held_and_the_tracks_lag_behind_them() -> None:
-    plan = Drive(path=PathPlan("curved"), command_rate_hz=10.0, motor_lag_s=0.1, duration_s=20.0)
-    truth = move(plan, 0.1)
+    plan = DrivePlan(path=PathPlan("curved"), command_rate_hz=10.0, motor_lag_s=0.1, duration_s=20.0)
+    truth = drive_plan(plan, 0.1)
     for step in range(5):
         held = (truth.t_s >= step / 10) & (truth.t_s < (step + 1) / 10 - 1e-9)
         assert len(np.unique(truth.command_left_mps[held])) == 1
@@ -141,7 +145,7 @@ def test_commands_are_held_and_the_tracks_lag_behind_them() -> None:
 
 
 def test_an_outage_takes_its_fixes_away_and_touches_no_other() -> None:
-    truth = move(Drive(duration_s=20.0), 0.01)
+    truth = drive_plan(DrivePlan(duration_s=20.0), 0.01)
     whole = sense(truth, Sensors(), 20.0, rng())
     holed = sense(truth, Sensors(outages_s=((5.0, 8.0),)), 20.0, rng())
     kept = (whole.gnss_t < 5.0) | (whole.gnss_t >= 8.0)
@@ -150,13 +154,13 @@ def test_an_outage_takes_its_fixes_away_and_touches_no_other() -> None:
 
 
 def test_the_antenna_stands_where_it_was_put() -> None:
-    truth = move(Drive(duration_s=5.0, start_heading_rad=math.pi / 2), 0.01)
+    truth = drive_plan(DrivePlan(duration_s=5.0, start_heading_rad=math.pi / 2), 0.01)
     seen = sense(truth, replace(QUIET, antenna_forward_m=0.3, antenna_right_m=0.1), 5.0, rng())
     np.testing.assert_allclose(seen.gnss_m[0], [-0.1, 0.3], atol=ROUNDING)
 
 
 def test_delays_move_stamps_and_nothing_else() -> None:
-    plan = Drive(duration_s=5.0)
+    plan = DrivePlan(duration_s=5.0)
     late, _ = simulate(plan, Sensors(gnss_delay_s=0.1, heading_delay_s=-0.05), 0)
     prompt, _ = simulate(plan, Sensors(), 0)
     assert set(late.gnss_stamp_ns - prompt.gnss_stamp_ns) == {100_000_000}
@@ -167,7 +171,7 @@ def test_delays_move_stamps_and_nothing_else() -> None:
 def test_fixes_stand_on_the_globe_about_the_datum() -> None:
     from pymap3d import geodetic2ned
 
-    truth = move(Drive(duration_s=50.0), 0.01)
+    truth = drive_plan(DrivePlan(duration_s=50.0), 0.01)
     seen = sense(truth, QUIET, 50.0, rng())
     told = record(seen, QUIET, rng())
     north, east, _ = geodetic2ned(told.latitude_deg, told.longitude_deg, told.height_m, *DATUM)
@@ -177,12 +181,12 @@ def test_fixes_stand_on_the_globe_about_the_datum() -> None:
 
 @pytest.mark.parametrize(("std", "status"), [(0.01, 2), (0.3, 1), (2.0, 0)])
 def test_a_fix_is_called_what_a_receiver_of_its_noise_would_call_it(std: float, status: int) -> None:
-    told, _ = simulate(Drive(duration_s=2.0), Sensors(gnss_std_m=std), 0)
+    told, _ = simulate(DrivePlan(duration_s=2.0), Sensors(gnss_std_m=std), 0)
     assert set(told.gnss_status) == {status}
 
 
 def test_the_truth_table_stands_at_the_wheel_stamps() -> None:
-    told, table = simulate(Drive(duration_s=20.0, changes=((10.0, (0.6, -0.6, 0.1)),)), Sensors(), 0)
+    told, table = simulate(DrivePlan(duration_s=20.0, changes=((10.0, (0.6, -0.6, 0.1)),)), Sensors(), 0)
     np.testing.assert_array_equal(table.stamp_ns, told.wheel_stamp_ns)
     np.testing.assert_array_equal(np.unique(table.x_icr_m), [-0.25, 0.1])
     assert list(table.columns()) == [
@@ -199,14 +203,17 @@ def test_sample_times_are_half_open() -> None:
 @pytest.mark.parametrize(
     ("plan", "words"),
     [
-        (Drive(icrs_m=(-0.5, 0.5, 0.0)), "icrs: y_icr_right -0.5 is not right of y_icr_left 0.5"),
-        (Drive(changes=((5.0, (-0.5, 0.5, 0.0)),)), "change: y_icr_right"),
-        (Drive(changes=((5.0, (0.5, -0.5, 0.0)), (5.0, (0.5, -0.5, 0.0)))), "change: the times 5, 5 do not increase"),
-        (Drive(path=PathPlan("lawnmower", radius_m=0.0)), "radius: a lawnmower path has no bends of radius 0"),
-        (Drive(duration_s=0.05), "duration: 0.05 s holds fewer than two samples at 20 Hz"),
+        (DrivePlan(icrs_m=(-0.5, 0.5, 0.0)), "icrs: y_icr_right -0.5 is not right of y_icr_left 0.5"),
+        (DrivePlan(changes=((5.0, (-0.5, 0.5, 0.0)),)), "change: y_icr_right"),
+        (
+            DrivePlan(changes=((5.0, (0.5, -0.5, 0.0)), (5.0, (0.5, -0.5, 0.0)))),
+            "change: the times 5, 5 do not increase",
+        ),
+        (DrivePlan(path=PathPlan("lawnmower", radius_m=0.0)), "radius: a lawnmower path has no bends of radius 0"),
+        (DrivePlan(duration_s=0.05), "duration: 0.05 s holds fewer than two samples at 20 Hz"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_words(plan: Drive, words: str) -> None:
+def test_what_cannot_be_driven_is_refused_in_words(plan: DrivePlan, words: str) -> None:
     with pytest.raises(ConfigError) as refused:
         check_drive(plan, Sensors())
     assert str(refused.value).startswith(words)

@@ -15,7 +15,7 @@ from icrtool.simulation import study_runs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import STUDY_NAMES, StudyRequest, StudyResult, default_request, run_study, statistics
 from icrtool.simulation.study_consistency import chi2_band, errors_over_std
-from icrtool.simulation.study_measures import rise_times, settling_times
+from icrtool.simulation.study_measures import convergence_times, settling_times
 
 
 def request(name: Any, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
@@ -88,7 +88,7 @@ def test_inflation_brings_reconvergence_from_minutes_to_seconds() -> None:
     asked = request("icr-change", 4)
     asked = replace(asked, plan=replace(asked.plan, duration_s=350.0))
     result = run_study(asked)
-    slow = median(result, "change1_rise_y_icr_right_s", series="paper", value="not told")
+    slow = median(result, "change1_rise_y_icr_right_s", series="paper", value="not inflated")
     fast = median(result, "change1_rise_y_icr_right_s", series="field", value="inflated")
     assert 80.0 < slow < 160.0
     assert fast < 1.0
@@ -198,7 +198,7 @@ def test_errors_over_std_of_a_known_gaussian_are_chi_squared() -> None:
 def test_a_ramp_rises_and_settles_when_it_should() -> None:
     t = np.arange(0, 11.0, 0.01)
     value = np.minimum(t / 10.0, 1.0)[None, :]
-    assert rise_times(t, value, 1.0)[0] == pytest.approx(8.0, abs=0.011)
+    assert convergence_times(t, value, 1.0)[0] == pytest.approx(8.0, abs=0.011)
     assert settling_times(t, value, 1.0)[0] == pytest.approx(9.0, abs=0.011)
 
 
@@ -206,7 +206,7 @@ def test_what_never_arrives_has_no_time() -> None:
     t = np.arange(0, 10.0, 0.1)
     value = np.vstack([0.5 * t / 10.0, np.full(100, np.nan), np.where(t < 9.9, 1.0, 0.0)])
     value[:, 0] = 0.0
-    assert np.isnan(rise_times(t, value[:2], 1.0)).all()
+    assert np.isnan(convergence_times(t, value[:2], 1.0)).all()
     assert np.isnan(settling_times(t, value, 1.0)).all()
 
 

@@ -1,0 +1,66 @@
+"""Calibrate from finished runs: what ``icrtool.calibrate`` and ``icrtool calibrate`` do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of
+from icrtool.calibration.pooled import calibrate as calibrate_recordings
+from icrtool.calibration.record import Calibration
+from icrtool.errors import ConfigError
+from icrtool.records.run import Run
+
+
+def calibrate(runs: Run | Sequence[Run]) -> Calibration:
+    """Calibrate the motion model of a robot from one run or many, tested on what it was not fitted to.
+
+    Parameters
+    ----------
+    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot
+
+    Raises
+    ------
+    ConfigError
+        Runs of different robots, wheel radii or scales, one run twice, or a track width that is not known.
+    DataError
+        Too short a drive.
+    """
+    return calibrate_runs([runs] if isinstance(runs, Run) else runs).calibration
+
+
+def calibrate_runs(runs: Sequence[Run]) -> CalibrationResult:
+    """Calibrate as `calibrate` does, with the tables by which the model was chosen."""
+    if not runs:
+        raise ConfigError("runs", "none is given", "name at least one run or log")
+    robots = [robot_of(run) for run in runs]
+    for key, unit in (("wheel_radius_m", "robot."), ("left_scale", "wheels."), ("right_scale", "wheels.")):
+        if len(found := {robot[key] for robot in robots}) > 1:
+            why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
+            raise ConfigError(f"{unit}{key}", why, "fit them with the same value: parameters refer to it")
+    result = calibrate_recordings([gyro_recording_of(run) for run in runs], robots[0])
+    warnings = tuple(dict.fromkeys(warning for run in runs for warning in use_warnings(run, alone=len(runs) == 1)))
+    return replace(result, calibration=replace(result.calibration, warnings=warnings))
+
+
+def robot_of(run: Run) -> dict[str, Any]:
+    """Return what a calibration holds of the robot of a run, but for its track width."""
+    config = run.config
+    scales = {
+        key: 1.0 if value == "auto" else float(value)
+        for key, value in (("left_scale", config.wheels.left_scale), ("right_scale", config.wheels.right_scale))
+    }
+    return {"name": config.robot.name, "wheel_radius_m": config.robot.wheel_radius_m, **scales}
+
+
+def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
+    """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
+    warnings = list(run.summary["excitation"]["sentences"]) if alone else []
+    stream = next((one for one in run.summary["streams"] if one["role"] == "wheels"), None)
+    if stream is not None and "Odometry" in stream["message_type"]:
+        warnings.append(
+            "the wheels were read from odometry twists, which hold the controller's own multipliers: "
+            "these numbers are right only where b and radius are those the twists were made with"
+        )
+    return tuple(warnings)

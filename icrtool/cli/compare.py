@@ -1,0 +1,105 @@
+"""``icrtool compare``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+
+if TYPE_CHECKING:
+    from icrtool.config import Config
+    from icrtool.records.run import Run
+
+
+@click.command("compare")
+@click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
+@click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="Write the transfer matrix.")
+@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Write it all as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@options.configuration
+@options.verbosity
+def command(
+    sources: tuple[str, ...], csv_file: Path | None, output: Path | None, as_json: bool,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
+    """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
+
+    Each argument is a group: a run, a log, or a folder of runs or logs; arguments of one NAME are one group. The first
+    group is compared with each of the others.
+
+    \b
+    Example:
+      icrtool compare old=season1/ new=season2/
+      icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
+    """  # noqa: D301 - click reads the escape
+    from icrtool.calibration.transfer import compare_groups
+    from icrtool.errors import ConfigError
+    from icrtool.output.atomic_file import check_place, atomic_file
+    from icrtool.output.run_directory import json_bytes
+    from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
+
+    config = options.load(config_file, robot, sets)
+    places: dict[str, list[Path]] = {}
+    for source in sources:
+        name, path = _named(source)
+        places.setdefault(name, []).append(path)
+    if len(places) < 2:
+        raise ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+    for file in (csv_file, output):
+        if file is not None:
+            check_place(file)
+    found = [(name, one) for name, paths in places.items() for path in paths for one in _expand(path)]
+    groups: dict[str, list[Run]] = {}
+    with options.progress_bar("reading", quiet=quiet) as progress:
+        for number, (name, path) in enumerate(found, start=1):
+            groups.setdefault(name, []).append(_run(path, config, verbose=verbose))
+            if progress is not None:
+                progress(number / len(found))
+    transfer = compare_groups(groups)
+    document = json_bytes(transfer_document(transfer))
+    for file, content in ((csv_file, transfer_csv(transfer)), (output, document)):
+        if file is not None:
+            with atomic_file(file) as partial:
+                partial.write_bytes(content)
+    if as_json:
+        click.echo(document, nl=False)
+    elif not quiet:
+        click.echo(format_transfer(transfer))
+
+
+def _named(source: str) -> tuple[str, Path]:
+    """Return the group's name and the place of one argument."""
+    name, sign, place = source.partition("=")
+    if sign and name and place and not Path(source).exists():
+        return name, Path(place)
+    return Path(source).name or source, Path(source)
+
+
+def _expand(place: Path) -> list[Path]:
+    """Return the runs in a folder, or else its logs; a run or log is itself."""
+    from icrtool.fleet.recordings import find_recordings
+    from icrtool.output.run_directory import RUN_FILE, is_run_directory
+
+    if is_run_directory(place) or not place.is_dir():
+        return [place]
+    runs = sorted(file.parent for file in place.rglob(RUN_FILE) if is_run_directory(file.parent))
+    return runs or [one.path for one in find_recordings([place])]
+
+
+def _run(path: Path, config: Config, *, verbose: bool) -> Run:
+    """Read a run, or fit a log."""
+    from icrtool.output.run_directory import is_run_directory
+
+    if verbose:
+        click.echo(str(path), err=True)
+    if is_run_directory(path):
+        from icrtool.output.stored_run import open_run
+
+        return open_run(path)
+    from icrtool.estimation.fit import fit
+    from icrtool.logs import read_log
+
+    return fit(read_log(path, config), config)

@@ -1,0 +1,71 @@
+"""The reference's own error: what open-loop trials would show if the motion model were perfect."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.trials import Drive
+from icrtool.records.dropout import ReferenceErrors
+from icrtool.records.run import Run
+
+DRAWS = 20_000
+"""Errors drawn a horizon: p95 is then known to 1 %."""
+
+GNSS_NIS, HEADING_NIS = 2.0, 1.0
+"""Mean normalised innovation squared where the noise is right: the number of measured components."""
+
+
+def reference_error(run: Run, drive: Drive, ends: NDArray[np.int32], seed: int) -> ReferenceErrors:
+    """Return the error that the reference puts into the trials of each horizon.
+
+    Parameters
+    ----------
+    run : its standard deviations are those of the reference
+    drive : the same for the kernels
+    ends : (h, n), the state at which the trial from each start ends, negative where there is none
+    seed : of the draws
+
+    Notes
+    -----
+    A trial starts at the reference pose (p_s, psi_s), adds the open-loop displacement and is compared with p_e. With
+    errors dp and dpsi of the reference, and D the displacement from start to end, a perfect model shows
+
+        e = dp_s - dp_e + dpsi_s J D,    J the turn by 90 degrees,
+
+    to first order, with the mean square var(p_s) + var(p_e) + var(psi_s) |D|^2. The variances are those of the filter
+    (or of the smoother, where it is the reference). They follow from the noise of the fixes that the alignment stated
+    or measured; where fixes or headings spread more than that, mean NIS / components > 1, the variances grow by that
+    factor (Birge 1932). Mean and 95th percentile are those of drawn normal errors. Errors of start and end count as
+    independent: what both share, an offset of all fixes, is in no trial, and what they share in part makes the result
+    an upper bound. A heading offset common to the whole log is not in the variances.
+    """
+    position, heading = _spread(run)
+    table = run.table
+    std_north, std_east = np.sqrt(position) * table.std_north_m, np.sqrt(position) * table.std_east_m
+    std_heading = np.sqrt(heading) * table.std_heading_rad
+    result = np.full((3, len(ends)), np.nan)
+    rng = np.random.default_rng(seed)
+    for h, column in enumerate(ends):
+        start = np.flatnonzero(column >= 0)
+        if not len(start):
+            continue
+        start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
+        end = column[start]
+        north, east = drive.north[end] - drive.north[start], drive.east[end] - drive.east[start]
+        drawn = rng.standard_normal((5, DRAWS))
+        turned = std_heading[start] * drawn[0]
+        off_north = std_north[start] * drawn[1] - std_north[end] * drawn[2] - turned * east
+        off_east = std_east[start] * drawn[3] - std_east[end] * drawn[4] + turned * north
+        error = np.hypot(off_north, off_east)
+        square = sum(std[rows] ** 2 for std in (std_north, std_east) for rows in (start, end))
+        square = square + std_heading[start] ** 2 * (north**2 + east**2)
+        result[:, h] = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
+    return ReferenceErrors(*result)
+
+
+def _spread(run: Run) -> tuple[float, float]:
+    """Return the factors by which fixes and headings spread more than the filter assumes, in variance; at least 1."""
+    noise = run.summary["filter"]
+    position, heading = noise["nis_gnss_mean"], noise["nis_heading_mean"]
+    return max((position or 0.0) / GNSS_NIS, 1.0), max((heading or 0.0) / HEADING_NIS, 1.0)

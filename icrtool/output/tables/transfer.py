@@ -1,0 +1,106 @@
+"""Compared groups of runs as text, as rows of CSV and as plain data."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from textwrap import wrap
+from typing import Any
+
+from icrtool.calibration.transfer import Cell, Pair, Transfer
+from icrtool.output.text_format import TABLE_WIDTH
+from icrtool.records.dropout import CHOICE_HORIZON_M
+
+TRANSFER_SCHEMA = "icrtool/compare/1"
+
+
+def transfer_document(transfer: Transfer) -> dict[str, Any]:
+    """Return plain data."""
+    return {
+        "schema": TRANSFER_SCHEMA,
+        "groups": {
+            name: {
+                "model": one.recommended,
+                "logs": [log._asdict() for log in one.logs],
+                "geometry": one.geometry()[0]._asdict(),
+            }
+            for name, one in transfer.calibrations.items()
+        },
+        "pairs": [
+            {
+                "first": pair.first,
+                "second": pair.second,
+                "parameters": [one._asdict() | {"significant": one.significant} for one in pair.parameters],
+                "errors": [one._asdict() for one in pair.errors],
+                "verdict": verdict(transfer, pair),
+            }
+            for pair in transfer.pairs
+        ],
+        "transfer": [cell._asdict() for cell in transfer.cells],
+    }
+
+
+def transfer_csv(transfer: Transfer) -> bytes:
+    """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Cell._fields)
+    writer.writerows(
+        ["" if isinstance(value, float) and not math.isfinite(value) else value for value in cell]
+        for cell in transfer.cells
+    )
+    return text.getvalue().encode()
+
+
+def format_transfer(transfer: Transfer) -> str:
+    """Return verdicts, differences and the transfer matrix, no line end."""
+    lines: list[str] = []
+    for pair in transfer.pairs:
+        lines += [*wrap(verdict(transfer, pair), TABLE_WIDTH), ""]
+        lines.append(f"{'':<24}{pair.first:>16.16}{pair.second:>16.16}{'difference ± std':>24}")
+        for one in pair.parameters:
+            difference = f"{one.difference:+.3f} ± {one.std:.3f}"
+            lines.append(f"{one.quantity:<24}{one.first:>+16.3f}{one.second:>+16.3f}{difference:>24}")
+        for change in pair.errors:
+            if math.isfinite(change.p95_m):
+                lines.append(f"held-out error after {change.horizon_m:g} m: 95 % {_change(change[1:4])}; "
+                             f"expected {_change(change[4:7])}")  # fmt: skip
+        lines.append("")
+    lines.append(f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column")
+    names = list(transfer.calibrations)
+    lines.append(f"{'':<24}" + "".join(f"{name:>20.18}" for name in names))
+    for row in names:
+        cells = (transfer.cell(row, column, CHOICE_HORIZON_M) for column in names)
+        lines.append(f"{row:<24.22}" + "".join(f"{f'{one.p95_m:.2f} / {one.expected_m:.2f}':>20}" for one in cells))
+    lines.append("on the diagonal each trial is predicted by what was not fitted to it")
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def verdict(transfer: Transfer, pair: Pair) -> str:
+    """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
+    one = next(one for one in pair.parameters if one.quantity == "multiplier")
+    change = f"by {one.difference:+.2f} ± {one.std:.2f}"
+    if not one.significant:
+        change += ", which may be chance"
+    own = transfer.cell(pair.second, pair.second, CHOICE_HORIZON_M)
+    foreign = transfer.cell(pair.first, pair.second, CHOICE_HORIZON_M)
+    if not math.isfinite(own.p95_m + foreign.p95_m):
+        return f"The multiplier of {pair.second} differs from that of {pair.first} {change}."
+    cost = foreign.p95_m - own.p95_m
+    sentence = (
+        f"costs {cost:.2f} m (95 %) at {CHOICE_HORIZON_M:g} m on {pair.second}"
+        if cost > 0.0
+        else f"is no worse than its own on {pair.second} at {CHOICE_HORIZON_M:g} m"
+    )
+    return (
+        f"The multiplier of {pair.second} differs from that of {pair.first} {change}; a calibration of {pair.first} "
+        f"{sentence}."
+    )
+
+
+def _change(values: tuple[float, ...]) -> str:
+    value, low, high = values
+    if not math.isfinite(low + high):
+        return f"{value:+.2f} m (too short for an interval)"
+    return f"{value:+.2f} m ({low:+.2f} to {high:+.2f})"

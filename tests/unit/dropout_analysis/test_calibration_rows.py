@@ -1,0 +1,120 @@
+"""Calibrations and the recommended model as rows of the dropout report; one answer wherever it is asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import icrtool
+from icrtool.calibration.controller_numbers import export_numbers
+from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.record import Calibration
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.errors import ConfigError
+from icrtool.kernels.error_statistics import summarise
+from icrtool.motion.trials import cut_trials
+from icrtool.output.exports.controllers import format_export
+from icrtool.output.tables.dropout import format_dropout
+from icrtool.records.run import Run
+
+HORIZONS = (5.0, 10.0, 20.0)
+
+
+@pytest.fixture(scope="module")
+def drive(make_run: Callable[..., Run]) -> Run:
+    run = make_run(duration_s=150.0, troubles=False)
+    return replace(run, summary={**run.summary, "inputs": [{"path": "a", "bytes": 1, "sha256": "a"}]})
+
+
+@pytest.fixture(scope="module")
+def own(drive: Run) -> Calibration:
+    return icrtool.calibrate(drive)
+
+
+@pytest.fixture(scope="module")
+def report(drive: Run, own: Calibration, tmp_path_factory: pytest.TempPathFactory) -> DropoutReport:
+    """With the run's own calibration and one that says it is of other logs, both read back from files."""
+    folder = tmp_path_factory.mktemp("calibrations")
+    other = replace(own, logs=(own.logs[0]._replace(sha256="b"),), others=own.others)
+    files = [own.write(folder / "own.json"), other.write(folder / "last.season.json")]
+    calibrations = [icrtool.open_calibration(file) for file in files]
+    gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "extended.p95@10m <= 9"]
+    return dropout_report(drive, horizons_m=HORIZONS, calibrations=calibrations, gates=gates)
+
+
+def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
+    drive: Run, own: Calibration, report: DropoutReport
+) -> None:
+    recording = recording_of(drive)
+    expected = summarise(predictor(own, recording)(cut_trials(recording, HORIZONS, all_starts=True)))
+    for name in ("calibration:own", "calibration:last.season"):
+        result = report.result(name)
+        assert result is not None
+        np.testing.assert_array_equal(result.summary.trials, report.counts.trials)
+        np.testing.assert_allclose(result.summary.p95, expected.p95)
+        assert np.all(result.intervals.p95_low[:1] < result.summary.p95[:1])
+
+
+def test_the_report_states_whether_the_log_was_fitted_to(report: DropoutReport) -> None:
+    assert [one.fitted_to_this for one in report.calibrations] == [True, False]
+    text = format_dropout(report)
+    assert "own: " in text
+    assert "not fitted to this log" in text
+
+
+def test_what_is_recommended_is_not_better_than_what_knew_the_drive(report: DropoutReport) -> None:
+    held_out, in_sample = report.result("recommended"), report.result("calibration:own")
+    assert held_out is not None
+    assert in_sample is not None
+    assert np.all(held_out.summary.expected != in_sample.summary.expected)
+    assert held_out.summary.expected[0] < 2.0 * in_sample.summary.expected[0]
+    np.testing.assert_array_equal(held_out.summary.trials, report.counts.trials)
+
+
+def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, report: DropoutReport) -> None:
+    assert report.calibration is not None
+    numbers, exported = report.calibration.controller_numbers(), export_numbers(own)
+    assert numbers == own.controller_numbers()
+    assert exported.separation_multiplier == numbers.multiplier
+    assert exported.separation_multiplier_std == numbers.multiplier_std
+    assert f"wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}" in " ".join(
+        format_dropout(report).split()
+    )
+    assert json.loads(format_export(own, "json"))["left_radius_multiplier"] == numbers.left_radius
+    # the controller's model is tested in the same trials as the whole one
+    assert exported.full_p95_m == report.comparison.rung("extended").summary.p95[1]  # type: ignore[union-attr]
+    assert exported.p95_m != exported.full_p95_m
+
+
+def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:
+    assert [verdict.passed for verdict in report.verdicts] == [True, False, True]
+    rows = {"icr", "no_slip", "icr_final", "recommended", "calibration:own", "calibration:last.season"}
+    assert {one.model for one in report.budgets} <= rows
+    assert all(one.low_m <= one.distance_m <= one.high_m for one in report.budgets if np.isfinite(one.low_m))
+
+
+def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path) -> None:
+    report.write(tmp_path / "dropout")
+    names = {"icr", "no_slip", "icr_final", "recommended", "calibration:own", "calibration:last.season"}
+    assert set(pd.read_csv(tmp_path / "dropout" / "summary.csv")["model"]) == names
+    assert set(pd.read_csv(tmp_path / "dropout" / "histogram.csv")["model"]) == names
+    document = json.loads((tmp_path / "dropout" / "report.json").read_bytes())
+    assert [one["fitted"] for one in document["calibrations"]] == ["fitted to this log", "not fitted to this log"]
+    assert document["recommended"]["model"] == report.calibration.recommended  # type: ignore[union-attr]
+    assert (tmp_path / "dropout" / "plots" / "histogram_10m.png").is_file()
+
+
+def test_one_calibration_has_the_plain_name_and_no_comparison_no_recommended_row(drive: Run, own: Calibration) -> None:
+    report = dropout_report(drive, horizons_m=[5.0], calibrations=[own], comparison=False)
+    assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final", "calibration"]
+    with pytest.raises(ConfigError, match="width"):
+        dropout_report(drive, calibrations=[replace(own, robot={**own.robot, "track_width_m": 1.0})])
+    with pytest.raises(ConfigError, match="recommended"):
+        dropout_report(drive, horizons_m=[5.0], comparison=False, gates=["recommended.p95@5m < 1"])

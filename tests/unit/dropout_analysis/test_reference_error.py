@@ -1,0 +1,83 @@
+"""The reference's own error, against trials of a perfect model on references of known noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.dropout_analysis.trials import Model, dropout
+from icrtool.kernels.trials import FrozenIcrs
+from icrtool.records.run import Run
+from support.barn import ICRS_M, RATE_HZ
+
+HORIZONS_M = [1.0, 5.0, 20.0]
+PERFECT = [Model("icr", "true ICRs", FrozenIcrs.constant(*ICRS_M))]
+STDS = [(0.05, 0.05, 0.0), (0.0, 0.0, 0.01), (0.02, 0.10, 0.02)]
+"""North and east [m], heading [rad]."""
+
+
+def true_path(run: Run) -> dict[str, np.ndarray]:
+    """Integrate the held wheel speeds with the true ICRs: what a perfect model predicts."""
+    table, (right, left, x) = run.table, ICRS_M
+    omega = (table.v_left_mps - table.v_right_mps) / (right - left)
+    ahead, aside = (table.v_left_mps * right - table.v_right_mps * left) / (right - left), -omega * x
+    dt = np.diff(table.stamp_ns) / 1e9
+    psi = np.concatenate([[0.0], np.cumsum(omega[:-1] * dt)])
+    north = np.concatenate([[0.0], np.cumsum(((ahead * np.cos(psi) - aside * np.sin(psi))[:-1]) * dt)])
+    east = np.concatenate([[0.0], np.cumsum(((ahead * np.sin(psi) + aside * np.cos(psi))[:-1]) * dt)])
+    return {"north_m": north, "east_m": east, "heading_rad": psi}
+
+
+def with_noise(run: Run, stds: tuple[float, float, float], factor: float = 1.0) -> Run:
+    """Return the run with a reference that has `factor` times white noise of these standard deviations."""
+    rng, columns = np.random.default_rng(11), {}
+    for (name, column), std in zip(true_path(run).items(), stds, strict=True):
+        columns[name] = column + factor * std * rng.standard_normal(len(column))
+        columns[f"std_{name}"] = np.full(len(column), std)
+    noise = {**run.summary["filter"], "nis_gnss_mean": 2.0 * factor**2, "nis_heading_mean": factor**2}
+    return replace(run, table=replace(run.table, **columns), summary={**run.summary, "filter": noise})
+
+
+@pytest.fixture(scope="module")
+def clean(make_run) -> Run:
+    run = make_run(troubles=False)
+    assert len(run.table) > 50 * RATE_HZ
+    return run
+
+
+@pytest.mark.parametrize("stds", STDS)
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_a_perfect_model_shows_the_references_error_and_nothing_else(
+    clean: Run, stds: tuple[float, float, float], factor: float
+) -> None:
+    report = dropout(with_noise(clean, stds, factor), HORIZONS_M, models=PERFECT)
+    shown, own = report.results[0].summary, report.reference_error
+    assert own is not None
+    np.testing.assert_allclose(shown.expected, own.expected, rtol=0.06)
+    np.testing.assert_allclose(shown.p95, own.p95, rtol=0.06)
+    assert (own.expected < own.std).all()
+    assert (own.std < own.p95).all()
+
+
+def test_a_worse_model_shows_more(clean: Run) -> None:
+    noisy = with_noise(clean, STDS[0])
+    wrong = [Model("icr", "wrong ICRs", FrozenIcrs.constant(0.6, -0.6, 0.0))]
+    report = dropout(noisy, [20.0], models=wrong)
+    assert report.reference_error is not None
+    assert report.results[0].summary.p95[0] > 2 * report.reference_error.p95[0]
+
+
+def test_the_filters_own_states_hold_what_their_standard_deviations_promise(clean: Run) -> None:
+    report = dropout(clean, HORIZONS_M, models=PERFECT)
+    assert report.reference_error is not None
+    ratio = report.results[0].summary.p95 / report.reference_error.p95
+    assert (ratio < 1.2).all(), ratio
+    assert (ratio > 0.1).all(), ratio
+
+
+def test_horizons_without_trials_have_none(clean: Run) -> None:
+    own = dropout(clean, [1.0, 900.0]).reference_error
+    assert own is not None
+    assert np.isfinite(own.p95).tolist() == [True, False]
