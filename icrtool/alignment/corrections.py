@@ -22,7 +22,7 @@ from icrtool.alignment.heading_alignment import (
     refuse_stuck,
     refuse_unexplained,
 )
-from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, derive_heading
+from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, as_turn_rate, derive_heading
 from icrtool.alignment.heading_offset_cause import NO_NAME, name_offset
 from icrtool.alignment.reference_delay import delayed
 from icrtool.alignment.stream_checks import check_streams
@@ -41,6 +41,9 @@ SMALLEST_SCALE_ERROR, SCALE_SIGMAS, USUAL_SCALE_STD = 0.01, 2.0, 0.04
 LARGEST_SCALE_CORRECTION = 0.15
 FACTOR_TWO_TOLERANCE = 0.04
 """A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
+
+SAME_CLOCK_SIGMAS = 2.0
+"""Heading and position whose delays differ by less lag or lead together: it is the wheels' clock then."""
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 STANDS_SHARE, STILL = 0.8, 0.2
@@ -121,7 +124,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         Streams that cannot be used together, a heading that nothing explains, wheels that turn while the robot stands.
     """
     corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
-    derived = None
+    as_sent, derived = log, None
     if not len(log.heading.stamp_ns) and corrects:
         derived = derive_heading(log, width)
         log = derived.apply(log)
@@ -143,10 +146,13 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     _refuse_standing(log, drive, windows)
     course = measure_course(_turned_over(log) if mirrored else log)
     free = config.frames.heading_offset_deg == "auto" and corrects
+    fit = estimate_alignment(drive, windows, width)
     if free and derived is None:
         refuse_stuck(log)
+        scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
+        if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
+            return align_streams(bare, config)
         refuse_unexplained(log, course)
-    fit = estimate_alignment(drive, windows, width)
     scale, scale_note = _scale(fit, config, sound=sound, corrects=corrects)
     notes += scale_note
     if scale != 1.0:
@@ -361,6 +367,9 @@ def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDe
         applied[what] = 0.0
         if field and setting != "auto":
             applied[what] = setting
+        elif field and what == "position" and applied["heading"] and _on_one_clock(fit, delay):
+            applied[what] = applied["heading"]
+            notes.append(f"{log.name}: the position is corrected alike: nothing shows that its delay differs")
         elif field and delay.is_clear:
             applied[what] = delay.value_s
             lags = ("lag" if together else "lags") if delay.value_s > 0 else ("lead" if together else "leads")
@@ -380,6 +389,14 @@ def _delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDe
     return StreamDelays(
         shifted, found["heading"], found["position"], applied["heading"], applied["position"], tuple(notes)
     )
+
+
+def _on_one_clock(fit: AlignmentFit | None, position: Delay) -> bool:
+    """Return whether a delay of the heading is one of the wheels: the position shows none of its own."""
+    if fit is None or position.is_clear:
+        return False
+    apart, std = fit.estimate("position_after_heading")
+    return abs(apart) < SAME_CLOCK_SIGMAS * std
 
 
 def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:

@@ -10,9 +10,12 @@ import numpy as np
 from icrtool.alignment.gnss_steps import bend_std_m, unbroken
 from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog
 
-WINDOW_M = 2.0
+WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_POSITION_STD = 12.0
 """A window is so long that noise of the fixes turns its displacement by no more than 7 deg."""
+
+WINDOW_IN_VALUES = 12.0
+"""A value that is held while the robot accelerates ends a window early or late by a part of its own distance."""
 
 STARTS_A_WINDOW = 8
 LONGEST_WINDOW_S = 30.0
@@ -104,7 +107,8 @@ def cut_windows(drive: DriveArrays) -> DriveWindows:
 
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
     """
-    length = max(WINDOW_M, WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0))
+    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
+    length = max(WINDOW_M, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
     at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
     cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
     begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)
@@ -122,6 +126,13 @@ def cut_windows(drive: DriveArrays) -> DriveWindows:
         begin, end, length, turn_begin, turn_end,
         np.floor(at_fix[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
+
+
+def _value_length(drive: DriveArrays) -> float:
+    """Return the distance [m] on which a wheel value lasts while the robot moves, however often it is repeated."""
+    moving = np.diff(drive.travel) > 0
+    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (drive.v_left, drive.v_right)]
+    return float(drive.travel[-1]) / max(sum(changes) / 2, 1.0)
 
 
 def _group_length(total: float, length: float) -> float:

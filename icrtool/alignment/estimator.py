@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
-from icrtool.kernels.robust import RobustFit, robust_least_squares
+from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.records.tables import Complexes, Floats
 
 NAMES = (
@@ -56,6 +56,12 @@ STEP_S = 0.02
 OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
+RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
+"""A robot answers its wheels late by up to 0.1 s, which no drive separates from a delay of the streams."""
+
+ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
+"""An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
+
 FEWEST_WINDOWS = 16
 MOST_STEPS = 15
 
@@ -80,11 +86,13 @@ class AlignmentFit(NamedTuple):
     ----------
     fit : the robust fit; width_m : b that w was formed with
     windows : DriveWindows it was made of
+    turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
     fit: RobustFit
     width_m: float
     windows: DriveWindows
+    turning_speed_mps: float
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -113,16 +121,22 @@ class AlignmentFit(NamedTuple):
         for i in range(len(x)):
             moved = x.astype(np.complex128)
             moved[i] += 1e-20j
-            columns.append(_geometry(moved, b).imag / 1e-20)
+            columns.append(_geometry(moved, b, self.turning_speed_mps).imag / 1e-20)
         jacobian = np.column_stack(columns)
-        return Geometry(_geometry(x.astype(np.complex128), b).real, jacobian @ self.fit.covariance @ jacobian.T)
+        values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
+        covariance = jacobian @ self.fit.covariance @ jacobian.T
+        # at one speed, positions that lag look like an antenna further back
+        covariance[2, 2] += (self.turning_speed_mps * RESPONSE_STD_S) ** 2
+        return Geometry(values, covariance)
 
 
-def _geometry(x: Complexes, b: float) -> Complexes:
+def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
     left, right = (x[K] + x[Q] / 2) / b, (x[K] - x[Q] / 2) / b
     y_right, y_left = (x[A] + x[M]) / 2 / left, -(x[A] - x[M]) / 2 / right
     width = y_right - y_left
-    return np.array([y_right, y_left, -x[C] * b / (2 * x[K]), left * width, right * width, width])
+    # sideways slip l v w of that speed displaces the centre as c does
+    sideways = x[C] + 2.0 * x[L] * speed / b
+    return np.array([y_right, y_left, -sideways * b / (2 * x[K]), left * width, right * width, width])
 
 
 def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
@@ -156,7 +170,13 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     except np.linalg.LinAlgError:
         # exact data on one circle: nothing separates the parameters
         return None
-    return AlignmentFit(fit, width_m, windows)
+    covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
+    covariance[TH, TH] += RESPONSE_STD_S**2
+    if not drive.same_clock:
+        covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
+    weight = drive.wheel_dt * model.u**2
+    speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
+    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed)
 
 
 class _Model:

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays
-from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.alignment.estimator import ATTITUDE_STD_RAD, ATTITUDE_TIME_S
+from icrtool.kernels.robust import huber_weights, long_run_factor, mad_std
 from icrtool.records.tables import Complexes, Floats, Ints
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ PSI, BIAS, SCALE, X, DELAY, OFFSET = range(6)
 COURSE, STANDING, ATTITUDE = range(3)
 HUBER_SIGMAS = 2.5
 SPIKE_SIGMAS = 8.0
+SETTLED_SIGMAS = 3.0
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD = 1.0, 12.0
 LONGEST_COURSE_S = 10.0
@@ -45,9 +47,6 @@ BIAS_WALKS = tuple(math.radians(rate) ** 2 for rate in (0.001, 0.01, 0.03, 0.1, 
 
 PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1, math.pi])
 STANDING_RATE_STD = math.radians(0.05)
-ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
-"""An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
-
 ATTITUDE_WALK = 2 * ATTITUDE_STD_RAD**2 / ATTITUDE_TIME_S
 DELAY_ROUNDS, LONG_DELAY_S = 3, 0.15
 """A delay of the fixes up to this is linear, and partly a robot's response to its wheels; a longer one takes rounds."""
@@ -276,7 +275,11 @@ def _choose(
             ((angle, bias) for angle in ANGLE_WALKS for bias in BIAS_WALKS),
             key=lambda one: run(events, one).log_likelihood(),
         )
-    return events, walks
+    # courses of windows that follow one another err alike, by slip that the model lacks
+    passes = run(events, walks)
+    z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
+    alike = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
+    return events._replace(r=np.where(course, events.r * alike, events.r)), walks
 
 
 class _Passes(NamedTuple):

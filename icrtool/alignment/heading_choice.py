@@ -10,6 +10,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, drive_arrays, fix_std_m
 from icrtool.alignment.gyro_heading import HeadingEstimate, TurnRate, estimate_heading, measure_courses
+from icrtool.alignment.heading_alignment import NOISY_SCATTER_RAD
 from icrtool.errors import DataError
 from icrtool.records.tables import Floats, GyroAxes, HeadingSamples, PositionFixes, RobotLog, StreamChoice
 
@@ -79,18 +80,21 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     drive = drive_arrays(log)
     epoch = int(log.wheels.stamp_ns[0])
     turns = [turn for turn in (_vertical_rate(drive, gyro, epoch) for gyro in log.gyros) if turn is not None]
-    turn, source, topic = _wheel_turn(drive, width_m), "wheels", "wheels"
-    if turns:
-        _, turn, topic = max(turns, key=lambda one: one[0])
-        source = "gyro"
     pairs = [pair for pair in (_baseline(log, other.fixes) for other in log.other_receivers) if pair is not None]
     pair = max(pairs, key=lambda one: one[0]) if pairs else None
-    found = estimate_heading(drive, turn, None if pair is None else pair[1], absolute_walk=0.0, stands=source == "gyro")
+    found, turn, source, topic = None, _wheel_turn(drive, width_m), "wheels", "wheels"
+    for _, rate, name in turns:
+        # of several units, the one that follows the courses best
+        one = estimate_heading(drive, rate, None if pair is None else pair[1], absolute_walk=0.0)
+        if one is not None and (found is None or _median_std(one) < _median_std(found)):
+            found, turn, source, topic = one, rate, "gyro", name
+    if found is None:
+        found = estimate_heading(drive, turn, None if pair is None else pair[1], absolute_walk=0.0, stands=False)
     if found is None:
         raise DataError(
             log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
         )
-    std = math.degrees(float(np.median(found.smoothed_std)))
+    std = math.degrees(_median_std(found))
     places = next((stream.topic for stream in log.streams if stream.role == "gnss"), "positions")
     if pair is not None:
         source, topic = "antennas", f"{log.other_receivers[0].topic} + {topic}"
@@ -131,6 +135,51 @@ def _samples(found: HeadingEstimate, epoch: int) -> tuple[HeadingSamples, Headin
         as_samples(found.causal, found.causal_std, slice(first, None)),
         as_samples(found.smoothed, found.smoothed_std, slice(None)),
     )
+
+
+def _median_std(found: HeadingEstimate) -> float:
+    return float(np.median(found.smoothed_std))
+
+
+def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:
+    """Return a log whose heading is a turn rate only, where it drifts and its rate gives a better one; else None.
+
+    An orientation without a magnetometer is an integrated gyro: its offset wanders with the bias.
+
+    Parameters
+    ----------
+    scatter_rad : of the heading about the course over ground
+    width_m : the track width b
+    """
+    if scatter_rad < NOISY_SCATTER_RAD:
+        return None
+    rate = rate_of_heading(log)
+    if rate is None:
+        return None
+    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    streams = tuple(one for one in log.streams if one.role != "heading")
+    note = (
+        f"{log.name}: the heading drifts ({math.degrees(scatter_rad):.0f}° about the course): only turn rates are used"
+    )
+    bare = replace(log, heading=nothing, gyros=(*log.gyros, rate), streams=streams, warnings=(*log.warnings, note))
+    try:
+        found = derive_heading(bare, width_m)
+    except DataError:
+        return None
+    std = _median_std(found.estimate)
+    return bare if found.source != "wheels" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
+
+
+def rate_of_heading(log: RobotLog) -> GyroAxes | None:
+    """Return the turn rate of the measured heading about a sensor's upward axis; None with too few samples."""
+    heading = log.heading
+    stamps, rows = np.unique(heading.stamp_ns, return_index=True)
+    if len(stamps) < 3:
+        return None
+    turned = np.diff(np.unwrap(heading.heading_rad)[rows])
+    rate = -turned / (np.diff(stamps) / 1e9)
+    topic = next((stream.topic for stream in log.streams if stream.role == "heading"), "heading")
+    return GyroAxes(topic, stamps[:-1] + np.diff(stamps) // 2, np.repeat(rate[:, None], 3, axis=1))
 
 
 def _wheel_turn(drive: DriveArrays, width_m: float) -> TurnRate:

@@ -11,7 +11,7 @@ from icrtool.records.tables import Datum
 
 LIKE_RAD = math.radians(1.0)
 """An offset is named after what it equals to within this: compasses in robots are no better. One that is not known
-that well, to three standard deviations, has no name."""
+that well has no name."""
 
 SMALLEST_NAME_RAD = math.radians(0.5)
 UTM_LATITUDES_DEG = (-80.0, 84.0)
@@ -54,7 +54,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
     datum : where; None: a metric reference, of which no north is known
     stamp_ns : when, Unix time
     """
-    if not 3.0 * sigma_rad <= LIKE_RAD:
+    if not sigma_rad <= LIKE_RAD:
         return NO_NAME
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
@@ -68,7 +68,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
             texts = [text for text in (turn_text, north_text) if text]
-            if away <= LIKE_RAD and texts:
+            if away <= max(LIKE_RAD, 2.0 * sigma_rad) and texts:
                 # The fewer causes, the likelier; then the nearer.
                 found.append((len(texts), away, " and ".join(texts)))
     return OffsetName(min(found)[2] if found else "", declination, convergence)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from icrtool.records.tables import RobotLog
 
-SIGNIFICANT_SIGMAS = 4.0
-SMALLEST_DELAY_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.08, 0.2, 0.04
-"""A robot answers its wheels late, by 0.1 s on rigid-body simulated robots: a stream that leads by as much needs no
-correction, one that lags does."""
+SIGNIFICANT_SIGMAS = 2.5
+SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.06
+"""A robot answers its wheels late by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
+stream that leads by little is more often a response that the model lacks than a clock."""
 
 
 class Delay(NamedTuple):
@@ -24,7 +24,7 @@ class Delay(NamedTuple):
     def is_clear(self) -> bool:
         """Whether it is certain and large enough to be corrected."""
         certain = self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
-        return certain and (self.value_s > SMALLEST_DELAY_S or self.value_s < -SMALLEST_LEAD_S)
+        return certain and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
 
 
 UNKNOWN = Delay(math.nan, math.nan)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.config import Config
+from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import (
     FilterSetup,
     ProcessNoise,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,9 @@ SETTLED_S = 2.0
 
 SMALLEST_CHANGE_M = 0.03
 """An ICR whose estimate moved less than this from its start has no convergence to time."""
+
+SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
+"""Chords of the driven path are at least this long, and so many standard deviations of the position."""
 
 MOST_LISTED = 50
 """Jumps of the position that run.json lists."""
@@ -238,13 +242,43 @@ def path_speed(table: States) -> Floats:
 
 
 def drive_summary(table: States) -> dict[str, float]:
-    """Return duration, distance, and mean and standard deviation of the speed over time."""
+    """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
+
+    Notes
+    -----
+    The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
+    parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
+    follows the model's.
+    """
     weight = np.diff(table.t_s)
-    duration, distance = float(table.t_s[-1]), float(table.distance_m[-1])
+    duration = float(table.t_s[-1])
+    noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
+    rows, chords = _chords(table, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
+    distance = float(chords.sum())
+    modelled = np.diff(table.distance_m[rows])
+    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=modelled > 0)
+    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows))
     mean = distance / duration if duration > 0 else 0.0
-    deviation = np.nan_to_num(path_speed(table)) - mean
-    spread = float(np.sqrt(np.average(deviation**2, weights=weight))) if duration > 0 else 0.0
+    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=weight))) if duration > 0 else 0.0
     return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
+
+
+def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
+    """Return rows of states (c + 1,), first and last included, at least a step apart, and the chords between (c,) [m].
+
+    The last chord may be shorter than a step; it counts for nothing then.
+    """
+    north, east, last = table.north_m.tolist(), table.east_m.tolist(), len(table) - 1
+    rows, chords = [0], []
+    for k in range(1, last + 1):
+        chord = math.hypot(north[k] - north[rows[-1]], east[k] - east[rows[-1]])
+        if chord >= step_m:
+            rows.append(k)
+            chords.append(chord)
+    if rows[-1] != last:
+        rows.append(last)
+        chords.append(0.0)
+    return np.array(rows, np.int64), np.array(chords, np.float64)
 
 
 def icr_summary(

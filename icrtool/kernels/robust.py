@@ -30,6 +30,9 @@ SETTLED = 0.03
 
 MOST_HALVINGS = 6
 
+FEWEST_BLOCKS, LARGEST_CORRELATION = 8, 0.9
+"""A correlation between neighbours is estimated from at least so many, and believed up to this."""
+
 
 def mad_std(values: Floats, centre: float | None = None) -> float:
     """Return the robust standard deviation of values (m,): 1.4826 times their median absolute deviation.
@@ -205,6 +208,56 @@ def sandwich_covariance(
     grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
     covariance: Floats = sandwich * np.outer(grown, grown)
     return (covariance + covariance.T) / 2.0, information, count
+
+
+def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: float = 1.0) -> Floats:
+    """Return the covariance (k, k) of a robust fit whose residuals stay correlated beyond a group.
+
+    Parameters
+    ----------
+    group : (m,) stretches in their order; pull : (k,) information of the prior
+
+    Notes
+    -----
+    The influence of the groups on each parameter is a series in order of distance; `long_run_factor` applies to it.
+    """
+    order = np.argsort(group, kind="stable")
+    z, slopes = fit.residuals / fit.scale, fit.jacobian / fit.scale[:, None]
+    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
+    gradients = np.add.reduceat((slopes * (soft_l1_weights(z) / overlap * z)[:, None])[order], first)
+    inverse = np.linalg.solve(fit.information, np.eye(len(pull)))
+    series = gradients @ inverse
+    of_prior = np.einsum("ij,j,ij->i", inverse, pull, inverse)
+    square = (series**2).sum(axis=0)
+    data = np.diag(fit.covariance)
+    known = data > 0.0
+    grown = np.ones(len(pull))
+    grown[known] = np.maximum(1.0, ((square * long_run_factor(series) + of_prior)[known] / data[known]))
+    size = np.sqrt(grown)
+    return np.asarray(fit.covariance * np.outer(size, size), np.float64)
+
+
+def long_run_factor(series: Floats) -> Floats:
+    """Return by how much the variance of a sum exceeds the sum of squares (k,), for correlated series (n, k).
+
+    Parameters
+    ----------
+    series : in order, about zero
+
+    Notes
+    -----
+    (1 + rho) / (1 - rho) of a first-order correlation rho (Andrews and Monahan 1992), with Kendall's (1954) correction
+    for few values; of single values and of sums of 2, 4, ... of them, the largest.
+    """
+    total = np.maximum((series**2).sum(axis=0), 1e-300)
+    factor = np.ones(series.shape[1])
+    while (count := len(series)) >= FEWEST_BLOCKS:
+        square = np.maximum((series**2).sum(axis=0), 1e-300)
+        rho = (series[1:] * series[:-1]).sum(axis=0) / square
+        rho = np.clip(rho + (1.0 + 3.0 * rho) / count, 0.0, LARGEST_CORRELATION)
+        factor = np.maximum(factor, square / total * (1.0 + rho) / (1.0 - rho))
+        series = series[: count // 2 * 2].reshape(count // 2, 2, -1).sum(axis=1)
+    return factor
 
 
 def _cost(z: Floats, overlap: float, pull: Floats, away: Floats) -> float:

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import icrtool
+from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.drive_windows import drive_arrays
 from icrtool.alignment.gyro_heading import TurnRate, estimate_heading
 from icrtool.alignment.heading_choice import derive_heading
 from icrtool.kernels.heading_kalman import HeadingEvents, filter_headings, smooth_headings
 from icrtool.records.tables import GyroAxes, HeadingSamples, OtherReceiver, RobotLog
-from support.exact_drives import simulate
+from support.exact_drives import CONFIG, simulate
 
 LARGEST_RMS_DEG = 0.3
 WIDTH_M = 0.6
@@ -123,3 +124,27 @@ def test_physics_logs_without_an_attitude_sensor_give_the_true_heading(shared_lo
 
 
 ROBOTS = {"tracked_gyro.bag": "pentzer-tracked", "wheeled_two_antennas": "segway-rmp400"}
+
+
+def test_of_several_units_the_one_that_agrees_with_the_courses_is_used() -> None:
+    log, truth = without_heading(2)
+    good = log.gyros[0]
+    rng = np.random.default_rng(6)
+    loose = GyroAxes("/loose", good.stamp_ns, good.rates_radps + rng.normal(0.0, 0.5, good.rates_radps.shape))
+    dead = GyroAxes("/dead", good.stamp_ns, np.zeros_like(good.rates_radps))
+    found = derive_heading(replace(log, gyros=(dead, loose, good)), WIDTH_M)
+    assert found.topic.startswith(good.topic)
+    assert math.sqrt((error_deg(found.smoothed, truth) ** 2).mean()) < LARGEST_RMS_DEG
+
+
+def test_an_orientation_that_drifts_is_used_as_a_turn_rate() -> None:
+    """Truth: the heading before a bias of 0.5 deg/s was added to it."""
+    log = simulate(3, lever=(0.0, 0.0), offset_deg=0.0, scales=(1.0, 1.0), seconds=160.0, heading_std_deg=0.1)
+    psi, stamps = np.unwrap(log.heading.heading_rad), log.heading.stamp_ns
+    drifting = psi + math.radians(0.5) * (stamps - stamps[0]) / 1e9
+    spoilt = replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * drifting))))
+    found = align_streams(spoilt, CONFIG)
+    assert found.source == "gyro"
+    assert found.derived is not None
+    assert any("drifts" in warning for warning in found.log.warnings)
+    assert math.sqrt((error_deg(found.derived.smoothed, (stamps, psi)) ** 2).mean()) < 1.0

@@ -102,6 +102,17 @@ def test_a_configured_heading_offset_is_used_as_it_is() -> None:
     assert not any("off the course" in warning for warning in run.warnings)
 
 
+def test_the_distance_is_that_of_the_positions_where_wheels_spin_in_place() -> None:
+    log = make_log(seconds=60.0)
+    wheels = log.wheels
+    spinning = np.abs((wheels.stamp_ns - wheels.stamp_ns[0]) / 1e9 - 30.0) < 4.0
+    spoilt = WheelSamples(wheels.stamp_ns, wheels.left + 1.5 * spinning, wheels.right + 1.5 * spinning)
+    clean, slipped = (fit(one, load_config()) for one in (log, replace(log, wheels=spoilt)))
+    distance = clean.summary["drive"]["distance_m"]
+    assert distance == pytest.approx(float(clean.table.distance_m[-1]), rel=0.03)
+    assert slipped.summary["drive"]["distance_m"] == pytest.approx(distance, rel=0.05)
+
+
 def test_a_clean_log_gives_no_warning() -> None:
     assert fit(make_log(), load_config(sets=[WIDTH])).warnings == ()
 

@@ -14,6 +14,7 @@ from icrtool.kernels.robust import (
     Floats,
     RobustFit,
     huber_weights,
+    long_run_factor,
     mad_std,
     robust_least_squares,
     soft_l1_weights,
@@ -108,3 +109,18 @@ def test_the_covariance_holds_where_members_of_a_group_repeat_one_another(member
         found = fitted((t, y), group=group, overlap=members)
         inside += int(np.count_nonzero(np.abs(found.x - TRUTH) < 2.0 * found.std))
     assert 0.90 < inside / (2 * seeds) < 0.99
+
+
+def test_the_long_run_factor_gives_the_spread_of_the_mean_of_correlated_values() -> None:
+    """Witness: the spread of the sums of many series of the same first-order process."""
+    rng, rho, count = np.random.default_rng(3), 0.7, 60
+    pushes = rng.normal(size=(4000, count + 100))
+    series = np.zeros_like(pushes)
+    for k in range(1, pushes.shape[1]):
+        series[:, k] = rho * series[:, k - 1] + pushes[:, k]
+    series = series[:, 100:]
+    true = series.sum(axis=1).var() / (series**2).sum(axis=1).mean()
+    found = np.median([long_run_factor(one[:, None])[0] for one in series[:300]])
+    assert 0.8 * true < found < 2.0 * true
+    white = np.median([long_run_factor(rng.normal(size=(count, 1)))[0] for _ in range(300)])
+    assert 1.0 <= white < 1.6
