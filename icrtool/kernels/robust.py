@@ -31,7 +31,7 @@ SETTLED = 0.03
 MOST_HALVINGS = 6
 
 FEWEST_BLOCKS, LARGEST_CORRELATION = 8, 0.9
-"""A correlation between neighbours is estimated from at least so many, and believed up to this."""
+"""A correlation between neighbours is estimated from at least so many, and limited to this."""
 
 
 def mad_std(values: Floats, centre: float | None = None) -> float:
@@ -222,9 +222,9 @@ def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: fl
     The influence of the groups on each parameter is a series in order of distance; `long_run_factor` applies to it.
     """
     order = np.argsort(group, kind="stable")
-    z, slopes = fit.residuals / fit.scale, fit.jacobian / fit.scale[:, None]
+    z, jacobian = fit.residuals / fit.scale, fit.jacobian / fit.scale[:, None]
     first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
-    gradients = np.add.reduceat((slopes * (soft_l1_weights(z) / overlap * z)[:, None])[order], first)
+    gradients = np.add.reduceat((jacobian * (soft_l1_weights(z) / overlap * z)[:, None])[order], first)
     inverse = np.linalg.solve(fit.information, np.eye(len(pull)))
     series = gradients @ inverse
     of_prior = np.einsum("ij,j,ij->i", inverse, pull, inverse)

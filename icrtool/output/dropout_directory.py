@@ -152,7 +152,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "reference_error": _reference_documents(report),
         "by_learning": _learned_document(report),
         "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
-        "recommended": report.calibration.summary() if report.calibration is not None else None,
+        "recommended": _recommended_document(report),
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
         "ladder": ladder_document(report.comparison)
@@ -198,6 +198,13 @@ WORST_COLUMNS = (
     "speed_mean_mps",
     *(f"{model}_error_m" for model in ERROR_COLUMNS),
 )
+
+
+def _recommended_document(report: DropoutReport) -> dict[str, Any] | None:
+    """Return the calibration that the run itself recommends, without when it was made: the same run, the same file."""
+    if report.calibration is None:
+        return None
+    return {key: value for key, value in report.calibration.summary().items() if key != "created"}
 
 
 def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any]:
