@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.calibration.calibrate import NAMES, PRIOR_STD, Estimate, WindowResiduals, estimate
 from icrtool.calibration.evidence import DriveFacts
 from icrtool.config import Config
@@ -161,6 +162,7 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
         Too short a drive, or streams that cannot be used together.
     """
     config = config if config is not None else Config()
+    log = with_wheel_speeds(log, config)
     aligned = align_streams(log, config)
     checked = aligned.wheels
     found = estimate(aligned.as_named, config)
