@@ -179,10 +179,9 @@ def test_the_readmes_errors_are_those_of_the_sample_log(readme_session: dict[str
 
 
 def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
-    run = readme_session["run"]
-    last = run.states.iloc[-1]
+    icr = readme_session["run"].summary["icr"]
     rows = dict(row[:2] for row in readme_table("ICR"))
     for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x", "x_icr_m")):
-        assert rows[label] == f"{last[column]:+.3f} ± {last['std_' + column]:.3f} m"
-    width = last["y_icr_right_m"] - last["y_icr_left_m"]
-    assert rows["multiplier"] == f"{width / readme_session['config'].robot.track_width_m:.2f}"
+        assert rows[label] == f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f} m"
+    multiplier, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
+    assert rows["multiplier"] == f"{multiplier:.2f} ± {std:.2f}"
