@@ -28,6 +28,10 @@ UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
 
 
+MOST_WHEEL_SAMPLES = 100_000
+"""The samples of a longer drive are joined to about so many: 1 h at 28 Hz, where windows last seconds."""
+
+
 class DriveArrays(NamedTuple):
     """A log in seconds since its first wheel sample.
 
@@ -84,13 +88,32 @@ def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveA
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
     )
     dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
-    step = dt * (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps)) / 2
+    wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
+    step = dt * (np.abs(left) + np.abs(right)) / 2
     topics = {stream.role: stream.topic for stream in log.streams}
     return DriveArrays(
-        wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps, heading_t, np.unwrap(heading.heading_rad),
+        wheel_t, dt, left, right, heading_t, np.unwrap(heading.heading_rad),
         fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
         fix_std_m(gnss), "gnss" in topics and topics["gnss"] == topics.get("heading", ""),
     )  # fmt: skip
+
+
+def _joined(t: Floats, dt: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return times, intervals and speeds with neighbouring samples of a long drive joined; distances are the same.
+
+    Gaps (`dt` 0) stay samples of their own.
+    """
+    every = -(-len(t) // MOST_WHEEL_SAMPLES)
+    if every < 2:
+        return t, dt, left, right
+    gaps = np.flatnonzero(dt[:-1] == 0.0)
+    first = np.unique(np.concatenate([np.arange(0, len(t), every), gaps, gaps + 1, [len(t) - 1]]))
+    joined = np.add.reduceat(dt, first)
+    speeds = []
+    for speed in (left, right):
+        distance = np.add.reduceat(dt * speed, first)
+        speeds.append(np.divide(distance, joined, out=speed[first].copy(), where=joined > 0.0))
+    return t[first], joined, speeds[0], speeds[1]
 
 
 def fix_std_m(gnss: PositionFixes) -> float:
