@@ -101,7 +101,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     words = {
         "antennas": f"two antennas {0.0 if pair is None else pair[0]:.2f} m apart, turn rate and course over ground",
         "gyro": f"turn rate and course over ground, bias {math.degrees(found.constants[1]):+.2f} deg/s at the end",
-        "wheels": "course over ground and wheels: no inertial unit in the log",
+        "wheels": "course over ground and wheels: no usable turn rate in the log",
     }
     why = f"{words[source]}, σ {std:.2f}°"
     if source == "wheels":

@@ -149,10 +149,11 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         long = last - first >= FEWEST_INTERVALS
         windows = compare(knots, motion, first[long], last[long], RESPONSE_STD_S)
         error = _model_error(windows, quiet, quantile)
+        # while the robot parks, sensors without noise leave no variance to divide by
+        windows = windows.rows(windows.path_m > TURNING_MPS * duration)
         square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
         missed = np.abs(windows.residual).max(axis=1)
         shows = (square > LEAST_DISTANCE2) & (missed > LEAST_SHARE * windows.path_m)
-        shows &= windows.path_m > TURNING_MPS * duration
         windows, square = windows.rows(shows), square[shows]
         begin.append(windows.begin)
         end.append(windows.end)

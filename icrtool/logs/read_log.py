@@ -184,7 +184,9 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
-    if source is not None and source.note:
+    if source is None:
+        warnings += [f"{name}: {one.topic} gives no heading: {one.problem}" for one in found.heading]
+    elif source.note:
         warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
     quantity = "position" if samples.from_position else "speed"

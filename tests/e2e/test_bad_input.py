@@ -20,6 +20,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
+from icrtool.config import load_config
+from icrtool.estimation.fit import fit
+from icrtool.logs import read_log
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
@@ -300,14 +303,17 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "topics with line breaks": (topics_with_line_breaks, r"/x\nError: forged\n"),
     "no wheels": (made(lambda columns: without(columns, "wheel")), "no wheels"),
     "no GNSS": (made(lambda columns: without(columns, "gnss")), "no position"),
-    "no heading": (made(lambda columns: without(columns, "heading")), "no heading"),
+    "no heading and no distance": (lambda folder: [str(log(folder, without(drive(1.5), "heading")))], "no heading"),
+    "no orientation for the paper's filter": (
+        lambda folder: [str(log(folder, without(drive(), "heading"))), "--set", "filter.preset=paper"],
+        "orientation",
+    ),
     "nothing at all": (made(lambda columns: without(columns, "wheel", "gnss", "heading")), "no topic at all"),
     "no position is a number": (edited(latitude_deg=np.full(FIXES, np.nan)), "no usable fix"),
     "no position is infinite": (edited(longitude_deg=np.full(FIXES, np.inf)), "no usable fix"),
     "no fix ever": (edited(gnss_status=np.full(FIXES, -1)), "no usable fix"),
     "nowhere on earth": (edited(latitude_deg=np.full(FIXES, 4711.0)), "no usable fix"),
     "at zero, zero": (edited(latitude_deg=np.zeros(FIXES), longitude_deg=np.zeros(FIXES)), "no usable fix"),
-    "no heading is a number": (edited(heading_rad=np.full(SAMPLES, np.nan)), "no valid quaternion"),
     "no wheel speed is a number": (
         edited(
             wheel_v_left_mps=np.full(SAMPLES, np.nan),
@@ -358,6 +364,8 @@ RUNS: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "zero in every header": (zero_stamps, "of the header stamps are 0; log time is used"),
     "stamps that go back": (stamps_going_back, "go back"),
     "duplicated stamps": (duplicated_stamps, "share a stamp"),
+    "no heading": (made(lambda columns: without(columns, "heading")), "the heading is estimated: "),
+    "no heading is a number": (edited(heading_rad=np.full(SAMPLES, np.nan)), "no valid quaternion"),
     "joints named for a twist": (joints_of_a_twist, "drive: wheels.left_joints is not used: "),
     "a name that is no UTF-8": (
         lambda folder: [shutil.move(log(folder), os.fsdecode(bytes(folder) + b"/\xff.mcap"))],
@@ -462,6 +470,19 @@ def test_what_survives_is_used_and_what_was_lost_is_a_warning(run, case):
     new = set(found.after) - set(found.before)
     assert {Path(name).parts[0] for name in new} == {"icrtool-runs"}
     assert {"run.json", "states.csv"} <= {Path(name).name for name in new}
+
+
+@pytest.mark.parametrize(("turning", "source"), [(False, "wheels"), (True, "gyro")])
+def test_a_heading_that_is_no_number_is_made_of_the_next_best(tmp_path, turning, source):
+    """A constant turn rate is that of a gyro that is stuck."""
+    columns = replace(drive(), heading_rad=np.full(SAMPLES, np.nan))
+    if turning:
+        noise = np.random.default_rng(0).normal(0, 1e-3, SAMPLES)
+        columns = replace(columns, yaw_rate_radps=columns.yaw_rate_radps + noise)
+    config = load_config(sets=[one for one in ROBOT if one != "--set"])
+    heading = fit(read_log(log(tmp_path, columns), config), config).summary["heading"]
+    assert heading["source"] == source
+    assert 0.0 < heading["offset_std_deg"] < 10.0
 
 
 @pytest.mark.parametrize("options", [{}, {"container": "db3", "compression": "zstd-file"}], ids=["mcap", "db3.zstd"])

@@ -52,7 +52,6 @@ EVERY_OPTION = [
     ("--path", "lawnmower", "--leg", 5),
     ("--path", "figure-eight"),
     ("--path", "spins"),
-    ("--path", "straight"),
     ("--icrs", "0.5,-0.75,-0.25"),
     ("--change", "20:0.45,-0.34,0.03"),
     ("--duration", 30),
@@ -81,6 +80,16 @@ EVERY_OPTION = [
 def test_every_option_reads_back_to_the_icrs_it_was_made_with(tmp_path: Path, options: tuple[object, ...]) -> None:
     duration = () if "--duration" in options else ("--duration", 60)
     assert_found(*round_trip(tmp_path, *duration, *options))
+
+
+def test_a_straight_drive_shows_no_icr_and_its_sigma_covers_the_truth(tmp_path: Path) -> None:
+    run, truth = round_trip(tmp_path, "--path", "straight", "--duration", 60)
+    icr, last = run.summary["icr"], run.states.iloc[-1]
+    assert not run.summary["usable"]
+    for name in ICRS:
+        assert icr["final"][name] is None
+        assert icr["final_std"][name] is None
+        assert abs(last[name] - truth[name].iloc[-1]) < SIGMAS * last[f"std_{name}"]
 
 
 def test_an_antenna_off_centre_is_read_back_when_its_place_is_told(tmp_path: Path) -> None:

@@ -244,8 +244,8 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
 def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float, real_m: float, words: str) -> None:
     log = replace(make_log(3, seconds=60.0, gnss_std=real_m), datum=clean().datum)
     count = len(log.gnss.stamp_ns)
-    said, told_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
-    log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, told_class=told_class))
+    said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
     quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
     assert quality.warnings == (f"made: {words}",)
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
@@ -268,7 +268,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> 
     log, float_ = lose_rtk(clean(), at_once=True)
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
-    log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, told_class=told))
+    log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
     quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
     assert quality.sold.any()
     assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
