@@ -89,10 +89,11 @@ def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveA
     )
     dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
     wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
+    heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad))
     step = dt * (np.abs(left) + np.abs(right)) / 2
     topics = {stream.role: stream.topic for stream in log.streams}
     return DriveArrays(
-        wheel_t, dt, left, right, heading_t, np.unwrap(heading.heading_rad),
+        wheel_t, dt, left, right, heading_t, angle,
         fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
         fix_std_m(gnss), "gnss" in topics and topics["gnss"] == topics.get("heading", ""),
     )  # fmt: skip
@@ -114,6 +115,16 @@ def _joined(t: Floats, dt: Floats, left: Floats, right: Floats) -> tuple[Floats,
         distance = np.add.reduceat(dt * speed, first)
         speeds.append(np.divide(distance, joined, out=speed[first].copy(), where=joined > 0.0))
     return t[first], joined, speeds[0], speeds[1]
+
+
+def _averaged(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Return times and unwrapped headings of a long drive, neighbours averaged: a delay then moves no single noise."""
+    every = -(-len(t) // MOST_WHEEL_SAMPLES)
+    if every < 2:
+        return t, angle
+    first = np.arange(0, len(t), every)
+    count = np.diff(first, append=len(t))
+    return np.add.reduceat(t, first) / count, np.add.reduceat(angle, first) / count
 
 
 def fix_std_m(gnss: PositionFixes) -> float:
