@@ -124,7 +124,8 @@ def _meets(begin_s: Floats, length_s: float, from_s: Floats, to_s: Floats) -> Bo
 def _spaced(run: Run, length_s: float) -> list[float]:
     """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
 
-    Time from which an outage would reach into one of the log's own, or into a gap in the wheel data, is none to begin in.
+    Time from which an outage would reach into one of the log's own, or into a gap in the wheel data, is not one to
+    begin in.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
     moves = ~standing_states(drive_of(run))[:-1]
