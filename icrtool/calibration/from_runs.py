@@ -56,7 +56,10 @@ def robot_of(run: Run) -> dict[str, Any]:
 
 def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
     """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
-    warnings = list(run.summary["excitation"]["sentences"]) if alone else []
+    warnings: list[str] = []
+    if alone:
+        warnings += [] if run.usable else [f"not usable: {run.summary['unusable_because']}"]
+        warnings += run.summary["excitation"]["sentences"]
     stream = next((one for one in run.summary["streams"] if one["role"] == "wheels"), None)
     if stream is not None and "Odometry" in stream["message_type"]:
         warnings.append(

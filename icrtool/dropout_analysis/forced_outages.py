@@ -110,21 +110,28 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
 
 def _in_real_outage(run: Run, begin_s: Floats, length_s: float) -> Bools:
     """Return which outages of a length, by their begins (k,) [s], share time with one that the log has itself."""
-    origin = int(run.table.stamp_ns[0])
-    shared = np.zeros(len(begin_s), np.bool_)
-    for begin, end in (run.outages_ns - origin) / 1e9:
-        shared |= (begin_s < end) & (begin_s + length_s > begin)
-    return shared
+    own: Floats = (run.outages_ns - int(run.table.stamp_ns[0])) / 1e9
+    return _meets(begin_s, length_s, own[:, 0], own[:, 1])
+
+
+def _meets(begin_s: Floats, length_s: float, from_s: Floats, to_s: Floats) -> Bools:
+    """Return which outages of a length, by their begins (k,) [s], share time with one of the ordered spans (m,) [s]."""
+    following = np.searchsorted(to_s, begin_s, side="right")
+    meets: Bools = np.append(from_s, np.inf)[following] < begin_s + length_s
+    return meets
 
 
 def _spaced(run: Run, length_s: float) -> list[float]:
     """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
 
-    Time from which an outage would reach into one of the log's own is none to begin in.
+    Time from which an outage would reach into one of the log's own, or into a gap in the wheel data, is not one to
+    begin in.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
     moves = ~standing_states(drive_of(run))[:-1]
     moves &= ~_in_real_outage(run, t[:-1], length_s)
+    gaps = np.flatnonzero(run.in_gap)
+    moves &= ~_meets(t[:-1], length_s, t[gaps], t[gaps + 1])
     moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
     before = float(np.interp(min(run.settled_s, last / 4), t, moved))
     rest = float(moved[-1]) - before

@@ -26,12 +26,17 @@ BAD_FIXES = 4
 
 
 def simulate(
-    *, duration_s: float = 60.0, speed_mps: float = 0.8, datum: bool = True, troubles: bool = True
+    *,
+    duration_s: float = 60.0,
+    speed_mps: float = 0.8,
+    turn_mps: float = 0.25,
+    datum: bool = True,
+    troubles: bool = True,
 ) -> RobotLog:
     rng = np.random.default_rng(7)
     n = int(duration_s * RATE_HZ)
     t, dt = np.arange(n) / RATE_HZ, 1 / RATE_HZ
-    turn = 0.25 * np.sin(2 * np.pi * t / 20) * (speed_mps > 0)
+    turn = turn_mps * np.sin(2 * np.pi * t / 20) * (speed_mps > 0)
     v_left, v_right = speed_mps + turn, speed_mps - turn
     y_right, y_left, x = ICRS_M
     omega = (v_left - v_right) / (y_right - y_left)

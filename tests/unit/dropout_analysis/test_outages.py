@@ -70,6 +70,16 @@ def test_no_outage_reaches_into_one_of_the_logs_own(run: Run) -> None:
         plan_outages(run, 2.0, (own_begin - 1.0,))
 
 
+@pytest.mark.parametrize("length_s", [1.0, 2.0, 3.0])
+def test_no_spaced_outage_reaches_into_a_gap_in_the_wheel_data(run: Run, length_s: float) -> None:
+    (gap,) = np.flatnonzero(run.in_gap)
+    begin_s, end_s = run.table.t_s[[gap, gap + 1]]
+    spans = plan_outages(run, length_s)
+    assert len(spans) > 3
+    assert all(end <= begin_s + 0.03 or begin >= end_s for begin, end in seconds(run, spans))
+    assert len(force_outages(run, spans)) == len(spans)
+
+
 def test_an_outage_that_takes_nothing_away_is_refused(clean: Run) -> None:
     for length, begin in ((5.0, 0.0), (1e-6, 20.0)):
         with pytest.raises(ConfigError, match="fewer than two states"):

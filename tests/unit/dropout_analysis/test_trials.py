@@ -26,6 +26,9 @@ EQUAL_M = 1e-9
 
 HORIZONS_M = (0.5, 1.0, 3.0, 10.0)
 
+PARKED = {"speed_mps": 0.008, "turn_mps": 0.0, "troubles": False}
+"""Below what counts as motion, and not refused as a robot that never moved."""
+
 
 def gathered(run, horizons_m=HORIZONS_M, **options):
     """All single errors by model and horizon."""
@@ -254,7 +257,7 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
     limit = settled + 0.1 * (stds[:, 0] - settled)
     assert (stds[:, row] <= limit).all()
     assert (stds[:, :row] > limit[:, None]).any(axis=0).all()
-    assert first_learned(make_run(duration_s=20.0, speed_mps=0.0, troubles=False)) is None
+    assert first_learned(make_run(duration_s=20.0, turn_mps=0.0, troubles=False)) is None
     known = {f"std_{name}": np.full(len(run.table), 0.02) for name in ICR_COLUMNS}
     assert first_learned(changed(run, **known)) == 0
     assert first_learned(changed(run, **{name: 10 * std for name, std in known.items()})) is None
@@ -265,8 +268,7 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
 
 def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
     assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
-    run = make_run(duration_s=20.0, speed_mps=0.01, troubles=False)
-    parked = replace(run, table=replace(run.table, distance_m=0.0 * run.table.distance_m))
+    parked = make_run(duration_s=20.0, **PARKED)
     assert dropout(parked, [1.0]).standing == len(parked.table) - 1
 
 

@@ -129,8 +129,7 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
 
 
 def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:
-    run = make_run(duration_s=20.0, speed_mps=0.01, troubles=False, track_width_m=None)
-    parked = replace(run, table=replace(run.table, distance_m=0.0 * run.table.distance_m))
+    parked = make_run(duration_s=20.0, speed_mps=0.008, turn_mps=0.0, troubles=False, track_width_m=None)
     text = format_dropout(content_of(parked, [5.0]))
     assert "no budget can be evaluated" in text
     assert "robot.track_width_m is not known" in text

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import odometry
 from icrtool.output.figures.run_figures import FIGURES
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.records.run import Run
+from support.barn import configured, simulate
 
 BAD_FIXES = 4
 CELL = 1 / 700
@@ -49,7 +52,7 @@ def test_every_axis_has_a_name_and_a_unit(name: str, run: Run) -> None:
     [
         {},
         {"troubles": False, "track_width_m": None, "datum": False},
-        {"speed_mps": 0.01, "duration_s": 20.0},
+        {"speed_mps": 0.008, "turn_mps": 0.0, "duration_s": 20.0},
         {"duration_s": 1.0, "troubles": False},
         {"duration_s": 700.0},
     ],
@@ -130,7 +133,25 @@ def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., Run
     assert any(text.endswith("(out of view)") for text in legend_texts(figure))
 
 
-def test_icr_estimates_show_bands_rises_and_outage(run: Run) -> None:
+def test_icr_estimates_show_bands_and_outage(run: Run) -> None:
+    figure = drawn("icr_estimates", run)
+    assert legend_texts(figure) == ["estimate", "±2σ", "no slip (±b/2, 0)", "no usable GNSS"]
+    # the alignment starts the filter where this drive has its ICRs
+    rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
+    assert rises == ["hardly moved from its start"] * 3
+    finals = [axes.get_title(loc="right") for axes in figure.axes if axes.get_title(loc="right")]
+    assert finals[1].startswith("final −0.6")
+    assert [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] == [
+        "ICR y right [m]", "ICR y left [m]", "ICR x [m]",
+    ]  # fmt: skip
+
+
+def test_icr_estimates_from_a_given_start_show_their_rises() -> None:
+    config = configured()
+    far = replace(
+        config.filter, initial_y_icr_right_m=1.2, initial_y_icr_left_m=-1.2, initial_x_icr_m=0.5, initial_icr_std_m=1.0
+    )
+    run = fit(simulate(), replace(config, filter=far))
     figure = drawn("icr_estimates", run)
     texts = legend_texts(figure)
     assert texts == ["estimate", "±2σ", "10 %", "90 % of the change", "no slip (±b/2, 0)", "no usable GNSS"]
@@ -139,11 +160,6 @@ def test_icr_estimates_show_bands_rises_and_outage(run: Run) -> None:
     assert rises == [
         f"10–90 % in {convergence[column]:.1f} s" for column in ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
     ]
-    finals = [axes.get_title(loc="right") for axes in figure.axes if axes.get_title(loc="right")]
-    assert finals[1].startswith("final −0.6")
-    assert [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] == [
-        "ICR y right [m]", "ICR y left [m]", "ICR x [m]",
-    ]  # fmt: skip
 
 
 def test_icr_clusters_add_up_to_all_of_the_time(run: Run) -> None:
