@@ -139,7 +139,8 @@ def _expected(steps: Windows, shares: Floats, rows: slice) -> Floats:
 def _evidence(steps: Windows, error: Floats, shares: Floats, rows: slice) -> Floats:
     """Return the log likelihood ratio of steps (k,): missing these shares over missing none; bounded."""
     seen = steps.residual_of(rows)
-    variance = steps.sensor[rows] + (error * steps.path_m[rows, None]) ** 2
+    # while the robot parks, sensors without noise leave no variance, and nothing is expected
+    variance = np.maximum(steps.sensor[rows] + (error * steps.path_m[rows, None]) ** 2, np.finfo(np.float64).tiny)
     ratio = ((seen**2 - (seen - _expected(steps, shares, rows)) ** 2) / (2 * variance)).sum(axis=1)
     return np.asarray(np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE))
 

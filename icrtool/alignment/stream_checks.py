@@ -1,4 +1,4 @@
-"""The door of the analysis: whether the streams of a log can be used together at all."""
+"""Whether the streams of a log can be used together at all."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from icrtool.errors import DataError
 from icrtool.records.tables import RobotLog
 
 IMPOSSIBLE_MPS = 1e6
-"""A wheel speed from here on is a broken value: its way is longer than can be cut into windows."""
+"""A wheel speed from here on is a broken value: its distance is more than can be cut into windows."""
 
 
 def check_streams(log: RobotLog) -> None:
@@ -22,6 +22,8 @@ def check_streams(log: RobotLog) -> None:
         program may.
     """
     needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
+    if not len(log.heading.stamp_ns):
+        raise DataError(log.name, "no orientation in it", "use preset field, which estimates the heading")
     for what, stamps in needed.items():
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")

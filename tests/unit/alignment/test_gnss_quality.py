@@ -264,7 +264,7 @@ def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     )
 
 
-def test_fixes_that_only_say_that_they_are_fixed_are_sold_without_a_number() -> None:
+def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_number() -> None:
     log, float_ = lose_rtk(clean(), at_once=True)
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)

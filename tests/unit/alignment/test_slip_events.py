@@ -91,6 +91,44 @@ def test_a_robot_that_is_held_is_found_with_begin_and_end(fix_hz: int, gyro: boo
     assert event.distance_m < 0.2
 
 
+def after_parking(sensors: SensorData, seconds: float = 300.0) -> SensorData:
+    """Let the robot park first, its heading without noise, as units hold it while nothing turns."""
+    parked = START_NS + np.rint(np.arange(seconds * RATE_HZ) / RATE_HZ * 1e9).astype(np.int64)
+    later, n, rng = round(seconds * 1e9), len(parked), np.random.default_rng(9)
+    wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
+    m, still = len(parked[::5]), np.zeros(n)
+
+    def joined(first: Floats, then: Floats) -> Floats:
+        return np.concatenate([first, then])
+
+    return replace(
+        sensors,
+        wheels=WheelSamples(
+            np.concatenate([parked, wheels.stamp_ns + later]),
+            joined(still, wheels.v_left_mps), joined(still, wheels.v_right_mps),
+        ),
+        fixes=Fixes(
+            np.concatenate([parked[::5], fixes.stamp_ns + later]),
+            joined(rng.normal(0, 0.01, m), fixes.north_m), joined(rng.normal(0, 0.01, m), fixes.east_m),
+            *(np.concatenate([np.full(m, one[0]), one]) for one in (
+                fixes.var_north_m2, fixes.var_east_m2, fixes.fix_class, fixes.misreported, fixes.down_weighted,
+            )),
+        ),
+        headings=HeadingSamples(
+            np.concatenate([parked, headings.stamp_ns + later]),
+            joined(still + headings.heading_rad[0], headings.heading_rad),
+            joined(still + headings.var_rad2[0], headings.var_rad2),
+        ),
+    )  # fmt: skip
+
+
+def test_a_hold_right_after_parking_is_found_where_the_parked_heading_has_no_noise() -> None:
+    span = (1.0, 4.0)
+    (event,) = find_slip_events(after_parking(drive(lambda t: hold(t, span), gyro=False)), WIDTH_M)
+    assert event.kind == "immobilised"
+    assert np.array(span_s(event)) - 300.0 == pytest.approx(span, abs=TIMING_S)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_holds_of_a_second_and_a_half_are_all_found(seed: int) -> None:
     begins = 15.0 + 20.0 * np.arange(5) + np.random.default_rng(seed).uniform(0, 8, 5)

@@ -275,7 +275,7 @@ def test_an_empty_stream_is_refused() -> None:
     log = make_log()
     none = WheelSamples(log.wheels.stamp_ns[:0], log.wheels.v_left_mps[:0], log.wheels.v_right_mps[:0])
     for use in (fit, calibrate):
-        with pytest.raises(DataError, match="0 usable heading samples"):
+        with pytest.raises(DataError, match="no orientation"):
             use(cut(log, slice(0, 0)), load_config(sets=["filter.preset=paper"]))
         with pytest.raises(DataError, match="0 usable wheel samples"):
             use(replace(log, wheels=none))
