@@ -215,14 +215,14 @@ def _heading_counts(heading: Mapping[str, Any]) -> list[str]:
 
 def _delay_lines(run: Run) -> list[str]:
     """Return which streams seem to lag or lead the wheels."""
-    told: list[str] = []
     if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
-        return told
-    for word, facts in (("heading", run.summary["heading"]), ("fixes", run.summary["gnss"])):
+        return []
+    found = []
+    for word, facts in (("headings", run.summary["heading"]), ("fixes", run.summary["gnss"])):
         delay, std = facts["delay_s"], facts["delay_std_s"]
         if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
-            told.append(f"{word} {abs(delay):.2f} ± {std:.2f} s {'late' if delay > 0 else 'early'}")
-    lines = [f"{', '.join(told)} against the wheels; not corrected: wheels that slip look the same"] if told else []
+            found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
+    lines = [*found, "not corrected: slip of the wheels has the same effect"] if found else []
     speed = run.summary["drive"]["speed_mean_mps"]
     if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = length_text(TYPICAL_DELAY_S * speed)
