@@ -9,6 +9,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.robust import mad_std
 from icrtool.records.tables import Bools, Floats, Ints, PositionFixes, RobotLog, WheelSamples, WheelUnit
 
 WINDOW_S = 2.0
@@ -122,8 +123,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
         return None
     ratio = chord[straight] / np.abs(distance[straight])
     centre = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - centre)))
-    return Scale(centre, 1.2533 * spread / math.sqrt(len(ratio)), len(ratio))
+    return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)), len(ratio))
 
 
 def _metres_per_unit(

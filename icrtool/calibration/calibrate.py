@@ -34,6 +34,7 @@ from icrtool.calibration.evidence import (
     summarise_drive,
 )
 from icrtool.config import Config
+from icrtool.kernels.robust import mad_std
 from icrtool.records.run import half_width_m
 from icrtool.records.tables import Complexes, Floats, RobotLog
 
@@ -287,7 +288,7 @@ def _scales(evidence: Evidence, residual: Floats) -> Floats:
         for long in (0, 1):
             rows = kind * count + np.flatnonzero(evidence.long == long)
             if len(rows):
-                scale[rows] = max(1.4826 * float(np.median(np.abs(residual[rows]))), 1e-5)
+                scale[rows] = max(mad_std(residual[rows], 0.0), 1e-5)
     return scale
 
 

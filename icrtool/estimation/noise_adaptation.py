@@ -35,13 +35,12 @@ MOST_SAMPLES = 60_000
 
 
 class AdaptedRun(NamedTuple):
-    """A filter run; `sensors` has the position reference `reference_delay_s` earlier, where such a delay was found."""
+    """A filter run, and the process noise that it was made with."""
 
     sensors: SensorData
     setup: FilterSetup
     output: FilterOutput
     noise: ProcessNoise
-    reference_delay_s: float
 
 
 def run_adaptively(
@@ -60,7 +59,7 @@ def run_adaptively(
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)
     if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
-        return AdaptedRun(sensors, setup, output, noise, 0.0)
+        return AdaptedRun(sensors, setup, output, noise)
     part = _busiest_part(sensors)
     best = find_noise(
         lambda tried: innovation_cost(run(part, tried)[1]),
@@ -71,7 +70,7 @@ def run_adaptively(
     if best != noise:
         noise = best
         setup, output = run(sensors, noise)
-    return AdaptedRun(sensors, setup, output, noise, 0.0)
+    return AdaptedRun(sensors, setup, output, noise)
 
 
 def _busiest_part(sensors: SensorData) -> SensorData:

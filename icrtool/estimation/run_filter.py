@@ -41,7 +41,6 @@ class Filtered(NamedTuple):
 
     Attributes
     ----------
-    sensors : with `reference_delay_s` corrected, where such a delay was found
     covariance : (6, 6) at the end
     noise : process noise of the pose that the run was made with
     start_std_m : (3,) of the ICRs at the start
@@ -58,7 +57,6 @@ class Filtered(NamedTuple):
     heading: MeasurementOutcome
     covariance: Floats
     noise: ProcessNoise
-    reference_delay_s: float
     start_std_m: Floats
     least_icr_m: float
     began_with: WarmStart | None
@@ -104,7 +102,6 @@ def run_filter(
         heading=heading,
         covariance=_square(output.P),
         noise=adapted.noise,
-        reference_delay_s=adapted.reference_delay_s,
         start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
         least_icr_m=setup.parameters.least_icr,
         began_with=warm_start,

@@ -46,15 +46,9 @@ def rejected_share(outcome: MeasurementOutcome) -> float:
     return int(np.count_nonzero(outcome.code == GATED)) / seen if seen else 0.0
 
 
-def noise_warnings(name: str, config: Config, reference_delay_s: float, noise: ProcessNoise) -> list[str]:
-    """Return what was done about clocks and wheels that contradict the position reference."""
+def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
+    """Return what was done about wheels that contradict the position reference."""
     found = []
-    if config.frames.reference_delay_s == "auto" and reference_delay_s:
-        relation = "lags" if reference_delay_s > 0 else "leads"
-        found.append(
-            f"{name}: the position reference {relation} the wheels by {abs(reference_delay_s):.2f} s: "
-            "corrected; frames.reference_delay_s sets it"
-        )
     configured = configured_noise(config)
     if noise.position_mps != configured.position_mps:
         found.append(

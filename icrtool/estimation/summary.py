@@ -63,7 +63,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             for t in filtered.changes_s
             if t not in changes_s
         ),
-        *noise_warnings(log.name, config, filtered.reference_delay_s, filtered.noise),
+        *noise_warnings(log.name, config, filtered.noise),
         *(f"{log.name}: {sentence}" for sentence in excitation.sentences),
     ]
     document: dict[str, Any] = plain(
@@ -90,7 +90,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(log, filtered.gnss, sensors.fixes.down_weighted)
             | measurements.sections["gnss"]
-            | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss, filtered.reference_delay_s),
+            | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss),
             "heading": measurements.sections["heading"] | counts(filtered.heading),
             "wheels": measurements.sections["wheels"],
             "events": event_summary(sensors.events, int(table.stamp_ns[0])),
@@ -101,7 +101,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "preset": config.filter.preset,
                 "process_position_mps": filtered.noise.position_mps,
                 "process_heading_degps": filtered.noise.heading_degps,
-                "reference_delay_s": measurements.position_delay_s + filtered.reference_delay_s,
+                "reference_delay_s": measurements.position_delay_s,
                 "heading_correlation_s": sensors.heading_correlation_s,
                 "heading_from_position": sensors.heading_from_position,
                 "antenna_m": sensors.antenna_m,
@@ -173,9 +173,7 @@ def warm_start_summary(warm_start: WarmStart | None) -> dict[str, Any] | None:
     return {"icrs_m": warm_start.icrs_m, "covariance_m2": warm_start.covariance_m2}
 
 
-def class_summary(
-    fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome, reference_delay_s: float
-) -> dict[str, Any]:
+def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
     """Return how many fixes of each class there were and what became of them, and the jumps of the position."""
     classes, (used, rejected) = {}, used_and_rejected(outcome)
     for code, name in CLASSES.items():
@@ -185,8 +183,7 @@ def class_summary(
             counted |= {"down_weighted": rows & fixes.down_weighted, "sold_as_fixed": rows & fixes.misreported}
             counts = {key: int(np.count_nonzero(marked)) for key, marked in counted.items()}
             classes[name] = counts | {"std_m": statistics.std_m[name], "step_std_m": statistics.step_std_m[name]}
-    stamps = statistics.jump_stamp_ns - round(reference_delay_s * 1e9)
-    jumps = list(zip(stamps, statistics.jump_m, strict=True))
+    jumps = list(zip(statistics.jump_stamp_ns, statistics.jump_m, strict=True))
     return {
         "classes": classes,
         "jumps": len(jumps),
