@@ -14,6 +14,7 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.drive_windows import drive_arrays
 from icrtool.alignment.gyro_heading import TurnRate, estimate_heading
 from icrtool.alignment.heading_choice import derive_heading
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.kernels.heading_kalman import HeadingEvents, filter_headings, smooth_headings
 from icrtool.records.tables import GyroAxes, HeadingSamples, OtherReceiver, RobotLog
 from support.exact_drives import CONFIG, simulate
@@ -115,7 +116,8 @@ def test_a_drive_too_short_for_courses_gives_no_heading() -> None:
 
 @pytest.mark.parametrize("name", ["tracked_gyro.bag", "wheeled_two_antennas"])
 def test_physics_logs_without_an_attitude_sensor_give_the_true_heading(shared_logs: Path, name: str) -> None:
-    log = icrtool.read_log(shared_logs / "simulated" / name, icrtool.load_config(robot=ROBOTS[name]))
+    config = icrtool.load_config(robot=ROBOTS[name])
+    log = with_wheel_speeds(icrtool.read_log(shared_logs / "simulated" / name, config), config)
     found = derive_heading(log, WIDTH_M)
     with np.load(shared_logs / "simulated" / f"{name}.truth.npz") as truth:
         stamps = log.wheels.stamp_ns[0] + np.round((truth["t"] - truth["t"][0]) * 1e9).astype(np.int64)
