@@ -66,7 +66,7 @@ _ICR_FIELDS = "".join(
     for name in ICR_COLUMNS
 )
 DEFINITIONS = {
-    ICRS: f"# Track ICRs [m] in the paper's body frame: x forward, y to the right.\nstd_msgs/Header header\n{_ICR_FIELDS}",
+    ICRS: f"# Track ICRs [m]; body frame: x forward, y right.\nstd_msgs/Header header\n{_ICR_FIELDS}",
     ERROR: (
         "# Open-loop error [m] after horizon_m of driving from this state; NaN where a model has none.\n"
         "std_msgs/Header header\nfloat64 horizon_m\nfloat64 icr_m\nfloat64 icr_final_m\nfloat64 no_slip_m\n"
