@@ -88,7 +88,7 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def _is_beside(file: Path, stems: set[Path]) -> bool:
-    """Return whether a file has the name of a recording and another suffix: ``drive.truth.csv`` beside ``drive.bag``."""
+    """Return whether a file has a recording's name and another suffix: ``drive.truth.csv`` beside ``drive.bag``."""
     parts = file.name.split(".")
     return file.is_file() and any(file.parent / f"{'.'.join(parts[:k])}." in stems for k in range(1, len(parts)))
 
