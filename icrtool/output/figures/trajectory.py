@@ -219,8 +219,8 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
             text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
             axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
             axes.annotate(
-                text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0, color="0.25", zorder=4.9,
-                bbox=TIME_BOX, annotation_clip=True,
+                text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0,
+                color="0.25", zorder=4.9, bbox=TIME_BOX, annotation_clip=True,
             )  # fmt: skip
 
 
