@@ -4,7 +4,7 @@
 
 Physics drives, measured with sensors and troubles drawn at random with fixed seeds. The truth is the same fit to true
 poses and speeds. *Right*: each ICR within 3 stated standard deviations, and within 0.06 m or 10 % of half the ICRs'
-separation. *Hedged*: refused, not usable, an ICR that is not shown, or a warning that the sides or senses may be others.
+separation. *Hedged*: refused, not usable, an ICR that is not shown, or a warning that sides or senses may be others.
 *Wrong*: anything else.
 """
 
