@@ -51,6 +51,12 @@ def length_text(metres: float) -> str:
     return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
+def metres_text(metres: float) -> str:
+    """Return an error as ``0.0034 m``, ``0.012 m`` or ``3.45 m``: one unit wherever errors stand side by side."""
+    digits = 4 if metres < 0.01 else 3 if metres < 0.1 else 2
+    return f"{metres:.{digits}f} m"
+
+
 def distance_text(metres: float) -> str:
     """Return a distance as ``398.5 m`` or ``36.00 km``."""
     return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
