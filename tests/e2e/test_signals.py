@@ -89,10 +89,11 @@ def interrupt(
     if process.returncode == 0:
         return None, []
     wrong = []
-    # A busy machine may still be starting the interpreter, which a signal then ends without a word.
-    if process.returncode not in {128 + number, -number} or (process.returncode < 0 and errors):
+    # A busy machine may still be starting the interpreter, which a signal then ends in its own manner.
+    starting = process.returncode == -number
+    if not starting and process.returncode != 128 + number:
         wrong.append(f"exit status {process.returncode}: {errors}")
-    if "Traceback" in errors:
+    if "Traceback" in errors and not starting:
         wrong.append(errors)
     end = time.monotonic() + 2
     while (left := processes_with(mark)) and time.monotonic() < end:
