@@ -73,7 +73,7 @@ def _watched() -> Iterator[None]:
     before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
     over = threading.Event()
     thread = threading.Thread(target=_watch, args=(arrived, over), name="interrupts", daemon=True)
-    # It inherits this: where the main thread holds signals, they must not come by way of another thread.
+    # It inherits this: where the main thread holds signals, another thread must not receive them either.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGALRM})
     thread.start()
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
