@@ -17,7 +17,6 @@ from icrtool.motion.models import (
     MotionModel,
     TrackGeometry,
     TypicalDrive,
-    find_model,
     track_geometry,
     twist,
     wheel_motion,
@@ -314,57 +313,3 @@ def _plain(one: FittedModel) -> dict[str, Any]:
         },
         "covariance": one.covariance.tolist(),
     }
-
-
-def calibration_of(document: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that a file's plain data hold.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        They are not what `Calibration.summary` gives.
-    """
-    if document["schema"] != CALIBRATION_SCHEMA:
-        raise ValueError(f"schema {document['schema']!r}")
-    gyro = document["gyro"]
-    if not float(document["robot"]["track_width_m"]) > 0.0:
-        raise ValueError("track width")
-    return Calibration(
-        robot=dict(document["robot"]),
-        fitted=_fitted(document["model"], document),
-        others={name: _fitted(name, one) for name, one in document["models"].items()},
-        gyro=None if gyro is None else _fitted(gyro["model"], gyro),
-        typical=TypicalDrive(**document["typical"]),
-        why=str(document["why"]),
-        logs=tuple(CalibrationLog(**log) for log in document["logs"]),
-        held_out=tuple(HeldOutScore(**score) for score in document["held_out"]),
-        controller=_controller_errors(document["controller"]),
-        warnings=tuple(str(warning) for warning in document["warnings"]),
-        created=str(document["created"]),
-        tool_version=str(document["tool_version"]),
-    )
-
-
-def _controller_errors(document: Mapping[str, Any] | None) -> ControllerErrors | None:
-    if document is None:
-        return None
-    pose, twisted, turn, way = (
-        tuple(map(float, document[name])) for name in ("pose_variance", "twist_variance", "turn_noise", "way_noise")
-    )
-    p95, full = (float("nan") if document[name] is None else float(document[name]) for name in ("p95_m", "full_p95_m"))
-    return ControllerErrors(
-        (pose[0], pose[1], pose[2]), (twisted[0], twisted[1], twisted[2]), (turn[0], turn[1]), (way[0], way[1]),
-        p95, full,
-    )  # fmt: skip
-
-
-def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:
-    model = find_model(name)
-    k = len(model.terms)
-    if tuple(document["terms"]) != model.terms:
-        raise ValueError(f"terms of {name}")
-    parameters = np.array([document["parameters"][term]["value"] for term in model.terms], np.float64)
-    covariance = np.array(document["covariance"], np.float64).reshape(k, k)
-    if not (np.isfinite(parameters).all() and np.isfinite(covariance).all()):
-        raise ValueError(f"parameters of {name}")
-    return FittedModel(model, parameters, covariance)

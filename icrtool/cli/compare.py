@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -42,7 +43,7 @@ def command(
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
-    places: dict[str, list[Path]] = {}
+    places: dict[LogText, list[Path]] = {}
     for source in sources:
         name, path = _named(source)
         places.setdefault(name, []).append(path)
@@ -70,12 +71,12 @@ def command(
         click.echo(format_transfer(transfer))
 
 
-def _named(source: str) -> tuple[str, Path]:
+def _named(source: str) -> tuple[LogText, Path]:
     """Return the group's name and the place of one argument."""
     name, sign, place = source.partition("=")
     if sign and name and place and not Path(source).exists():
-        return name, Path(place)
-    return Path(source).name or source, Path(source)
+        return LogText(name), Path(place)
+    return LogText(Path(source).name or source), Path(source)
 
 
 def _expand(place: Path) -> list[Path]:

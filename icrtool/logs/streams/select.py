@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.channel import Channel, some_of
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource, no_heading
@@ -306,7 +306,7 @@ def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> 
     if configured is not None:
         return f"{best.why}; configured"
     rest = [source.topic for source in sources if source is not best]
-    return f"{best.why}; chosen over {', '.join(rest[:3])}" if rest else best.why
+    return f"{best.why}; chosen over {some_of(rest[:3])}" if rest else best.why
 
 
 def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
