@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from icrtool.cli.stages import Stages
 from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
@@ -128,16 +128,10 @@ def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
 
 @contextmanager
 def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that moves a bar on a terminal; None where there is no terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
-
-        def move(share: float) -> None:
-            bar.update(int(1000 * min(share, 1.0)) - bar.pos)
-
-        yield move
+    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+    with Stages(label, quiet=quiet) as stages:
+        stages.begin("")
+        yield stages.share if stages.on_terminal else None
 
 
 def load_ahead(*modules: str) -> None:
