@@ -360,6 +360,18 @@ def describe_key(section: str, key: str) -> str:
     return _described(get_type_hints(SECTIONS[section], include_extras=True)[key])
 
 
+def words_of_key(section: str, key: str) -> tuple[str, ...]:
+    """Return the words that a key takes, as ``auto``; empty where it is no key, or takes none."""
+    if section not in SECTIONS:
+        return ()
+    return _literals(get_type_hints(SECTIONS[section]).get(key))
+
+
+def _literals(kind: Any) -> tuple[str, ...]:  # noqa: ANN401 - a type, as annotations have it
+    parts = get_args(kind)
+    return parts if get_origin(kind) is Literal else tuple(word for part in parts for word in _literals(part))
+
+
 def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it
     """Return a key's type in the words of TOML."""
     origin, parts = get_origin(kind), get_args(kind)

@@ -5,11 +5,7 @@ from __future__ import annotations
 import click
 from click.shell_completion import BashComplete, CompletionItem, add_completion_class, get_completion_class
 
-SHELLS = {
-    "bash": 'eval "$(icrtool completion bash)"        # in ~/.bashrc',
-    "zsh": 'eval "$(icrtool completion zsh)"         # in ~/.zshrc, after compinit',
-    "fish": "icrtool completion fish | source         # in ~/.config/fish/config.fish",
-}
+SHELLS = ("bash", "zsh", "fish")
 
 NAME, VARIABLE = "icrtool", "_ICRTOOL_COMPLETE"
 
@@ -27,14 +23,16 @@ class BashWithEquals(BashComplete):
     def get_completion_args(self) -> tuple[list[str], str]:
         """Return the words before the one to complete, and that one; words that bash cut at ``=`` are joined."""
         args, incomplete = super().get_completion_args()
-        words: list[str] = []
-        for word in [*args, incomplete]:
-            joined = words and (word == "=" or (words[-1].endswith("=") and word != incomplete) or words[-1][-1:] == "=")
-            if joined and not words[-1].startswith("-"):
-                words[-1] += word
-            else:
+        rest, words = [*args, incomplete], [""]
+        while rest:
+            word = rest.pop(0)
+            if word != "=":
                 words.append(word)
-        return words[:-1], words[-1] if words else ""
+            elif words[-1].startswith("-"):
+                words.append(rest.pop(0) if rest else "")
+            else:
+                words[-1] += f"={rest.pop(0) if rest else ''}"
+        return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
         """Return a completion without what stands before its ``=``."""
@@ -49,7 +47,7 @@ def register() -> None:
 
 
 @click.command("completion")
-@click.argument("shell", type=click.Choice(list(SHELLS)))
+@click.argument("shell", type=click.Choice(SHELLS))
 def command(shell: str) -> None:
     """Print what a shell needs to complete commands, options, robots, configuration keys and topics of a log.
 
@@ -90,13 +88,14 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
         keys = [(f"{one}.{two}", texts[one][two]["text"]) for one in SECTIONS for two in texts[one]]
         return [CompletionItem(f"{one}=", help=text) for one, text in keys if one.startswith(incomplete)]
     if section == "topics":
-        values = _topics(ctx.params.get("logs") or ctx.params.get("sources") or ())
+        # Without the value of --set, click leaves what stands before it in `args`.
+        values = _topics(ctx.params.get("logs") or ctx.params.get("sources") or ctx.args)
     else:
         values = words_of_key(section, name)
     return [CompletionItem(f"{key}={value}") for value in values if value.startswith(begun)]
 
 
-def _topics(logs: object) -> list[str]:
+def _topics(logs: object) -> tuple[str, ...]:
     """Return the topics of the logs that were named before, as far as they can be read."""
     from pathlib import Path
 
@@ -111,4 +110,4 @@ def _topics(logs: object) -> list[str]:
             continue
         topics |= {str(channel.topic) for channel in container.channels}
         container.close()
-    return sorted(topics)
+    return tuple(sorted(topics))

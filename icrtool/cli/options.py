@@ -15,6 +15,8 @@ from icrtool.cli.stages import Stages
 from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
     from icrtool.output.figures.drawing_process import DrawingProcess
@@ -37,14 +39,26 @@ def configuration(command: Command) -> Command:
         click.option(
             "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."
         ),
-        click.option("--robot", metavar="NAME", help="Built-in robot, for example husky-a200, jackal, warthog."),
-        click.option(
-            "--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."
-        ),
-    )
+        click.option("--robot", metavar="NAME", shell_complete=_robots,
+                     help="Built-in robot, for example husky-a200; icrtool robots lists them."),
+        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
+                     help="Set a configuration key; icrtool config lists them; repeatable."),
+    )  # fmt: skip
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _robots(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_robot
+
+    return complete_robot(ctx, param, incomplete)
+
+
+def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_setting
+
+    return complete_setting(ctx, param, incomplete)
 
 
 def place(command: Command) -> Command:

@@ -11,22 +11,30 @@ from icrtool.config import SECTIONS, Config, describe_key, key_texts
 WIDTH = 110
 
 HEAD = """\
-# Configuration of icrtool. Use it with --config FILE.toml; --set section.key=value changes single keys.
-# In brackets: type and bounds. A key in a comment has no default: its value is an example.
+# Configuration of icrtool, for --config FILE.toml; --set section.key=value changes single keys.
+# Each key is shown with its default; remove the # before it and change it. Behind it: its type and bounds.
 """
 
 
 def format_configuration(config: Config) -> str:
-    """Return all keys with their meaning, their type and bounds, and their value; TOML that loads as this `config`."""
-    texts, document = key_texts(), config.effective()
+    """Return all keys as TOML that loads as this `config`: those that have another value than their default are set.
+
+    Notes
+    -----
+    A default is a comment: a key that is set has precedence over what icrtool would find in the log.
+    """
+    texts, document, default = key_texts(), config.effective(), Config().effective()
     parts = [HEAD]
     for section, kind in SECTIONS.items():
         parts.append(f"\n[{section}]\n")
         for key in (field.name for field in fields(kind)):
             about, value = texts[section][key], document[section][key]
-            comment = f"{about['text']} [{describe_key(section, key)}]"
-            parts += [f"# {line}\n" for line in textwrap.wrap(comment, WIDTH, break_long_words=False)]
-            parts.append(f"# {key} = {_toml(about['example'])}\n" if value is None else f"{key} = {_toml(value)}\n")
+            parts += [f"# {line}\n" for line in textwrap.wrap(about["text"], WIDTH, break_long_words=False)]
+            mark = "#" if value == default[section][key] else ""
+            note = f"{describe_key(section, key)}{'; no default, this is an example' if value is None else ''}"
+            shown = _toml(about["example"] if value is None else value)
+            parts.append(f"{mark}{key} = {shown}  # {note}\n\n")
+        parts[-1] = parts[-1].removesuffix("\n")
     return "".join(parts)
 
 
