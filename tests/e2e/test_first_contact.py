@@ -57,7 +57,7 @@ def test_info_gives_date_extent_verdict_and_a_next_command_that_works(icrtool) -
     status, out, _ = icrtool("info", MOWER, "--robot", "segway-rmp400")
     assert status == 0
     lines = {line.partition(" ")[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
-    assert lines["recorded"].startswith("2025-10-09 08:53:20 UTC, 15:00 min")
+    assert lines["recorded"].startswith("2025-10-09 08:53:20 UTC, 3:20 min")
     assert lines["driven"].startswith("12")
     assert "m north-south about 40.79" in lines["area"]
     assert lines["verdict"] == "can be fitted, all ICRs are shown"
