@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 TABLE_WIDTH = 100
 """Letters in a line of a printed table."""
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 """What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
@@ -29,6 +32,11 @@ def unusable_lines(summary: Mapping[str, Any]) -> list[str]:
 def position_word(summary: Mapping[str, Any]) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
     return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
+
+
+def xml_text(text: str) -> str:
+    """Return text without the characters that XML 1.0 cannot hold; the rest is escaped by the writer."""
+    return _NOT_XML.sub("?", text)
 
 
 def signed(metres: float) -> str:

@@ -14,9 +14,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import atomic_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
-from icrtool.output.text_format import run_title
-
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from icrtool.output.text_format import run_title, xml_text
 
 Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
@@ -167,7 +165,7 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
 
 
 def _suite(one: Suite, command: str) -> ET.Element:
-    name = _xml_text(one.log)
+    name = xml_text(one.log)
     counts = {
         "tests": len(one.cases) + bool(one.error),
         "failures": sum(not case.passed for case in one.cases),
@@ -176,23 +174,18 @@ def _suite(one: Suite, command: str) -> ET.Element:
     }
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
     for case in one.cases:
-        element = ET.SubElement(suite, "testcase", classname=name, name=_xml_text(case.gate))
+        element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(case.gate))
         if case.not_checked:
-            ET.SubElement(element, "skipped", message=_xml_text(case.not_checked))
+            ET.SubElement(element, "skipped", message=xml_text(case.not_checked))
         elif not case.passed:
-            failure = ET.SubElement(element, "failure", type="gate", message=_xml_text(case.line))
-            failure.text = _xml_text(case.line)
+            failure = ET.SubElement(element, "failure", type="gate", message=xml_text(case.line))
+            failure.text = xml_text(case.line)
         else:
-            ET.SubElement(element, "system-out").text = _xml_text(case.line)
+            ET.SubElement(element, "system-out").text = xml_text(case.line)
     if one.error:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
-        ET.SubElement(element, "error", type="IcrToolError", message=_xml_text(one.error))
+        ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
     return suite
-
-
-def _xml_text(text: str) -> str:
-    """Return text without the characters that XML 1.0 cannot hold; the rest is escaped by the writer."""
-    return _NOT_XML.sub("?", text)
 
 
 def escaped_markdown(text: str) -> str:
