@@ -95,11 +95,11 @@ def block_sums(
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
     above = [np.add.reduceat((errors > limit).astype(np.int64), first) for limit in (p50_m, p95_m)]
-    slopes = [
+    growth = [
         _slope(ordered, share, np.asarray((count - (1.0 - share) * trials) / len(errors)))
         for share, count in zip(SHARES.values(), above, strict=True)
     ]
-    return BlockSums(trials, sums, above[0], above[1], *slopes)
+    return BlockSums(trials, sums, above[0], above[1], *growth)
 
 
 def _slope(ordered: Floats, share: float, influence: Floats) -> float:
