@@ -1,0 +1,92 @@
+"""``icrtool report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli.fit import RUNS
+
+if TYPE_CHECKING:
+    from icrtool.output.page.pictures import Picture
+    from icrtool.records.run import Run
+
+
+@click.command("report")
+@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
+              help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
+@click.option("--no-coordinates", is_flag=True, help="Leave out where on the globe a run was: to pass the page on.")
+@click.option("-q", "--quiet", is_flag=True, help="Print no results.")
+def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
+    """Write a run, a fleet or a comparison as one HTML file that needs no network.
+
+    RUN is a directory that `icrtool fit` wrote, with or without its dropout report; FLEET the folder of `icrtool
+    batch`; COMPARISON what `icrtool compare -o` wrote. Without an argument: the newest run below icrtool-runs/.
+
+    \b
+    Example:
+      icrtool report
+      icrtool report icrtool-runs/field -o field.html --no-coordinates
+      icrtool report results/
+    """  # noqa: D301 - click reads the escape
+    from icrtool.errors import ConfigError
+    from icrtool.output.atomic_file import check_place
+    from icrtool.output.stored_run import newest_run
+
+    sources = sources or (newest_run(RUNS),)
+    if output is not None and len(sources) > 1:
+        raise ConfigError("-o", "names one file for several pages", "leave it out: each page goes to its own directory")
+    for source in sources:
+        place = output if output is not None else _default_place(source)
+        check_place(place)
+        _write(source, place, coordinates=not no_coordinates)
+        if not quiet:
+            click.echo(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
+
+
+def _default_place(source: Path) -> Path:
+    from icrtool.output.page.run_page import PAGE_FILE
+
+    return source / PAGE_FILE if source.is_dir() else source.with_suffix(".html")
+
+
+def _write(source: Path, place: Path, *, coordinates: bool) -> None:
+    """Write the page of one source, whatever it is."""
+    import json
+
+    from icrtool.errors import RunError
+    from icrtool.output.page.comparison_page import comparison_in, comparison_page, schema_of
+    from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
+    from icrtool.output.page.run_page import write_html
+    from icrtool.output.run_directory import is_run_directory
+    from icrtool.output.stored_run import open_run
+
+    if is_run_directory(source):
+        _write_run(open_run(source), place, coordinates=coordinates)
+    elif (schema_of(source / FLEET_FILE) or "").startswith(FLEET_FAMILY):
+        write_html(fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source), place)
+    elif (file := comparison_in(source)) is not None:
+        write_html(comparison_page(json.loads(file.read_bytes()), file.stem), place)
+    else:
+        what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
+        raise RunError(source, what, "icrtool fit, batch and compare make one")
+
+
+def _write_run(run: Run, place: Path, *, coordinates: bool) -> None:
+    """Write the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
+    from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page, write_html
+
+    assert run.directory is not None  # noqa: S101 - it was read from there
+    report = read_report(run.directory)
+    pictures: dict[str, Picture] = pictures_of_run(run)
+    if report is None:
+        from icrtool.dropout_analysis.dropout_report import dropout_report
+        from icrtool.output.dropout_directory import report_document
+
+        report = report_document(dropout_report(run))
+    if "trajectory" not in pictures:
+        pictures = draw_pictures(run) | pictures
+    write_html(run_page(run, report, pictures, coordinates=coordinates), place)
