@@ -44,13 +44,14 @@ if TYPE_CHECKING:
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.page
 @json_option
 @options.configuration
 @options.verbosity
 def command(
     places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
     redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
-    plots: str, as_json: bool,
+    plots: str, page: bool, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -70,7 +71,7 @@ def command(
     from icrtool.fleet.fleet_files import fleet_document, write_fleet
 
     asked = BatchOptions(
-        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite,
+        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, page,
     )  # fmt: skip
     requests = plan(places, output, asked)
     output.mkdir(parents=True, exist_ok=True)
@@ -87,6 +88,10 @@ def command(
     order = {request.row.log: number for number, request in enumerate(requests)}
     rows.sort(key=lambda row: order[row.log])
     write_fleet(rows, output)
+    if page:
+        from icrtool.output.page.fleet_page import write_fleet_page
+
+        write_fleet_page(fleet_document(rows), output)
     if as_json:
         print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
     elif not quiet:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from icrtool.cli.fit import RUNS
-
-if TYPE_CHECKING:
-    from icrtool.output.page.pictures import Picture
-    from icrtool.records.run import Run
 
 
 @click.command("report")
@@ -48,7 +45,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
 
 
 def _default_place(source: Path) -> Path:
-    from icrtool.output.page.run_page import PAGE_FILE
+    from icrtool.output.run_directory import PAGE_FILE
 
     return source / PAGE_FILE if source.is_dir() else source.with_suffix(".html")
 
@@ -60,33 +57,49 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     from icrtool.errors import RunError
     from icrtool.output.page.comparison_page import comparison_in, comparison_page, schema_of
     from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
-    from icrtool.output.page.run_page import write_html
+    from icrtool.output.page.render import write_html
     from icrtool.output.run_directory import is_run_directory
-    from icrtool.output.stored_run import open_run
 
     if is_run_directory(source):
-        _write_run(open_run(source), place, coordinates=coordinates)
+        page = _page_of_run(source, coordinates=coordinates)
     elif (schema_of(source / FLEET_FILE) or "").startswith(FLEET_FAMILY):
-        write_html(fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source), place)
+        with _as_written(source / FLEET_FILE, "run icrtool batch again"):
+            page = fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source)
     elif (file := comparison_in(source)) is not None:
-        write_html(comparison_page(json.loads(file.read_bytes()), file.stem), place)
+        with _as_written(file, "run icrtool compare again"):
+            page = comparison_page(json.loads(file.read_bytes()), file.stem)
     else:
         what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
         raise RunError(source, what, "icrtool fit, batch and compare make one")
+    write_html(page, place)
 
 
-def _write_run(run: Run, place: Path, *, coordinates: bool) -> None:
-    """Write the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
-    from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page, write_html
+def _page_of_run(directory: Path, *, coordinates: bool) -> str:
+    """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
+    from icrtool.output.dropout_directory import report_document
+    from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page
+    from icrtool.output.stored_run import open_run
 
-    assert run.directory is not None  # noqa: S101 - it was read from there
-    report = read_report(run.directory)
-    pictures: dict[str, Picture] = pictures_of_run(run)
-    if report is None:
-        from icrtool.dropout_analysis.dropout_report import dropout_report
-        from icrtool.output.dropout_directory import report_document
-
-        report = report_document(dropout_report(run))
+    run, report, pictures = open_run(directory), read_report(directory), pictures_of_run(directory)
     if "trajectory" not in pictures:
         pictures = draw_pictures(run) | pictures
-    write_html(run_page(run, report, pictures, coordinates=coordinates), place)
+    if report is None:
+        from icrtool.dropout_analysis.dropout_report import dropout_report
+
+        return run_page(run, report_document(dropout_report(run)), pictures, coordinates=coordinates)
+    with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
+        return run_page(run, report, pictures, coordinates=coordinates)
+
+
+@contextmanager
+def _as_written(place: Path, advice: str) -> Iterator[None]:
+    """Refuse a document that was edited, or that another version wrote."""
+    from jinja2 import TemplateError
+
+    from icrtool.errors import RunError
+    from icrtool.output.page.render import DOCUMENT_ERRORS
+
+    try:
+        yield
+    except (*DOCUMENT_ERRORS, TemplateError) as err:
+        raise RunError(place, "is not as this version of icrtool writes it", advice) from err

@@ -54,6 +54,7 @@ class BatchOptions:
     redo: bool = False
     timeout_s: float = 1800.0
     overwrite: bool = False
+    page: bool = True
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -88,6 +89,8 @@ def finished(request: Request) -> Row | None:
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
     """
+    from icrtool.output.run_directory import PAGE_FILE
+
     try:
         row = msgspec.json.decode(path_of(request.row_file).read_bytes(), type=Row)
     except (OSError, msgspec.MsgspecError, ValueError):
@@ -99,6 +102,7 @@ def finished(request: Request) -> Row | None:
     if (
         not Path(path_of(request.directory), "run.json").is_file()
         or not Path(path_of(request.directory), "dropout").is_dir()
+        or (request.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
     ):
         return None
     why = "done before: same input, configuration and version"
@@ -183,7 +187,7 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions) 
     return Request(
         path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
-        budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
+        budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite, page=options.page,
     )  # fmt: skip
 
 

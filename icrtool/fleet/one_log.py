@@ -45,6 +45,7 @@ class Request:
     budgets_m: tuple[float, ...] = (0.5,)
     ladder: bool = True
     overwrite: bool = False
+    page: bool = True
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -118,7 +119,7 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
-    from icrtool.output.run_directory import check_target
+    from icrtool.output.run_directory import PAGE_FILE, check_target
 
     directory = path_of(request.directory)
     check_target(directory, path_of(request.path), overwrite=request.overwrite)
@@ -132,6 +133,11 @@ def _results(request: Request, stage: Stage) -> Row:
     report = dropout_report(run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder)
     stage("writing the report")
     report.write(directory / "dropout", plots=request.plots)
+    if request.page:
+        from icrtool.output.page.run_page import write_page
+
+        stage("writing the page")
+        write_page(run, report, directory / PAGE_FILE, plots=directory)
     return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
 
 

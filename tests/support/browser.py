@@ -113,6 +113,7 @@ class Page:
 
     def open(self, file: Path) -> float:
         """Load a file; return how long it took until everything was drawn [s]."""
+        self.front()
         begun = time.monotonic()
         self.send("Page.navigate", url=file.absolute().as_uri())
         while not self._events("Page.loadEventFired"):
@@ -120,6 +121,10 @@ class Page:
             self._owner.receive(0.5)
         self.send("Page.captureScreenshot", format="jpeg", quality=10)
         return time.monotonic() - begun
+
+    def front(self) -> None:
+        """Bring the tab to the front: in the background it answers neither mouse nor keys at once."""
+        self.send("Page.bringToFront")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression; a promise is awaited."""

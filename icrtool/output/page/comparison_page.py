@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from icrtool.errors import RunError
 from icrtool.output.page.render import render
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -20,25 +19,13 @@ def comparison_page(document: Mapping[str, Any], title: str) -> str:
     Parameters
     ----------
     document : what `icrtool compare` writes as JSON
-
-    Raises
-    ------
-    RunError
-        The document is not of this version.
     """
-    try:
-        names = list(document["groups"])
-        cells = {
-            (one["calibrated_on"], one["tested_on"]): one
-            for one in document["transfer"]
-            if one["horizon_m"] == CHOICE_HORIZON_M
-        }
-        return render(
-            "comparison.html", (), None, title=title, groups=document["groups"], pairs=document["pairs"], names=names,
-            cells=cells, horizon_m=CHOICE_HORIZON_M,
-        )  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
-        raise RunError(title, "this comparison is not of this version", "run icrtool compare again") from err
+    at_choice = (one for one in document["transfer"] if one["horizon_m"] == CHOICE_HORIZON_M)
+    return render(
+        "comparison.html", (), None, title=title, groups=document["groups"], pairs=document["pairs"],
+        names=list(document["groups"]), cells={(one["calibrated_on"], one["tested_on"]): one for one in at_choice},
+        horizon_m=CHOICE_HORIZON_M,
+    )  # fmt: skip
 
 
 def comparison_in(place: Path) -> Path | None:

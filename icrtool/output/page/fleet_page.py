@@ -7,9 +7,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from icrtool.errors import RunError
-from icrtool.output.page.render import render
-from icrtool.output.page.run_page import PAGE_FILE
+from icrtool.output.page.render import render, write_html
+from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.tables.dropout import metres_text
 from icrtool.output.text_format import distance_text, duration_text
 
@@ -55,24 +54,27 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
     ----------
     document : what fleet.json holds
     folder : of the batch; pages of logs that are there are linked
+    """
+    logs = list(document["logs"])
+    budgets = _budgets(logs)
+    lines = [_line(log, budgets, folder) for log in logs]
+    return render(
+        "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
+        counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
+        statuses=sorted({one.status for one in lines}), groups=sorted({one.group for one in lines} - {""}),
+        robots=sorted({one.robot for one in lines} - {""}), horizon_m=HORIZON_M,
+    )  # fmt: skip
+
+
+def write_fleet_page(document: Mapping[str, Any], folder: Path) -> None:
+    """Write the page of a fleet into its folder.
 
     Raises
     ------
-    RunError
-        The document is not of this version.
+    OutputError
+        It cannot be written.
     """
-    try:
-        logs = list(document["logs"])
-        budgets = _budgets(logs)
-        lines = [_line(log, budgets, folder) for log in logs]
-        return render(
-            "fleet.html", ("fleet.js",), None, title=folder.name or "fleet", lines=lines, columns=_columns(budgets),
-            counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
-            statuses=sorted({one.status for one in lines}), groups=sorted({one.group for one in lines} - {""}),
-            robots=sorted({one.robot for one in lines} - {""}), horizon_m=HORIZON_M,
-        )  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
-        raise RunError(folder / FLEET_FILE, "is not of this version", "run icrtool batch again") from err
+    write_html(fleet_page(document, folder), folder / PAGE_FILE)
 
 
 def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -13,20 +13,17 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
-from icrtool.output.atomic_file import atomic_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
 from icrtool.output.figures.drawing_process import matplotlib_unsaid
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import WITH_PLACE, Picture, pictures_in, pictures_of
-from icrtool.output.page.render import render
+from icrtool.output.page.render import render, write_html
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
 from icrtool.output.text_format import position_word
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
-
-PAGE_FILE = "report.html"
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -42,31 +39,26 @@ TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
 """Pictures that a browser with scripts draws itself; they are for printing, and for readers without scripts."""
 
 
-def write_page(run: Run, report: DropoutReport | Mapping[str, Any], path: Path, *, coordinates: bool = True) -> None:
+def write_page(
+    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True
+) -> None:
     """Write a run and its dropout report as one HTML file.
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    report : of `icrtool.dropout_report`, or what report.json holds of it
+    report : of `icrtool.dropout_report`
     path : the file
+    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
     coordinates : False leaves out where on the globe the robot was
 
     Raises
     ------
     OutputError
         The file cannot be written.
-    RunError
-        `report` is not of this version.
     """
-    document = report_document(report) if isinstance(report, DropoutReport) else report
-    write_html(run_page(run, document, pictures_of_run(run), coordinates=coordinates), path)
-
-
-def write_html(page: str, path: Path) -> None:
-    """Write a page, whole or not at all."""
-    with atomic_file(path) as partial:
-        partial.write_bytes(page.encode("utf-8", errors="backslashreplace"))
+    pictures = pictures_of_run(plots if plots is not None else run.directory)
+    write_html(run_page(run, report_document(report), pictures, coordinates=coordinates), Path(path))
 
 
 def run_page(
@@ -85,22 +77,15 @@ def run_page(
         pictures = _without_place(run, pictures)
         run, document = without_place(run, document)
     summary = run.summary
-    try:
-        compared = with_smoothed_reference(run) if document.setdefault("smoothed", False) else run
-        return render(
-            "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
-            title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
-            pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
-            begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
-            errors=_error_rows(document), config=_config_lines(summary["config"]), coordinates=coordinates,
-            samples=len(run.table),
-        )  # fmt: skip
-    except (KeyError, TypeError, IndexError, ValueError) as err:
-        raise RunError(
-            run.directory or run.name,
-            f"its {REPORT_FILE} is not of this version",
-            "make it again with icrtool dropout-report",
-        ) from err
+    compared = with_smoothed_reference(run) if document.setdefault("smoothed", False) else run
+    return render(
+        "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
+        title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
+        pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
+        begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
+        errors=_error_rows(document), config=_config_lines(summary["config"]), coordinates=coordinates,
+        samples=len(run.table),
+    )  # fmt: skip
 
 
 def read_report(directory: Path) -> dict[str, Any] | None:
@@ -124,11 +109,11 @@ def read_report(directory: Path) -> dict[str, Any] | None:
     return dict(document)
 
 
-def pictures_of_run(run: Run) -> dict[str, Picture]:
+def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
     """Return the pictures in a run's directory and in that of its dropout report."""
-    if run.directory is None:
+    if directory is None:
         return {}
-    return pictures_in(run.directory / "plots") | pictures_in(run.directory / DROPOUT_DIRECTORY / "plots")
+    return pictures_in(directory / "plots") | pictures_in(directory / DROPOUT_DIRECTORY / "plots")
 
 
 def draw_pictures(run: Run) -> dict[str, Picture]:

@@ -7,7 +7,7 @@
   const collator = new Intl.Collator(undefined, { numeric: true });
 
   function valueOf(row, column) {
-    const cell = row.cells[column], order = cell.dataset.order;
+    const cell = row.cells[column], order = cell ? cell.dataset.order : "";
     if (order === undefined) return cell.textContent.trim();
     return order === "" ? null : Number.isNaN(Number(order)) ? order : Number(order);
   }
