@@ -106,7 +106,7 @@ def test_pointing_at_a_chart_marks_the_moment_on_the_map(page: Page) -> None:
     duration = page.evaluate("icrtoolPage.data.duration_s")
     assert moment == pytest.approx(duration / 2, abs=0.02 * duration)
     at = page.evaluate("document.getElementById('here').getAttribute('transform').match(/[\\d.]+/g).map(Number)")
-    assert at == pytest.approx(page.evaluate("icrtoolPage.map().positionOf(icrtoolPage.moment())"), abs=0.5)
+    assert at == pytest.approx(page.evaluate("icrtoolPage.map().pixelsOf(icrtoolPage.moment())"), abs=0.5)
     left = page.evaluate("icrtoolPage.charts().charts.map((chart) => chart.posToVal(chart.cursor.left, 'x'))")
     assert left == pytest.approx([moment] * len(left), abs=0.02 * duration)
 
@@ -115,7 +115,7 @@ def test_pointing_at_the_map_marks_the_moment_in_the_charts(page: Page) -> None:
     row = page.evaluate("icrtoolPage.rowAt(0.7 * icrtoolPage.data.duration_s)")
     centre(page, "#map")
     x, y = page.evaluate(
-        f"((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().positionOf({row}), "
+        f"((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().pixelsOf({row}), "
         "document.getElementById('map').getBoundingClientRect())"
     )
     page.mouse("mouseMoved", x, y)
@@ -123,8 +123,8 @@ def test_pointing_at_the_map_marks_the_moment_in_the_charts(page: Page) -> None:
     left = page.evaluate("icrtoolPage.charts().charts.map((chart) => chart.posToVal(chart.cursor.left, 'x'))")
     assert left == pytest.approx([moment] * len(left), abs=0.5)
     # The nearest point of the drive, whichever time the robot passed there.
-    place = page.evaluate("icrtoolPage.map().positionOf(icrtoolPage.moment())")
-    assert place == pytest.approx(page.evaluate(f"icrtoolPage.map().positionOf({row})"), abs=3.0)
+    place = page.evaluate("icrtoolPage.map().pixelsOf(icrtoolPage.moment())")
+    assert place == pytest.approx(page.evaluate(f"icrtoolPage.map().pixelsOf({row})"), abs=3.0)
 
 
 def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file:
     page.open(file)
     centre(page, "#map")
     x, y = page.evaluate(
-        "((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().positionOf(icrtoolPage.rowAt(20)), "
+        "((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().pixelsOf(icrtoolPage.rowAt(20)), "
         "document.getElementById('map').getBoundingClientRect())"
     )
     page.click(x, y)
@@ -230,8 +230,8 @@ def test_a_checker_of_accessibility_finds_no_error(chrome: Browser, file: Path, 
 
 
 LOG = {
-    "log": "b.bag", "run": "runs/b", "status": "done", "reason": "", "robot": "jackal", "group": "grass", "tags": ["dry"],
-    "start_utc": "2024-05-01T10:00:00Z", "duration_s": 60.0, "distance_m": 90.0,
+    "log": "b.bag", "run": "runs/b", "status": "done", "reason": "", "robot": "jackal", "group": "grass",
+    "tags": ["dry"], "start_utc": "2024-05-01T10:00:00Z", "duration_s": 60.0, "distance_m": 90.0,
     "icr": {"y_icr_right_m": 0.4, "std_y_icr_right_m": 0.01}, "multiplier": 1.5, "multiplier_std": 0.1,
     "errors": {"icr_p95_10m_m": 0.9, "recommended_within_0.5m_m": 8.0}, "events": None, "warnings": 1, "verdicts": [],
 }  # fmt: skip

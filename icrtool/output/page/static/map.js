@@ -258,7 +258,7 @@ const icrtoolMap = (() => {
         soon();
       },
       /** Where a moment is on the map, in pixels of its element: for tests. */
-      positionOf(row) {
+      pixelsOf(row) {
         const [x, y] = scales();
         return [x(rowEast[row]), y(rowNorth[row])];
       },
