@@ -92,7 +92,7 @@ def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
         return set()
     if topics.wheel_left is not None and topics.wheel_right is not None:
         return {topics.wheel_left, topics.wheel_right}
-    names = [channel.topic for channel in channels if channel.message_type in PAIR_TYPES]
+    names = dict.fromkeys(channel.topic for channel in channels if channel.message_type in PAIR_TYPES)
     found: set[str] = set()
     for left in names:
         right = right_twin(left, names)
