@@ -160,6 +160,7 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
         multiplier=multiplier,
         multiplier_std=multiplier_std,
         errors=_errors(report),
+        events=len(summary["events"]),
         outages=len(report.outages),
         warnings=len(summary["warnings"]),
         verdicts=tuple(_verdict(replace(one, log=request.row.log)) for one in report.verdicts),
