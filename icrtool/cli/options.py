@@ -114,6 +114,12 @@ def cut(command: Command) -> Command:
     return click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}.")(command)
 
 
+def page(command: Command) -> Command:
+    """Add --page."""
+    what = "Also write report.html: pictures, tables and an interactive map in one file."
+    return click.option("--page/--no-page", default=True, show_default=True, help=what)(command)
+
+
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
     command = click.option("-v", "--verbose", is_flag=True, help="Print more details.")(command)
