@@ -62,7 +62,7 @@ def _parameter_lines(fitted: FittedModel) -> list[str]:
 
 def format_held_out(table: HeldOut) -> list[str]:
     """Return the leave-one-out table: p95 / expected error by horizon, median over folds and worst fold."""
-    what = "log" if math.isinf(table.folds[0].begin_m) and math.isinf(table.folds[0].end_m) else "block"
+    what = "log" if table.folds[0].whole else "block"
     head = f"each {what} left out in turn ({len(table.folds)}): 95 % / expected error [m], median {what} (worst {what})"
     lines = [head, f"{'model':<25}" + "".join(f"{f'{horizon:g} m':>25}" for horizon in table.horizons_m)]
     for row in table.scores:
