@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.trials import Summary
@@ -39,18 +40,6 @@ SHORTEST_BLOCK_M, MOST_BLOCKS = 25.0, 5
 
 FEWEST_RESIDUALS = 20
 
-FEWEST_TO_CHOOSE = 3
-"""With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
-
-UNCHOSEN = "icr"
-"""The paper's model stands where there are too few folds to choose."""
-
-BASELINE = "multiplier"
-"""What is worse than this one is never recommended."""
-
-MOST_GIVEN_UP = 0.05
-"""A simpler model may cost this share of the best one's error, no more: few folds show their own noise badly."""
-
 AT_ONCE = 2
 
 
@@ -69,7 +58,7 @@ class Fold(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ModelScores:
+class HeldOutRow:
     """One model on what it was not fitted to.
 
     Attributes
@@ -101,7 +90,7 @@ class HeldOut:
     scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
         what a controller makes of that
     fits : of everything, by model name
-    without : by fold, the model chosen without it and fitted without it
+    without : by fold, the model chosen without it and fitted without it; delays_s : of the wheels in it
     typical : curvature and speed at which ICRs and multiplier are stated
     recommended : name of the model chosen with all folds
     chosen : by fold, the model chosen without it
@@ -110,15 +99,16 @@ class HeldOut:
 
     horizons_m: tuple[float, ...]
     folds: tuple[Fold, ...]
-    scores: tuple[ModelScores, ...]
+    scores: tuple[HeldOutRow, ...]
     fits: dict[str, PooledFit]
     without: tuple[PooledFit, ...]
+    delays_s: tuple[float, ...]
     typical: TypicalDrive
     recommended: str
     chosen: tuple[str, ...]
     why: str
 
-    def score(self, name: str) -> ModelScores:
+    def score(self, name: str) -> HeldOutRow:
         """Return the row of a model."""
         return next(score for score in self.scores if score.name == name)
 
@@ -178,12 +168,12 @@ def hold_out(
     with ThreadPoolExecutor(AT_ONCE) as threads:
         fitted = list(threads.map(tester.fit, tuple(MODELS.values()) if models is None else models))
         tested = list(threads.map(job, fitted))
-    alone, choice = [one[0] for one in tested], _nested_choice(fitted, tester.folds)
+    alone, choice = [one[0] for one in tested], _choose(fitted, tester.folds)
     wheels = _table(tester, horizons_m, alone, choice)
     if not gyro:
         return wheels, None
     # the same models: a choice of its own for the gyro would only add noise
-    names = _Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
+    names = Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
     return wheels, _table(tester, horizons_m, [one[1] for one in tested], names)
 
 
@@ -212,7 +202,7 @@ def recommend(recordings: Sequence[Recording]) -> Recommendation:
     tester = _Tester(recordings)
     with ThreadPoolExecutor(AT_ONCE) as threads:
         fitted = list(threads.map(tester.fit, MODELS.values()))
-    choice = _nested_choice(fitted, tester.folds)
+    choice = _choose(fitted, tester.folds)
     best = next(one for one in fitted if one.model.name == choice.recommended)
     return Recommendation(best.whole, choice.why, tester.typical)
 
@@ -341,32 +331,14 @@ def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequen
     return Trials(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-class _Choice(NamedTuple):
-    """The model recommended and why, and the one chosen without each fold."""
-
-    recommended: str
-    why: str
-    chosen: tuple[str, ...]
-
-
-def _nested_choice(fitted: Sequence[_Fitted], folds: Sequence[Fold]) -> _Choice:
-    """Choose with all folds, and without each of them."""
-    by_name = {one.model.name: one for one in fitted}
-    sizes = {name: len(one.model.terms) for name, one in by_name.items()}
-    baseline = BASELINE if BASELINE in by_name else next(iter(by_name))
-    recommended, why = choose({name: np.diag(one.inner) for name, one in by_name.items()}, sizes, baseline)
-    chosen = [UNCHOSEN if UNCHOSEN in by_name else baseline] * len(folds)
-    if len(folds) < FEWEST_TO_CHOOSE and folds[0].recording == folds[-1].recording:
-        return _Choice(chosen[0], f"{len(folds)} blocks are too few to choose a model", tuple(chosen))
-    if len(folds) >= FEWEST_TO_CHOOSE:
-        for f in range(len(folds)):
-            others = [g for g in range(len(folds)) if g != f]
-            chosen[f], _ = choose({name: one.inner[f, others] for name, one in by_name.items()}, sizes, baseline)
-    return _Choice(recommended, why, tuple(chosen))
+def _choose(fitted: Sequence[_Fitted], folds: Sequence[Fold]) -> Choice:
+    inner = {one.model.name: one.inner for one in fitted}
+    sizes = {one.model.name: len(one.model.terms) for one in fitted}
+    return nested_choice(inner, sizes, one_recording=folds[0].recording == folds[-1].recording)
 
 
 def _table(
-    tester: _Tester, horizons_m: Sequence[float], tested: Sequence[_Tested], choice: _Choice
+    tester: _Tester, horizons_m: Sequence[float], tested: Sequence[_Tested], choice: Choice
 ) -> HeldOut:  # fmt: skip
     """Return the table of models that were tested on the same folds."""
     by_name = {one.model.name: one for one in tested}
@@ -376,44 +348,14 @@ def _table(
     )
     fits = {name: one.whole for name, one in by_name.items()}
     without = tuple(by_name[name].fits[f] for f, name in enumerate(choice.chosen))
+    delays = tuple(by_name[name].delays[f] for f, name in enumerate(choice.chosen))
     if not any(fit.model.uses_gyro for fit in without):
-        delays = [by_name[name].delays[f] for f, name in enumerate(choice.chosen)]
         errors = [tester.controller_errors(fit, f, delays[f]) for f, fit in enumerate(without)]
         rows.append(_scores(CONTROLLER.name, CONTROLLER.label, errors))
     return HeldOut(
-        tuple(horizons_m), tester.folds, tuple(rows), fits, without, tester.typical, choice.recommended, choice.chosen,
-        choice.why,
+        tuple(horizons_m), tester.folds, tuple(rows), fits, without, delays, tester.typical, choice.recommended,
+        choice.chosen, choice.why,
     )  # fmt: skip
-
-
-def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> tuple[str, str]:
-    """Return the model to recommend and why: the simplest whose held-out error is within noise of the best.
-
-    Parameters
-    ----------
-    errors : by model, expected error of each fold (folds,) [m], NaN where it has no window
-    sizes : by model, how many parameters it has
-    baseline : what is worse than this one is not recommended
-
-    Notes
-    -----
-    The rule of one standard error (Breiman et al. 1984), of the logarithms' differences over the same folds, since some
-    folds are harder than others for every model.
-    """
-    logs = {name: np.log(np.maximum(values[np.isfinite(values)], 1e-9)) for name, values in errors.items()}
-    logs = {name: values for name, values in logs.items() if len(values) and values.mean() <= logs[baseline].mean()}
-    if not logs:
-        return baseline, "the drive is too short to compare models"
-    best = min(logs, key=lambda name: float(logs[name].mean()))
-    for name in sorted(logs, key=lambda one: sizes[one]):
-        apart = logs[name] - logs[best]
-        noise = float(apart.std(ddof=1)) / np.sqrt(len(apart)) if len(apart) > 1 else np.inf
-        if name == best or float(apart.mean()) <= min(noise, MOST_GIVEN_UP):
-            break
-    if name == best:
-        return name, f"least expected error after {CHOICE_HORIZON_M:g} m on what it was not fitted to"
-    share = 100.0 * float(np.expm1((logs[name] - logs[best]).mean()))
-    return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
 
 
 def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
@@ -431,9 +373,9 @@ def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[lis
     return clear, inside
 
 
-def _scores(name: str, label: str, errors: Sequence[Floats]) -> ModelScores:
+def _scores(name: str, label: str, errors: Sequence[Floats]) -> HeldOutRow:
     folds = tuple(summarise(one) for one in errors)
-    return ModelScores(name, label, folds, summarise(np.concatenate(errors)))
+    return HeldOutRow(name, label, folds, summarise(np.concatenate(errors)))
 
 
 def _over(function: Callable[[Floats], Any], folds: Sequence[Summary], column: str, h: int) -> float:

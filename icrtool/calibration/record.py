@@ -137,6 +137,33 @@ class ControllerErrors(NamedTuple):
     full_p95_m: float
 
 
+class ErrorSources(NamedTuple):
+    """Variances of what a model leaves out, and what its quantiles are scaled by.
+
+    Attributes
+    ----------
+    heading_start_rad2 : of the heading at the start
+    heading_rate_rad2pm2 : of a turn per metre that stays the same along the path
+    turn_share : of the share by which every turn is off
+    heading_wander_rad2pm : of the heading, for each metre
+    speed_share : of the share by which the distance is off
+    distance_wander_m2pm : of the distance, for each metre
+    heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
+    p95_factor, expected_factor : measured over predicted
+    """
+
+    heading_start_rad2: float
+    heading_rate_rad2pm2: float
+    turn_share: float
+    heading_wander_rad2pm: float
+    speed_share: float
+    distance_wander_m2pm: float
+    heading_noise_rad2: float
+    position_noise_m2: float
+    p95_factor: float
+    expected_factor: float
+
+
 class Odometry(NamedTuple):
     """A path from wheel speeds alone, from the origin with heading zero; (n,) each."""
 
@@ -160,6 +187,7 @@ class Calibration:
     logs : what it was fitted to
     held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
     controller : errors of what a controller can express; None where the drive is too short to measure them
+    sources : of the errors beside those of the parameters; None where the drive is too short to measure them
     warnings : what to know before use
     created : date and time, UTC, ISO 8601
     name : stem of its file; empty for one just made
@@ -178,6 +206,7 @@ class Calibration:
     created: str
     tool_version: str
     name: str = field(default="", compare=False)
+    sources: ErrorSources | None = None
 
     @property
     def recommended(self) -> str:
@@ -195,14 +224,7 @@ class Calibration:
 
     def controller_numbers(self) -> ControllerNumbers:
         """Return multiplier and radius factors of the recommended model for a controller."""
-        geometry, covariance = self.geometry()
-        std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-        left, right = float(self.robot.get("left_scale", 1.0)), float(self.robot.get("right_scale", 1.0))
-        return ControllerNumbers(
-            geometry.multiplier, std["multiplier"],
-            left * geometry.radius_left, left * std["radius_left"],
-            right * geometry.radius_right, right * std["radius_right"],
-        )  # fmt: skip
+        return _controller_numbers(*self.geometry(), self.robot)
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
         """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks; NaN without."""
@@ -277,30 +299,50 @@ class Calibration:
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for the calibration file."""
-        geometry, covariance = self.geometry()
         return {
             "schema": CALIBRATION_SCHEMA,
             "tool_version": self.tool_version,
             "created": self.created,
             "robot": dict(self.robot),
             "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
-            "model": self.fitted.model.name,
             "recommended": self.recommended,
             "why": self.why,
-            **_plain(self.fitted),
-            "not_shown": list(self.fitted.not_shown),
-            "geometry": geometry._asdict(),
-            "typical": self.typical._asdict(),
-            "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+            **fitted_document(self.fitted, self.robot, self.typical),
             "gyro": None if self.gyro is None else {"model": self.gyro.model.name, **_plain(self.gyro)},
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
-            "controller": None
-            if self.controller is None
-            else plain(self.controller_numbers()._asdict() | self.controller._asdict()),
+            "controller": plain(
+                self.controller_numbers()._asdict() | ({} if self.controller is None else self.controller._asdict())
+            ),
+            "error_sources": None if self.sources is None else self.sources._asdict(),
             "warnings": list(self.warnings),
         }
+
+
+def fitted_document(fitted: FittedModel, robot: Mapping[str, Any], typical: TypicalDrive) -> dict[str, Any]:
+    """Return plain data of a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
+    geometry, covariance = fitted.geometry(float(robot["track_width_m"]), typical)
+    return {
+        "model": fitted.model.name,
+        **_plain(fitted),
+        "not_shown": list(fitted.not_shown),
+        "geometry": geometry._asdict(),
+        "typical": typical._asdict(),
+        "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        "controller": _controller_numbers(geometry, covariance, robot)._asdict(),
+    }
+
+
+def _controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:
+    """Return multiplier and radius factors with one standard deviation each."""
+    std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    left, right = float(robot.get("left_scale", 1.0)), float(robot.get("right_scale", 1.0))
+    return ControllerNumbers(
+        geometry.multiplier, std["multiplier"],
+        left * geometry.radius_left, left * std["radius_left"],
+        right * geometry.radius_right, right * std["radius_right"],
+    )  # fmt: skip
 
 
 def _plain(one: FittedModel) -> dict[str, Any]:
@@ -342,11 +384,21 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
         warnings=tuple(str(warning) for warning in document["warnings"]),
         created=str(document["created"]),
         tool_version=str(document["tool_version"]),
+        sources=_error_sources(document.get("error_sources")),
     )
 
 
-def _controller_errors(document: Mapping[str, Any] | None) -> ControllerErrors | None:
+def _error_sources(document: Mapping[str, Any] | None) -> ErrorSources | None:
     if document is None:
+        return None
+    found = ErrorSources(**{key: float(value) for key, value in document.items()})
+    if not all(np.isfinite(found)) or min(found) < 0.0:
+        raise ValueError("error sources")
+    return found
+
+
+def _controller_errors(document: Mapping[str, Any] | None) -> ControllerErrors | None:
+    if document is None or "pose_variance" not in document:
         return None
     pose, twisted, turn, way = (
         tuple(map(float, document[name])) for name in ("pose_variance", "twist_variance", "turn_noise", "way_noise")

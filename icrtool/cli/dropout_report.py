@@ -258,7 +258,7 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
         from icrtool.logs import read_log
 
         measured = read_log(log, request.config, progress)
-    from icrtool.estimation.fit import fit
+    from icrtool.calibration.fit import fit
 
     run = fit(measured, request.config, smooth=request.smoothed)
     write_run(run, directory, drawer=drawer)

@@ -176,9 +176,9 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
-        options.load_ahead("pymap3d", "icrtool.estimation.fit")
+        options.load_ahead("pymap3d", "icrtool.calibration.fit")
         measured = read_log(log, request.config, progress, start=request.start, end=request.end)
-    from icrtool.estimation.fit import fit
+    from icrtool.calibration.fit import fit
 
     run = fit(
         measured,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from icrtool.calibration.model_comparison import Comparison, compare_models
+from icrtool.calibration.model_comparison import ComparedModels, compare_models
 from icrtool.calibration.pooled import predictor, recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
@@ -144,7 +144,7 @@ def _calibration_rows(
     return tuple(used), models
 
 
-def _compare(compared: Run, run: Run) -> tuple[Comparison | None, str]:
+def _compare(compared: Run, run: Run) -> tuple[ComparedModels | None, str]:
     """Compare the models of a run; where that cannot be, None and why."""
     try:
         return compare_models(compared, measured_headings(run)), ""

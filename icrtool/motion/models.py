@@ -146,8 +146,8 @@ MODELS: dict[str, MotionModel] = {
         MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
         MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
         MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
-        MotionModel("six", "+ side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
-        MotionModel("eight", "+ turn gain", _EIGHT, "with gains that depend on curvature and speed"),
+        MotionModel("six", "ICRs, scales, side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
+        MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains that depend on curvature and speed"),
         MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004"),
         MotionModel("slip", "slip regression", (*_FIVE, "vx_absw", "vy_vw"), "Seegmiller 2014, Baril 2024"),
     )

@@ -81,7 +81,7 @@ class Outage:
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
+class ModelScore:
     """One model's errors.
 
     Attributes
