@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.calibration.held_out import Fold, HeldOut
-from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.calibration.measured_errors import ControllerErrors
+from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.motion.fit import PooledFit
 from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_parameters, track_geometry

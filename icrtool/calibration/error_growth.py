@@ -10,12 +10,12 @@ and the quantiles are scaled so that they hold there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from icrtool.calibration.held_out import HeldOut
-from icrtool.calibration.record import ErrorSources
+from icrtool.calibration.measured_errors import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import sums_at_knots
 from icrtool.motion.models import MotionModel, model_columns, wheel_motion
@@ -37,6 +37,8 @@ DESCENTS = 400
 SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 4.0
 """Of the quantiles; of p95 never less than 1: a few windows do not show that the errors are smaller than normal."""
 
+
+Values = TypeVar("Values", Floats, Complexes)
 
 SOURCES = len(ErrorSources._fields) - 2
 
@@ -99,12 +101,14 @@ def path_errors(
     delay_s : of the wheels relative to the times of the knots
     """
     fixed, axes, columns = model_columns(model, wheel_motion(steps.v_left, steps.v_right, width_m))
-    row, share = steps.locate(ends.knot_t + delay_s)
+    # the sources act all along the path, not at the ends of windows alone
+    at = np.union1d(ends.knot_t + delay_s, steps.t)
+    row, share = steps.locate(at)
     knots, k = len(row), len(parameters)
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
     sums_at_knots(fixed, columns, axes, parameters, steps.held, steps.into, row, share, rate, sums, by)
     theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
-    s, e = ends.start, ends.end
+    s, e = (np.searchsorted(at, ends.knot_t[rows] + delay_s) for rows in (ends.start, ends.end))
     back = np.exp(-1j * theta[s])
     went = place[e] - place[s]
     turned_by = by[:, e, 0] - by[:, s, 0]
@@ -125,9 +129,10 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
     middle_m, middle_rad = (length[1:] + length[:-1]) / 2, (theta[1:] + theta[:-1]) / 2
     middle = (place[1:] + place[:-1]) / 2
 
-    def between(values: Floats) -> Floats:
-        sums = np.concatenate([[0.0], np.cumsum(values)])
-        return np.asarray(sums[e] - sums[s])
+    def between(values: Values) -> Values:
+        sums = np.concatenate([np.zeros(1, values.dtype), np.cumsum(values)])
+        difference: Values = sums[e] - sums[s]
+        return difference
 
     back, went, driven = np.exp(-1j * theta[s]), place[e] - place[s], length[e] - length[s]
     by_rate = 1j * back * (between(step * middle_m) - length[s] * went)

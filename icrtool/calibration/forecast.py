@@ -12,7 +12,7 @@ from icrtool.errors import DataError
 from icrtool.motion.models import MotionModel, model_columns, wheel_motion
 from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
 from icrtool.motion.trials import Trials
-from icrtool.records.tables import Complexes, Floats
+from icrtool.records.tables import Complexes, Floats, Ints
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""
@@ -62,14 +62,13 @@ def forecast_plan(
     DataError
         A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
     """
-    place = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
-    path, chord = place[0], place[1]
+    path, line = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
     step = np.diff(path)
     direction = np.unwrap(np.angle(step))
     # a corner of the plan is turned over the steps around it, not on the spot
     width = max(round(calibration.width_m / STEP_M), 1)
     direction = _smoothed(direction, width)
-    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[chord[:-1]]
+    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
     if not (np.isfinite(speed).all() and speed.min() > 0.0):
         raise DataError("plan", "a speed that is not positive", "give speed_mps in m/s, forward")
     speed = np.maximum(speed, SLOWEST_MPS)
@@ -135,7 +134,7 @@ def _ahead_and_turn(model: MotionModel, parameters: Floats, width_m: float, v: F
     return made[[0, 2]]
 
 
-def _resampled(points: Complexes) -> tuple[Complexes, Floats]:
+def _resampled(points: Complexes) -> tuple[Complexes, Ints]:
     """Return points (n,) a step apart along straight lines between points (p,), and the line (n,) that each lies on."""
     if not np.isfinite(points).all():
         raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
@@ -144,7 +143,8 @@ def _resampled(points: Complexes) -> tuple[Complexes, Floats]:
         raise DataError("plan", f"a path of {length[-1]:.3g} m", f"give 1 m to {LONGEST_PATH_M:g} m")
     at = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
     line = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(points) - 2)
-    return np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag), line
+    place: Complexes = np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag)
+    return place, line
 
 
 def _smoothed(values: Floats, width: int) -> Floats:

@@ -14,6 +14,7 @@ _COMMANDS = {
     "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
     "export": "Print the calibration of a run or of a file for a robot's controller or filter.",
     "fit": "Learn the track ICRs of a robot from its logs.",
+    "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
 @click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="Write the transfer matrix.")
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Write it all as JSON.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 @options.configuration
 @options.verbosity
 def command(
@@ -59,13 +60,13 @@ def command(
             if progress is not None:
                 progress(number / len(found))
     transfer = compare_groups(groups)
-    document = json_bytes(transfer_document(transfer))
-    for file, content in ((csv_file, transfer_csv(transfer)), (output, document)):
+    document = transfer_document(transfer)
+    for file, content in ((csv_file, transfer_csv(transfer)), (output, json_bytes(document))):
         if file is not None:
             with atomic_file(file) as partial:
                 partial.write_bytes(content)
     if as_json:
-        click.echo(document, nl=False)
+        print_json("compare", document)
     elif not quiet:
         click.echo(format_transfer(transfer))
 

@@ -6,13 +6,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS, plot_formats, run_directories
+from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
+from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.options import POSITIVE
+from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -34,6 +36,7 @@ class Request:
     ----------
     horizons_m, outage_s : empty: those of the run's configuration
     config : that of the options; logs are fitted with it
+    prints : results on standard output
     """
 
     config: Config
@@ -49,15 +52,15 @@ class Request:
     formats: tuple[str, ...]
     ladder: bool
     smoothed: bool
+    overwrite: bool
     quiet: bool
+    prints: bool
     verbose: bool
 
 
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
-)
+@options.place
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Report how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
@@ -83,13 +86,15 @@ class Request:
 @click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
+@json_option
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
+    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
+    budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    junit: Path | None, markdown: Path | None, plots: str, seed: int | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
@@ -116,12 +121,25 @@ def command(
         calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
-        smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
+        smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet,
+        prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
-    sources, places = plan_sources(sources, output, config, (junit, markdown))
+    sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
     with picture_process(formats, fits=bool(places)) as drawer:
         outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
+    if as_json:
+        print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
     leave(outcomes, junit=junit, markdown=markdown)
+
+
+def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
+    """Return the outcome of a source as plain data: its report, or the reason why there is none."""
+    from icrtool.errors import IcrToolError
+    from icrtool.output.dropout_directory import report_document
+
+    if isinstance(outcome, IcrToolError):
+        return {"source": escaped(source), "status": "failed", "reason": str(outcome)}
+    return {"source": escaped(source), "status": "done", "report": report_document(outcome)}
 
 
 def picture_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
@@ -145,11 +163,21 @@ def parse_horizons(text: str) -> tuple[float, ...]:
 
 
 def plan_sources(
-    sources: tuple[Path, ...], output: Path | None, config: Config, exports: tuple[Path | None, ...]
+    sources: tuple[Path, ...],
+    places: tuple[Path | None, Path | None],
+    config: Config,
+    exports: tuple[Path | None, ...],
+    *,
+    quiet: bool,
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
     Everything that can be refused without reading a log is refused here.
+
+    Parameters
+    ----------
+    places : -o and --into
+    exports : files to be written
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
@@ -159,9 +187,11 @@ def plan_sources(
         if export is not None:
             check_place(export)
     sources = sources or (newest_run(RUNS),)
+    sources = logs_of(sources, quiet=quiet)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
-    check_configuration(config, runs_only=not logs, output=output)
-    return sources, dict(zip(logs, run_directories(logs, output), strict=True)) if logs else {}
+    output, into = places
+    check_configuration(config, runs_only=not logs, output=output or into)
+    return sources, dict(zip(logs, run_directories(logs, output, into), strict=True)) if logs else {}
 
 
 def report_all(
@@ -171,13 +201,12 @@ def report_all(
     from icrtool.errors import IcrToolError
 
     for number, source in enumerate(sources):
-        if number and not request.quiet:
+        if number and request.prints:
             click.echo()
         try:
             yield source, _report_one(source, places.get(source), request, drawer)
         except IcrToolError as err:
-            if len(sources) > 1:
-                click.echo(f"Error: {err}", err=True)
+            options.report_error(err, source)
             yield source, err
 
 
@@ -190,13 +219,9 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
         write_junit(junit, outcomes)
     if markdown is not None:
         write_markdown(markdown, outcomes)
-    failed = [outcome for _, outcome in outcomes if isinstance(outcome, IcrToolError)]
-    if len(failed) == len(outcomes) == 1:
-        raise failed[0]
-    if failed:
-        raise options.not_all_used(len(failed), len(outcomes), "runs and logs")
-    if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
-        raise SystemExit(3)
+    failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
+    missed = any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError))
+    options.leave(failed, len(outcomes), "runs and logs", gate_failed=missed)
 
 
 def check_configuration(config: Config, *, runs_only: bool, output: Path | None) -> None:
@@ -216,7 +241,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
     run = _read(source) if place is None else _fit(source, place, request, drawer)
     directory = source if place is None else place
     report = _analyse(run, directory, request, drawer)
-    if not request.quiet:
+    if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
         click.echo(format_dropout(report))
@@ -251,9 +276,9 @@ def _read(directory: Path) -> Run:
 
 def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> Run:
     """Fit a log and write its run directory, as `icrtool fit` does."""
-    from icrtool.output.run_directory import check_target, write_run
+    from icrtool.output.run_directory import check_target, replaced_log, write_run
 
-    check_target(directory)
+    check_target(directory, log, overwrite=request.overwrite)
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
@@ -261,8 +286,11 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     from icrtool.calibration.fit import fit
 
     run = fit(measured, request.config, smooth=request.smoothed)
-    write_run(run, directory, drawer=drawer)
-    options.warn(run.warnings, quiet=request.quiet)
+    notes: list[str] = []
+    if (before := replaced_log(directory, run)) is not None:
+        notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
+    write_run(run, directory, drawer=drawer, note=notes.append)
+    options.warn((*run.warnings, *notes), quiet=request.quiet)
     if request.verbose:
         for stream in measured.streams:
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path, PurePosixPath
@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from icrtool.errors import OutputError
 from icrtool.output import disk
 from icrtool.output.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
+from icrtool.records.unfinished import end, unfinished
 
 IsOurs = Callable[[Path], bool]
 """Whether a directory is one that we wrote and may replace."""
@@ -71,6 +72,7 @@ def atomic_directory(
     *,
     kind: str,
     names: Collection[str] = (),
+    made_from: Sequence[str] = (),
     note: Callable[[str], None] | None = None,
 ) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
@@ -81,6 +83,7 @@ def atomic_directory(
     ----------
     directory, ours, kind : as in `check_place`
     names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
+    made_from : absolute paths of the files that the content is made from
     note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
 
     Yields
@@ -103,11 +106,12 @@ def atomic_directory(
         for left in _hidden(place):
             _clean(left, place, names)
         partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
-        partial.mkdir()
-        with disk.locked(partial):
-            yield partial
-            check_place(place, ours, kind=kind)
-            done = _put(partial, place, kind, names)
+        with unfinished(partial):
+            partial.mkdir()
+            with disk.locked(partial):
+                yield partial
+                check_place(place, ours, kind=kind)
+                done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:
             note(f"{directory}: {done}")
@@ -137,10 +141,10 @@ def restore(directory: Path, ours: IsOurs) -> None:
         disk.rename(max(aside, key=lambda path: path.stat().st_mtime_ns), place)
 
 
-def _put(partial: Path, place: Path, kind: str, names: Collection[str]) -> str:
+def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_from: Sequence[str]) -> str:
     """Move `partial` to `place`; return a line about what the replacement removed and kept, empty where nothing."""
     new = set(files_in(partial))
-    write_own_files(partial, kind)
+    write_own_files(partial, kind, made_from)
     removed: list[PurePosixPath] = []
     kept: list[PurePosixPath] = []
     replaces = place.exists()
@@ -153,7 +157,9 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str]) -> str:
                 place, f"holds {_listed(lost, set())}, which icrtool did not write", "move it elsewhere first"
             )
     disk.sync_tree(partial)
-    old = _exchange(partial, place) if replaces else None
+    # From here on its name may be that of the old directory, whose files are looked after below.
+    end(partial)
+    old = exchange(partial, place) if replaces else None
     if old is None:
         disk.rename(partial, place)
     disk.sync(place.parent)
@@ -167,8 +173,8 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str]) -> str:
     return f"replaced: {'; '.join(parts)}" if parts else ""
 
 
-def _exchange(partial: Path, place: Path) -> Path:
-    """Put `partial` into the place of a directory; return where that one is now."""
+def exchange(partial: Path, place: Path) -> Path:
+    """Put `partial` into the place of a directory, in one step where that can be; return where the old one is now."""
     if disk.exchange(partial, place):
         return partial
     old = partial.with_suffix(".old")

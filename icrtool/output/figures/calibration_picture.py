@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from icrtool.calibration.findings import Calibration
 from icrtool.errors import OutputError
@@ -25,7 +27,24 @@ def check_picture(file: Path) -> None:
 
 
 def write_picture(calibration: Calibration, file: Path) -> None:
-    """Draw a calibration; the suffix says in which format.
+    """Draw a calibration; the suffix decides the format.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+
+    def draw() -> object:
+        from icrtool.output.figures.calibration import draw_calibration
+
+        return draw_calibration(calibration)
+
+    save_picture(draw, file)
+
+
+def save_picture(draw: Callable[[], Any], file: Path) -> None:
+    """Write the figure that `draw` makes, in our style; the suffix decides the format.
 
     Raises
     ------
@@ -34,8 +53,7 @@ def write_picture(calibration: Calibration, file: Path) -> None:
     """
     form = file.suffix.removeprefix(".").lower()
     with atomic_file(file) as partial, matplotlib_unsaid():
-        from icrtool.output.figures.calibration import draw_calibration
         from icrtool.output.figures.style import save, style
 
         with style():
-            save(draw_calibration(calibration), partial.with_suffix(""), (form,))
+            save(draw(), partial.with_suffix(""), (form,))
