@@ -22,7 +22,7 @@ from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import SECTIONS, builtin_robots, load_config
 
 ROOT = Path(__file__).resolve().parents[1]
-SCHEMA = re.compile(r"icrtool/\w+/\d+")
+SCHEMA = re.compile(r"icrtool/[a-z-]+/\d+")
 """Names of JSON schemas look like paths."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
