@@ -39,10 +39,11 @@ NAMES = (
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.15, 0.5])
+PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5])
 """They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
 far to either side. Delays of position and heading of one
-robot usually agree to 0.15 s."""
+robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without that, a drive at
+constant speed does not separate the drift from unequal wheels."""
 
 MIDDLE_STD_M = 0.1
 """The middle of the ICRs lies this near to the antenna, to either side."""
@@ -79,13 +80,29 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
+class WindowResiduals(NamedTuple):
+    """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
+
+    Attributes
+    ----------
+    before, after : (2, w) along and across the heading [m], prediction minus measurement
+    turn_before, turn_after : (u,) of the heading changes [rad]; turn_rad : (u,) as measured
+    """
+
+    before: Floats
+    after: Floats
+    turn_before: Floats
+    turn_after: Floats
+    turn_rad: Floats
+
+
 class AlignmentFit(NamedTuple):
     """The parameters in the order of `NAMES`, with covariance.
 
     Attributes
     ----------
     fit : the robust fit; width_m : b that w was formed with
-    windows : DriveWindows it was made of
+    windows : DriveWindows it was made of, cut from drive
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
@@ -93,6 +110,7 @@ class AlignmentFit(NamedTuple):
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
+    drive: DriveArrays
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -128,6 +146,19 @@ class AlignmentFit(NamedTuple):
         # at one speed, positions that lag look like an antenna further back
         covariance[2, 2] += (self.turning_speed_mps * RESPONSE_STD_S) ** 2
         return Geometry(values, covariance)
+
+
+def window_residuals(found: AlignmentFit) -> WindowResiduals:
+    """Return the residuals of all windows before and after the estimate."""
+    model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
+    neutral = PRIOR_MEAN.copy()
+    neutral[K] = found.fit.x[K]
+    parts = []
+    for x in (neutral, found.fit.x):
+        residual, _ = model.evaluate(x)
+        parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
+    (before, turn_before), (after, turn_after) = parts
+    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
 
 
 def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
@@ -167,16 +198,18 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         fit = robust_least_squares(
             model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
         )
+        covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
     except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(covariance).all():
         # exact data on one circle: nothing separates the parameters
         return None
-    covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
     covariance[TH, TH] += RESPONSE_STD_S**2
     if not drive.same_clock:
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
     weight = drive.wheel_dt * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed)
+    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive)
 
 
 class _Model:

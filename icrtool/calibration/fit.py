@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,7 @@ def fit(
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
     smooth: bool = False,
+    watch: Callable[[str], None] | None = None,
 ) -> Run:
     """Learn a robot's track ICRs from a log, and which motion model to use.
 
@@ -33,6 +35,7 @@ def fit(
     warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
     changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
     smooth : also make the states of the RTS smoother
+    watch : called with the name of each stage when it begins
 
     Returns
     -------
@@ -46,7 +49,7 @@ def fit(
     ConfigError
         A start that preset ``field`` does not take.
     """
-    run = fit_filter(log, config, warm_start=warm_start, changes_s=changes_s, smooth=smooth)
+    run = fit_filter(log, config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
     return replace(run, summary=run.summary | {"recommended": recommendation(run)})
 
 

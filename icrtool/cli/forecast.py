@@ -11,6 +11,8 @@ from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from icrtool.calibration.forecast import Forecast
     from icrtool.calibration.record import Calibration
 
@@ -57,7 +59,7 @@ def command(
             partial.write_text(forecast_csv(forecast), encoding="utf-8")
     if plot is not None:
 
-        def draw() -> object:
+        def draw() -> Figure:
             from icrtool.output.figures.forecast import draw_forecast
 
             return draw_forecast(forecast, path.name, budgets)

@@ -1,16 +1,19 @@
-"""The picture of a calibration as a file that appears whole or not at all."""
+"""The picture of a calibration as an atomic file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from icrtool.calibration.findings import Calibration
+from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
 from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.figures.drawing_process import matplotlib_unsaid
 from icrtool.output.run_directory import PLOT_FORMATS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def check_picture(file: Path) -> None:
@@ -26,8 +29,8 @@ def check_picture(file: Path) -> None:
     check_place(file)
 
 
-def write_picture(calibration: Calibration, file: Path) -> None:
-    """Draw a calibration; the suffix decides the format.
+def write_picture(name: str, residuals: WindowResiduals, file: Path) -> None:
+    """Draw the residuals of a calibration; the suffix gives the format.
 
     Raises
     ------
@@ -35,16 +38,16 @@ def write_picture(calibration: Calibration, file: Path) -> None:
         The file cannot be written.
     """
 
-    def draw() -> object:
+    def draw() -> Figure:
         from icrtool.output.figures.calibration import draw_calibration
 
-        return draw_calibration(calibration)
+        return draw_calibration(name, residuals)
 
     save_picture(draw, file)
 
 
-def save_picture(draw: Callable[[], Any], file: Path) -> None:
-    """Write the figure that `draw` makes, in our style; the suffix decides the format.
+def save_picture(draw: Callable[[], Figure], file: Path) -> None:
+    """Write the figure that `draw` makes, in our style; the suffix gives the format.
 
     Raises
     ------
