@@ -14,7 +14,7 @@ from icrtool.errors import DataError
 from icrtool.motion.fit import PooledFit
 from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_parameters, track_geometry
 from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import path_at, twist_rates
+from icrtool.motion.trials import drawn_path, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Floats
 
@@ -161,7 +161,7 @@ def _fold_misses(recording: Recording, windows: Windows, fold: Fold, fit: Pooled
     s, e = windows.start[mine], windows.end[mine]
     geometry = track_geometry(fit.model, fit.parameters, recording.width_m, typical)
     rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=windows.steps)
-    theta, place = path_at(windows.steps, rates, windows.knot_t)
+    theta, place = drawn_path(windows.steps, rates)(windows.knot_t)
     miss = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
     turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]
     turned = theta[e] - theta[s] - turn

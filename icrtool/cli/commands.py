@@ -20,6 +20,7 @@ _COMMANDS = {
     "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
+    "report": "Write a run, a fleet or a comparison as one HTML file.",
     "robots": "List the built-in robots, with their numbers and sources.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",

@@ -63,18 +63,16 @@ def trial_errors(
 
     Notes
     -----
-    Euler steps as in `icrtool.kernels.open_loop`. The parameters are constants, so the path from any start is the same
-    path, turned and shifted: one pass serves all.
+    The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
     drive = recording.drive
-    read_s = recording.t_s + wheels_delay_s
     reference = drive.north + 1j * drive.east
     errors: Floats = np.full(trials.ends.shape, np.nan)
     if steps is None:
-        at_states = path_at(joined_steps(recording, 1), rates, read_s)
-        path: PathAt = lambda rows: (at_states[0][rows], at_states[1][rows])  # noqa: E731 - one of two
+        places, headings = wheels_path(recording, rates, wheels_delay_s)
+        path: PathAt = lambda rows: (headings[rows], places[rows])  # noqa: E731 - one of two
     else:
-        drawn = drawn_path(steps, rates)
+        drawn, read_s = drawn_path(steps, rates), recording.t_s + wheels_delay_s
         path = lambda rows: drawn(read_s[rows])  # noqa: E731 - the other
     heading, begin = path(trials.starts)
     turn = np.exp(1j * (drive.heading[trials.starts] - heading))
@@ -90,18 +88,32 @@ PathAt = Callable[[Any], tuple[Floats, Complexes]]
 """Gives heading and place of a path at rows or times."""
 
 
-def path_at(steps: Steps, rates: Floats, at: Floats) -> tuple[Floats, Complexes]:
-    """Return heading (m,) [rad] and place (m,) [m], forward + j right, at times (m,) [s], from zero at the first step.
+def wheels_path(recording: Recording, rates: Floats, wheels_delay_s: float = 0.0) -> tuple[Complexes, Floats]:
+    """Return the path that a twist makes from the origin, at every state.
+
+    Parameters
+    ----------
+    rates, wheels_delay_s : as in `trial_errors`
+
+    Returns
+    -------
+    complex (n,), forward + j right of the first heading [m]; float64 (n,), clockwise turn since the first state [rad].
+
+    Notes
+    -----
+    Euler steps as in `icrtool.kernels.open_loop`; nothing moves through a gap in the wheel data.
+    """
+    heading, place = drawn_path(joined_steps(recording, 1), rates)(recording.t_s + wheels_delay_s)
+    return place, heading
+
+
+def drawn_path(steps: Steps, rates: Floats) -> PathAt:
+    """Return what gives heading (m,) [rad] and place (m,) [m], forward + j right, at times (m,) [s], from zero.
 
     Parameters
     ----------
     rates : (3, n) body twist of each step
     """
-    return drawn_path(steps, rates)(at)
-
-
-def drawn_path(steps: Steps, rates: Floats) -> PathAt:
-    """Return what gives heading and place at times, as `path_at`."""
     v_x, v_y, omega = rates
     turned = steps.held * omega
     heading = np.concatenate([[0.0], np.cumsum(turned)])

@@ -98,11 +98,11 @@ def headline(report: DropoutReport) -> list[str]:
         return []
     fitted, numbers = calibration.fitted, calibration.controller_numbers()
     interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
-    without = f"; without slip model: {_reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {_reach_text(best)}{interval}{without}.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
         f"Controller: {controller_text(numbers._asdict())}.",
     ]
 
@@ -122,8 +122,8 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
-        more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)} ({first.label}){more}")
+        more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
+        lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
     return lines
 
 
@@ -144,7 +144,8 @@ def ratio_text(numerator: float, denominator: float) -> str:
     return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
 
 
-def _reach_text(one: BudgetDistance) -> str:
+def reach_text(one: BudgetDistance) -> str:
+    """Return how far a model stays within a budget."""
     if one.beyond:
         return f"more than {one.distance_m:g} m"
     low, high = one.between_m
