@@ -11,8 +11,6 @@ from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from icrtool.config import Config
     from icrtool.records.run import Run
 
@@ -41,7 +39,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.atomic_file import atomic_file, check_place
-    from icrtool.output.figures.calibration_picture import check_picture, save_picture
+    from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
     from icrtool.output.run_directory import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
@@ -66,13 +64,7 @@ def command(
             with atomic_file(file) as partial:
                 partial.write_bytes(content)
     if plot is not None:
-
-        def draw() -> Figure:
-            from icrtool.output.figures.transfer import draw_transfer
-
-            return draw_transfer(transfer)
-
-        save_picture(draw, plot)
+        write_transfer_picture(transfer, plot)
     if as_json:
         print_json("compare", document)
     elif not quiet:

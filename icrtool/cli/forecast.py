@@ -11,8 +11,6 @@ from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from icrtool.calibration.forecast import Forecast
     from icrtool.calibration.record import Calibration
 
@@ -45,7 +43,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.calibration_file import open_calibration
-    from icrtool.output.figures.calibration_picture import check_picture, save_picture
+    from icrtool.output.figures.calibration_picture import check_picture, write_forecast_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast
 
     if output is not None:
@@ -58,13 +56,7 @@ def command(
         with atomic_file(output) as partial:
             partial.write_text(forecast_csv(forecast), encoding="utf-8")
     if plot is not None:
-
-        def draw() -> Figure:
-            from icrtool.output.figures.forecast import draw_forecast
-
-            return draw_forecast(forecast, path.name, budgets)
-
-        save_picture(draw, plot)
+        write_forecast_picture(forecast, path.name, budgets, plot)
     if as_json:
         print_json("forecast", forecast_document(forecast, calibration, budgets))
     elif not quiet:

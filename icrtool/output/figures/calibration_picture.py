@@ -15,6 +15,9 @@ from icrtool.output.run_directory import PLOT_FORMATS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.transfer import Transfer
+
 
 def check_picture(file: Path) -> None:
     """Refuse a place or a format that cannot be written, before any work is done for it.
@@ -42,6 +45,28 @@ def write_picture(name: str, residuals: WindowResiduals, file: Path) -> None:
         from icrtool.output.figures.calibration import draw_calibration
 
         return draw_calibration(name, residuals)
+
+    save_picture(draw, file)
+
+
+def write_forecast_picture(forecast: Forecast, title: str, budgets_m: tuple[float, ...], file: Path) -> None:
+    """Draw a forecast, as `write_picture`."""
+
+    def draw() -> Figure:
+        from icrtool.output.figures.forecast import draw_forecast
+
+        return draw_forecast(forecast, title, budgets_m)
+
+    save_picture(draw, file)
+
+
+def write_transfer_picture(transfer: Transfer, file: Path) -> None:
+    """Draw compared groups, as `write_picture`."""
+
+    def draw() -> Figure:
+        from icrtool.output.figures.transfer import draw_transfer
+
+        return draw_transfer(transfer)
 
     save_picture(draw, file)
 

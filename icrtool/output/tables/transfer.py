@@ -88,10 +88,9 @@ def verdict(transfer: Transfer, pair: Pair) -> str:
     cost = transfer.cost(pair.first, pair.second, CHOICE_HORIZON_M)
     if not math.isfinite(cost.p95_m):
         return f"The multiplier of {pair.second} differs from that of {pair.first} {change}."
-    if math.isfinite(cost.p95_low_m) and cost.p95_low_m <= 0.0 <= cost.p95_high_m:
-        sentence = f"is as good as its own on {pair.second}, within chance ({_change(cost[3:6])} at 95 %, 10 m)"
-    else:
-        sentence = f"costs {_change(cost[3:6])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
+    sentence = f"costs {_change(cost[3:6])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
+    if cost.p95_low_m <= 0.0 <= cost.p95_high_m:
+        sentence += ", which may be chance"
     return (
         f"The multiplier of {pair.second} differs from that of {pair.first} {change}; a calibration of {pair.first} "
         f"{sentence}."
