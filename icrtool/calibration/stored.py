@@ -8,11 +8,11 @@ from typing import Annotated, Any, TypedDict, TypeVar
 import msgspec
 import numpy as np
 
+from icrtool.calibration.measured_errors import controller_errors_of, error_sources_of
 from icrtool.calibration.record import (
     CALIBRATION_SCHEMA,
     Calibration,
     CalibrationLog,
-    ControllerErrors,
     FittedModel,
     HeldOutScore,
 )
@@ -25,7 +25,7 @@ WIDEST_M = 20.0
 LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
-Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore, ControllerErrors)
+Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore)
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
@@ -54,7 +54,7 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
     """
     if document["schema"] != CALIBRATION_SCHEMA:
         raise ValueError(f"schema {document['schema']!r}")
-    gyro, controller = document["gyro"], document["controller"]
+    gyro = document["gyro"]
     try:
         found = Calibration(
             robot=_robot(document["robot"]),
@@ -65,10 +65,11 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
             why=_text(document["why"]),
             logs=tuple(_record(CalibrationLog, log) for log in document["logs"]),
             held_out=tuple(_record(HeldOutScore, score) for score in document["held_out"]),
-            controller=None if controller is None else _controller_errors(controller),
+            controller=controller_errors_of(document["controller"]),
             warnings=tuple(map(_text, document["warnings"])),
             created=_text(document["created"]),
             tool_version=_text(document["tool_version"]),
+            sources=error_sources_of(document.get("error_sources")),
         )
     except msgspec.ValidationError as err:
         raise ValueError(str(err)) from err
@@ -96,11 +97,6 @@ def _record(kind: type[Record], document: Mapping[str, Any]) -> Record:
     given: tuple[Any, ...] = kind(**document)
     values = [float("nan") if value is None else escaped(value) if isinstance(value, str) else value for value in given]
     return msgspec.convert(values, kind)
-
-
-def _controller_errors(document: Mapping[str, Any]) -> ControllerErrors:
-    """Return the errors of a controller; its other numbers, which follow from the model, are computed again."""
-    return _record(ControllerErrors, {name: document[name] for name in ControllerErrors._fields})
 
 
 def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:
