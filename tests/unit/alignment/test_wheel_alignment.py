@@ -11,8 +11,9 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.tables import GyroSamples, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
@@ -181,3 +182,30 @@ def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     filled, note = bridged(short, 0.5)
     assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
     assert note.startswith("1 gaps")
+
+
+def test_a_robot_on_a_stand_is_refused() -> None:
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    count = len(log.gnss.north_m)
+    gnss = replace(log.gnss, north_m=rng.normal(3.0, 0.01, count), east_m=rng.normal(-2.0, 0.01, count))
+    heading = replace(log.heading, heading_rad=rng.normal(0.4, 0.01, len(log.heading.heading_rad)))
+    with pytest.raises(DataError, match="the robot does not move"):
+        fit(replace(log, gnss=gnss, heading=heading), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("message_type", "share", "warned"),
+    [("nav_msgs/Odometry", 1.0, True), ("nav_msgs/Odometry", 0.9, False), ("sensor_msgs/JointState", 1.0, False)],
+)
+def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: float, warned: bool) -> None:
+    """A turn rate of the wheels that is the gyro's was not measured by wheels."""
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    speed = (log.wheels.v_left_mps + log.wheels.v_right_mps) / 2
+    rate = np.gradient(np.unwrap(log.heading.heading_rad), 0.02)
+    rate = np.convolve(rate, np.ones(50) / 50, "same") + rng.normal(0.0, 0.002, len(rate))
+    turn = share * rate + (1.0 - share) * rng.normal(0.0, 0.3, len(rate))
+    streams = tuple(replace(stream, message_type=message_type) for stream in log.streams)
+    gyro = GyroSamples("/imu", log.wheels.stamp_ns, rate)
+    fused = replace(with_wheels(log, speed + 0.4 * turn, speed - 0.4 * turn), streams=streams, gyro=gyro)
+    warnings = align_streams(fused, CONFIG).warnings
+    assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned
