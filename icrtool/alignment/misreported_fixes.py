@@ -14,7 +14,8 @@ USUAL_M2 = 2 * 0.005**2
 
 STRETCH_VARIANCE = 9.0
 """A stretch whose white noise has this many times the usual variance is float by itself, unless its messages state
-that it is fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where it parks.
+that it is fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where
+it parks.
 """
 
 BESIDE_JUMP = 5
