@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from icrtool.errors import IcrToolError
     from icrtool.logs import read_log
     from icrtool.output.calibration_file import open_calibration
+    from icrtool.output.page.run_page import write_page
     from icrtool.output.stored_run import open_run
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
@@ -64,6 +65,7 @@ __all__ = [
     "open_calibration",
     "open_run",
     "read_log",
+    "write_page",
 ]
 
 _HOMES = {
@@ -82,6 +84,7 @@ _HOMES = {
     "open_calibration": "icrtool.output.calibration_file",
     "open_run": "icrtool.output.stored_run",
     "read_log": "icrtool.logs",
+    "write_page": "icrtool.output.page.run_page",
 }
 
 
