@@ -15,7 +15,9 @@ from icrtool.records.tables import Bools, Floats, Ints, PositionFixes, RobotLog,
 WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
-"""The distance by the position reference is compared with that of the wheels over straight windows of this length."""
+STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
+"""The distance by the position reference is compared with that of the wheels over windows of this length: straight ones,
+in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
 
 FASTEST_MPS = 100.0
 """No robot on wheels or tracks is faster: a number over it is damage, and would make a distance of any length."""
@@ -98,7 +100,13 @@ def _side_scale(scale: float | str) -> float:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over straight windows; None where too few are straight."""
+    """Compare distances by reference and wheels over windows; None where too few windows show one.
+
+    Notes
+    -----
+    Straight windows where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
+    before and after. Senses of the wheels do not matter.
+    """
     if len(gnss.stamp_ns) < 2:
         return None
     begin, end, window = max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9)
@@ -114,14 +122,23 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     sides = []
     for speed in (left, right):
         travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])
-        sides.append(np.diff(np.interp(moments, stamps, travelled)))
+        sides.append(np.abs(np.diff(np.interp(moments, stamps, travelled))))
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
-    chord = np.hypot(np.diff(gnss.north_m[places]), np.diff(gnss.east_m[places]))
+    step = np.diff(gnss.north_m[places]) + 1j * np.diff(gnss.east_m[places])
+    chord = np.abs(step)
     whole = np.abs(np.diff(moments) / 1e9 - WINDOW_S) < WINDOW_S / 4
-    straight = whole & (turn < 0.1 * np.abs(distance)) & (chord > LEAST_MOVE_M) & (np.abs(distance) > 0)
+    usable = whole & (chord > LEAST_MOVE_M) & (distance > 0)
+    straight = usable & (turn < STRAIGHT * distance)
+    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+        bend = np.full(len(step), np.inf)
+        bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
+        beside = usable.copy()
+        beside[1:-1] &= usable[2:] & usable[:-2]
+        straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
+        chord[straight] /= np.sinc(bend[straight] / 2 / math.pi)
     if np.count_nonzero(straight) < FEWEST_WINDOWS:
         return None
-    ratio = chord[straight] / np.abs(distance[straight])
+    ratio = chord[straight] / distance[straight]
     centre = float(np.median(ratio))
     return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)), len(ratio))
 
@@ -147,15 +164,15 @@ def _metres_per_unit(
     if scale is None and unit == "unknown":
         raise ConfigError(
             "wheels.quantity",
-            f"{topic} names no unit, and the log has no straight driving to find it from",
-            "drive straight for some metres; where they are ticks, give --set wheels.quantity=counts",
+            f"{topic} names no unit, and the log has too little driving to find it from",
+            "drive for half a minute; where they are ticks, give --set wheels.quantity=counts",
         )
     lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
     if scale is None:
         raise ConfigError(
             lacking,
             f"needed to read {topic}, which is in {unit}",
-            f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
+            f"give it with --set {lacking}=…; the log has too little driving to find the scale from",
         )
     how = f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
     why = "no unit that the robot's keys know fits" if radius and counts else f"{lacking} is not given"
