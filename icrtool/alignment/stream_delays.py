@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.records.tables import RobotLog
+from icrtool.alignment.estimator import SLIPPING, AlignmentFit
+from icrtool.config import Config
+from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
 SIGNIFICANT_SIGMAS = 2.5
-SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.06
-"""A robot answers its wheels late by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
+SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1
+"""A robot follows its wheels by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
 
 
@@ -21,10 +24,14 @@ class Delay(NamedTuple):
     std_s: float
 
     @property
+    def is_certain(self) -> bool:
+        """Whether it is known well, and not zero."""
+        return self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
+
+    @property
     def is_clear(self) -> bool:
-        """Whether it is certain and large enough to be corrected."""
-        certain = self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
-        return certain and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
+        """Whether it is certain and more than a robot's response to its wheels."""
+        return self.is_certain and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -36,13 +43,16 @@ class StreamDelays:
 
     Attributes
     ----------
-    heading, gnss : as measured
+    heading, gnss : as measured; apart : of the position against the heading
+    together : position and heading are fields of the same messages
     applied_heading_s, applied_gnss_s : corrected
     """
 
     log: RobotLog
     heading: Delay
     gnss: Delay
+    apart: Delay
+    together: bool
     applied_heading_s: float
     applied_gnss_s: float
     warnings: tuple[str, ...]
@@ -63,3 +73,87 @@ class StreamDelays:
             "delay_s": self.gnss.value_s if known else None,
             "delay_std_s": self.gnss.std_s if known else None,
         }
+
+
+def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
+    """Return the delays of heading and positions against the wheels, with what is clear, or configured, corrected."""
+    field = config.filter.preset == "field"
+    found = {"heading": UNKNOWN, "position": UNKNOWN}
+    apart = UNKNOWN
+    if fit is not None:
+        for what in found:
+            value, std = fit.estimate(f"{what}_delay")
+            found[what] = Delay(value, std) if std < 2 * LARGEST_STD_S else UNKNOWN
+        apart = Delay(*fit.estimate("position_after_heading"))
+    topics = {stream.role: stream.topic for stream in log.streams}
+    together = "gnss" in topics and topics["gnss"] == topics.get("heading")
+    given = {"heading": config.frames.heading_delay_s, "position": config.frames.reference_delay_s}
+    applied, notes = {"heading": 0.0, "position": 0.0}, []
+    if field and fit is not None and fit.slip_std <= SLIPPING:
+        applied = _clear_delays(found["heading"], found["position"], apart, together=together)
+        notes = _delay_notes(log.name, applied, {**found, "apart": apart}, given, together=together)
+    for what, setting in given.items():
+        if field and setting != "auto":
+            applied[what] = setting
+    if together:
+        applied["heading"] = 0.0
+    shifted = delayed(log, applied["position"])
+    if applied["heading"] and not together:
+        shift = round(applied["heading"] * 1e9)
+        moved: HeadingSamples = replace(shifted.heading, stamp_ns=shifted.heading.stamp_ns - shift)
+        shifted = replace(shifted, heading=moved)
+    return StreamDelays(
+        shifted, found["heading"], found["position"], apart, together,
+        applied["heading"], applied["position"], tuple(notes),
+    )  # fmt: skip
+
+
+def delayed(log: RobotLog, delay_s: float) -> RobotLog:
+    """Return the log with the position reference taken `delay_s` earlier.
+
+    The heading goes with it where both come from the same messages.
+    """
+    if delay_s == 0.0:
+        return log
+    shift = round(delay_s * 1e9)
+    gnss: PositionFixes = replace(log.gnss, stamp_ns=log.gnss.stamp_ns - shift)
+    topics = {stream.role: stream.topic for stream in log.streams}
+    heading: HeadingSamples = log.heading
+    if topics.get("gnss") == topics.get("heading", ""):
+        heading = replace(heading, stamp_ns=heading.stamp_ns - shift)
+    return replace(log, gnss=gnss, heading=heading)
+
+
+def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> dict[str, float]:
+    """Return the delays to correct: that against the wheels, and that of position and heading against each other.
+
+    Of two streams that are apart, the one that lags the wheels is moved: stamps that lead need a clock that is wrong.
+    """
+    if together:
+        common = position.value_s if position.is_clear else 0.0
+        return {"heading": common, "position": common}
+    if apart.is_certain and apart.value_s < 0.0:
+        late = position.value_s if position.is_clear else 0.0
+        return {"heading": late - apart.value_s, "position": late}
+    late = heading.value_s if heading.is_clear else 0.0
+    return {"heading": late, "position": late + (apart.value_s if apart.is_certain else 0.0)}
+
+
+def _delay_notes(
+    name: str, applied: dict[str, float], found: dict[str, Delay], given: Mapping[str, float | str], *, together: bool
+) -> list[str]:
+    """Return a line for each stream that was moved."""
+    notes = []
+    keys = {"heading": "frames.heading_delay_s", "position": "frames.reference_delay_s"}
+    for what, key in keys.items():
+        value = applied[what]
+        if value == 0.0 or given[what] != "auto" or (together and what == "heading"):
+            continue
+        if not together and what == "position" and value == applied["heading"]:
+            notes.append(f"{name}: the position is corrected alike: nothing shows that its delay differs")
+            continue
+        subject = "the position and its heading" if together else f"the {what}"
+        lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
+        std = (found[what] if found[what].is_certain else found["apart"]).std_s
+        notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
+    return notes

@@ -16,8 +16,8 @@ WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
-"""The distance by the position reference is compared with that of the wheels over windows of this length: straight ones,
-in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
+"""The distance by the position reference is compared with that of the wheels over windows of this length: straight
+ones, in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
 
 FASTEST_MPS = 100.0
 """No robot on wheels or tracks is faster: a number over it is damage, and would make a distance of any length."""
@@ -41,8 +41,8 @@ class Scale:
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
 
-    What no wheel can have done is left out; configured scales of the sides are applied. What was used, and what had
-    to be estimated, stands in the stream's ``why`` and in the warnings.
+    What no wheel can have done is left out. What was used, and what had to be estimated, stands in the stream's
+    ``why`` and in the warnings.
 
     Raises
     ------
@@ -58,8 +58,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
     warnings = [f"{log.name}: {note}" for note in estimated]
     with np.errstate(over="ignore"):
-        left = wheels.left * factor * _side_scale(config.wheels.left_scale)
-        right = wheels.right * factor * _side_scale(config.wheels.right_scale)
+        left, right = wheels.left * factor, wheels.right * factor
     stamps = wheels.stamp_ns
     possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
     if not possible.all():
@@ -92,11 +91,6 @@ def _spikes(speed: Floats) -> Bools:
     usual = float(np.quantile(size, USUAL_SHARE))
     spikes: Bools = (size > max(SPIKE_MPS, SPIKE_RATIO * usual)) & (size > SPIKE_RATIO * around)
     return spikes
-
-
-def _side_scale(scale: float | str) -> float:
-    """Return a side's configured scale; ``auto`` is 1 here, and judged where position and heading are known."""
-    return scale if isinstance(scale, float | int) else 1.0
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
