@@ -113,6 +113,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     drive = _apply_to_drive(drive, decision.convention)
     notes += convention_notes(decision, corrects=corrects)
     mirrored = decision.convention.heading < 0
+    pose_mirrored = mirrored and decision.convention.position < 0 and drive.same_clock
     if derived is None and config.frames.heading != "auto":
         free_hand = decide_conventions(drive, windows, metric=False)
         if free_hand.convention.heading < 0:
@@ -139,7 +140,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         log, a, a_std, applied, (abs(configured[0]), abs(configured[1])), share,
         tuple(f"{log.name}: {note}" for note in notes), course,
     )  # fmt: skip
-    heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored)
+    heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored, pose_mirrored=pose_mirrored)
     delays = find_delays(log, config, fit)
     log = delays.log
     return AlignedStreams(
@@ -188,9 +189,12 @@ def _turned_over(log: RobotLog) -> RobotLog:
 
 def _heading_check(
     log: RobotLog, config: Config, fit: AlignmentFit | None, course: Course, derived: DerivedHeading | None,
-    *, mirrored: bool,
+    *, mirrored: bool, pose_mirrored: bool,
 ) -> HeadingCheck:  # fmt: skip
-    """Return the heading's offset and noise, and what is applied."""
+    """Return the heading's offset and noise, and what is applied.
+
+    `pose_mirrored`: position and heading are fields of the same poses, both mirrored.
+    """
     given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
     fixed = -math.radians(given) if given != "auto" and corrects else 0.0
     nothing = (math.nan,) * 5
@@ -209,7 +213,7 @@ def _heading_check(
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
     scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
-    rest = offset + math.pi / 2 if mirrored else offset
+    rest = offset + math.pi / 2 if mirrored and not pose_mirrored else offset
     significant = _significant(offset - fixed, std)
     begin = int(log.wheels.stamp_ns[0])
     name = name_offset(rest, std, log.datum, begin) if _significant(rest, std) else NO_NAME
@@ -218,6 +222,9 @@ def _heading_check(
     applied, notes = fixed, []
     if mirrored and not corrects:
         notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+    elif mirrored and pose_mirrored:
+        applied = offset if given == "auto" else fixed
+        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
     elif mirrored:
         applied = offset if given == "auto" else fixed
         notes.append(

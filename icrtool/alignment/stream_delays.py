@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.alignment.estimator import SLIPPING, AlignmentFit
+from icrtool.alignment.estimator import SLIPPING, USUAL_APART_S, AlignmentFit
 from icrtool.config import Config
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
@@ -23,15 +23,14 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
-    @property
-    def is_certain(self) -> bool:
-        """Whether it is known well, and not zero."""
-        return self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
+    def differs_from(self, usual_s: float) -> bool:
+        """Return whether it is known well, and is not the usual one."""
+        return self.std_s < LARGEST_STD_S and abs(self.value_s - usual_s) > SIGNIFICANT_SIGMAS * self.std_s
 
     @property
     def is_clear(self) -> bool:
         """Whether it is certain and more than a robot's response to its wheels."""
-        return self.is_certain and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
+        return self.differs_from(0.0) and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -132,11 +131,12 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     if together:
         common = position.value_s if position.is_clear else 0.0
         return {"heading": common, "position": common}
-    if apart.is_certain and apart.value_s < 0.0:
+    is_apart = apart.differs_from(USUAL_APART_S)
+    if is_apart and apart.value_s < 0.0:
         late = position.value_s if position.is_clear else 0.0
         return {"heading": late - apart.value_s, "position": late}
     late = heading.value_s if heading.is_clear else 0.0
-    return {"heading": late, "position": late + (apart.value_s if apart.is_certain else 0.0)}
+    return {"heading": late, "position": late + (apart.value_s if is_apart else 0.0)}
 
 
 def _delay_notes(
@@ -154,6 +154,6 @@ def _delay_notes(
             continue
         subject = "the position and its heading" if together else f"the {what}"
         lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
-        std = (found[what] if found[what].is_certain else found["apart"]).std_s
+        std = (found[what] if found[what].differs_from(0.0) else found["apart"]).std_s
         notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
     return notes

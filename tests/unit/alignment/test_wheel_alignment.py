@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
@@ -128,3 +129,36 @@ def test_a_configured_scale_is_not_touched() -> None:
     check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"])).wheels
     assert check.applied == (1.0, 1.0)
     assert any("check wheel radius" in warning for warning in check.warnings)
+
+
+def test_wheels_that_spin_show_no_scale_and_no_delay() -> None:
+    log = make_log(seconds=120.0)
+    rng = np.random.default_rng(3)
+    # for five seconds at a time, both sides turn up to twice as far as they move
+    spin = 1.0 + np.repeat(rng.random(24), 250)
+    left, right = spin * log.wheels.v_left_mps, spin * log.wheels.v_right_mps
+    spoilt = with_wheels(log, left, right)
+    found = align_streams(replace(spoilt, heading=moved(spoilt.heading, 0.3)), CONFIG)
+    assert found.wheels.applied == (1.0, 1.0)
+    assert found.delays.applied_heading_s == found.delays.applied_gnss_s == 0.0
+    assert any("the wheels slip" in warning for warning in found.wheels.warnings)
+
+
+def moved(heading: HeadingSamples, late_s: float) -> HeadingSamples:
+    return replace(heading, stamp_ns=heading.stamp_ns + round(late_s * 1e9))
+
+
+@pytest.mark.parametrize("reversed_side", [1.0, -1.0])
+def test_the_unit_of_wheels_is_found_on_a_circle(reversed_side: float) -> None:
+    radius_m, psi = 2.5, np.arange(0.0, 12.0, 0.02)
+    stamps = np.round(psi / 0.2 * 1e9).astype(np.int64)
+    few, wide = slice(0, None, 2), 1.4
+    unit = 0.003
+    left, right = (np.full(len(psi), 0.2 * (radius_m + side * wide / 2) / unit) for side in (1.0, -1.0))
+    known = np.full(len(psi[few]), 1e-4)
+    fixes = PositionFixes(
+        stamps[few], radius_m * np.sin(psi[few]), radius_m * (1 - np.cos(psi[few])), known, known, known
+    )
+    scale = reference_scale(stamps, left, reversed_side * right, fixes)
+    assert scale is not None
+    assert scale.value == pytest.approx(unit, rel=0.01)
