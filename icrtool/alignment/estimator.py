@@ -90,24 +90,37 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
+class WindowResiduals(NamedTuple):
+    """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
+
+    Attributes
+    ----------
+    before, after : (2, w) along and across the heading [m], prediction minus measurement
+    turn_before, turn_after : (u,) of the heading changes [rad]; turn_rad : (u,) as measured
+    """
+
+    before: Floats
+    after: Floats
+    turn_before: Floats
+    turn_after: Floats
+    turn_rad: Floats
+
+
 class AlignmentFit(NamedTuple):
     """The parameters in the order of `NAMES`, with covariance.
 
     Attributes
     ----------
     fit : the robust fit; width_m : b that w was formed with
-    windows : DriveWindows it was made of
+    windows : DriveWindows it was made of, cut from drive
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
-    fix_std_m : noise of the fixes, an axis
-    clock_std_s : what no drive shows of the time between position and heading
     """
 
     fit: RobustFit
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
-    fix_std_m: float
-    clock_std_s: float
+    drive: DriveArrays
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -132,7 +145,7 @@ class AlignmentFit(NamedTuple):
     @property
     def slip_std(self) -> float:
         """Robust scatter of the displacements along the path beyond the fixes' noise, over the window's length."""
-        noise = math.sqrt(2.0) * self.fix_std_m
+        noise = math.sqrt(2.0) * self.drive.fix_std_m
         return math.sqrt(max(float(self.fit.scale[0]) ** 2 - noise**2, 0.0)) / self.windows.length_m
 
     def geometry(self) -> Geometry:
@@ -147,8 +160,26 @@ class AlignmentFit(NamedTuple):
         values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
         covariance = jacobian @ self.fit.covariance @ jacobian.T
         # at one speed, positions that lag look like an antenna further back
-        covariance[2, 2] += (self.turning_speed_mps * self.clock_std_s) ** 2
+        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.drive)) ** 2
         return Geometry(values, covariance)
+
+
+def window_residuals(found: AlignmentFit) -> WindowResiduals:
+    """Return the residuals of all windows before and after the estimate."""
+    model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
+    neutral = PRIOR_MEAN.copy()
+    neutral[K] = found.fit.x[K]
+    parts = []
+    for x in (neutral, found.fit.x):
+        residual, _ = model.evaluate(x)
+        parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
+    (before, turn_before), (after, turn_after) = parts
+    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
+
+
+def _clock_std_s(drive: DriveArrays) -> float:
+    """Return what no drive shows of the time between position and heading, or of a robot's response."""
+    return RESPONSE_STD_S if drive.same_clock else CLOCK_STD_S
 
 
 def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
@@ -195,14 +226,12 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         # exact data on one circle: nothing separates the parameters
         return None
     covariance[TH, TH] += RESPONSE_STD_S**2
-    clock_std_s = RESPONSE_STD_S
     if not drive.same_clock:
-        clock_std_s = CLOCK_STD_S
-        covariance[TP, TP] += clock_std_s**2
+        covariance[TP, TP] += CLOCK_STD_S**2
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
     weight = drive.wheel_dt * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive.fix_std_m, clock_std_s)
+    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive)
 
 
 class _Model:

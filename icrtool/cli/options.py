@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -12,11 +11,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from icrtool.cli.stages import Stages
 from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
+    from icrtool.output.baseline_file import Baseline
     from icrtool.output.figures.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -37,14 +40,26 @@ def configuration(command: Command) -> Command:
         click.option(
             "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."
         ),
-        click.option("--robot", metavar="NAME", help="Built-in robot, for example husky-a200, jackal, warthog."),
-        click.option(
-            "--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."
-        ),
-    )
+        click.option("--robot", metavar="NAME", shell_complete=_robots,
+                     help="Built-in robot, for example husky-a200; icrtool robots lists them."),
+        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
+                     help="Set a configuration key; icrtool config lists them; repeatable."),
+    )  # fmt: skip
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _robots(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_robot
+
+    return complete_robot(ctx, param, incomplete)
+
+
+def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_setting
+
+    return complete_setting(ctx, param, incomplete)
 
 
 def place(command: Command) -> Command:
@@ -54,6 +69,42 @@ def place(command: Command) -> Command:
                            help="Parent of the run directories, also of one log.")(command)  # fmt: skip
     return click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path),
                         help="Run directory of a log; of several logs: its parent.")(command)  # fmt: skip
+
+
+def baseline(command: Command) -> Command:
+    """Add --baseline and --strict-gates, as `baseline` and `strict`."""
+    command = click.option("--strict-gates", "strict", is_flag=True,
+                           help="A gate on the baseline fails by its number, not only beyond the interval of the "
+                           "difference.")(command)  # fmt: skip
+    return click.option("--baseline", metavar="REPORT.json|DIR", type=click.Path(path_type=Path),
+                        help="Earlier report, run or batch to compare with; a gate may then read "
+                        "\"icr.p95@10m <= 1.1 * baseline\".")(command)  # fmt: skip
+
+
+def open_baseline(place: Path | None, gates: Sequence[str]) -> Baseline | None:
+    """Find the reports of --baseline; refuse gates that need one where there is none."""
+    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.errors import ConfigError
+    from icrtool.output.baseline_file import open_baseline
+
+    relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]
+    if place is None and relative:
+        raise ConfigError(f"gate {relative[0]!r}", "needs an earlier report", "name it with --baseline REPORT.json|DIR")
+    return open_baseline(place) if place is not None else None
+
+
+def check_compared(verdicts: Sequence[tuple[bool, bool]]) -> None:
+    """Refuse a baseline that has none of the logs: a gate that is never checked would always pass.
+
+    Parameters
+    ----------
+    verdicts : for each, whether its limit is relative to the baseline, and whether it was not checked
+    """
+    from icrtool.errors import ConfigError
+
+    relative = [not_checked for is_relative, not_checked in verdicts if is_relative]
+    if relative and all(relative):
+        raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
 
 
 def cut(command: Command) -> Command:
@@ -128,16 +179,10 @@ def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
 
 @contextmanager
 def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that moves a bar on a terminal; None where there is no terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
-
-        def move(share: float) -> None:
-            bar.update(int(1000 * min(share, 1.0)) - bar.pos)
-
-        yield move
+    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+    with Stages(label, quiet=quiet) as stages:
+        stages.begin("")
+        yield stages.share if stages.on_terminal else None
 
 
 def load_ahead(*modules: str) -> None:
