@@ -168,7 +168,7 @@ def find_scales(
         return (1.0, 1.0), []
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     if fit.slip_std > SLIPPING:
-        slip = f"the wheels slip: their distance misses that of the positions by {100 * fit.slip_std:.0f} % every"
+        slip = f"the wheels slip: their distance differs from that of the positions by {100 * fit.slip_std:.0f} % every"
         return (1.0, 1.0), [f"{slip} {fit.windows.length_m:.0f} m; no scale and no delay is corrected"]
     may = corrects and sound and not given
     scale, notes = _common_scale(fit, may=may)
