@@ -67,8 +67,8 @@ looks as if its position lagged its heading: on 55 rigid-body drives without any
 0.06 s more or less, whatever the standard deviation that the fit states."""
 
 SLIPPING = 0.08
-"""Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show neither
-a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 to 18 %."""
+"""Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show
+neither a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 to 18 %."""
 
 ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 """An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
