@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.page
 @options.baseline
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -55,7 +56,8 @@ if TYPE_CHECKING:
 def command(
     places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
     redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
-    plots: str, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None, as_json: bool,
+    plots: str, page: bool, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None,
+    as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -79,7 +81,7 @@ def command(
 
     asked = BatchOptions(
         config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
-        strict,
+        strict, page,
     )  # fmt: skip
     for file in (junit, markdown):
         if file is not None:
@@ -108,6 +110,10 @@ def command(
             file.write_bytes(format_fleet_markdown(rows, missing).encode("utf-8", errors="backslashreplace"))
     if compared is not None:
         options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
+    if page:
+        from icrtool.output.page.fleet_page import write_fleet_page
+
+        write_fleet_page(fleet_document(rows), output)
     if as_json:
         print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
     elif not quiet:

@@ -53,6 +53,7 @@ class Request:
     seed: int
     formats: tuple[str, ...]
     ladder: bool
+    page: bool
     smoothed: bool
     overwrite: bool
     quiet: bool
@@ -87,6 +88,7 @@ class Request:
 )
 @click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.page
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
 @options.configuration
 @options.verbosity
@@ -96,7 +98,7 @@ def command(
     gates: tuple[str, ...], baseline: Path | None, strict: bool,
     calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
@@ -123,7 +125,7 @@ def command(
         calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
         starts=starts, trials=trials,
-        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
+        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder, page=page,
         smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
@@ -230,14 +232,21 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
 
 def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
+    from icrtool.output.run_directory import PAGE_FILE
+
     run = _read(source) if place is None else _fit(source, place, request, drawer)
     directory = source if place is None else place
     report = _analyse(run, directory, request, drawer)
+    if request.page:
+        from icrtool.output.page.run_page import write_page
+
+        write_page(run, report, directory / PAGE_FILE, plots=directory)
     if not request.quiet:
         from icrtool.output.tables.dropout import format_dropout
 
         click.echo(format_dropout(report))
-        click.echo(f"\nwritten to {directory / 'dropout'}")
+        page = f"; page: {directory / PAGE_FILE}" if request.page else ""
+        click.echo(f"\nwritten to {directory / 'dropout'}{page}")
     else:
         for verdict in report.verdicts:
             if not verdict.passed:

@@ -57,6 +57,7 @@ class BatchOptions:
     overwrite: bool = False
     baseline: Path | None = None
     strict: bool = False
+    page: bool = True
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -98,6 +99,8 @@ def finished(request: Request) -> Row | None:
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
     """
+    from icrtool.output.run_directory import PAGE_FILE
+
     try:
         row = msgspec.json.decode(path_of(request.row_file).read_bytes(), type=Row)
     except (OSError, msgspec.MsgspecError, ValueError):
@@ -109,6 +112,7 @@ def finished(request: Request) -> Row | None:
     if (
         not Path(path_of(request.directory), "run.json").is_file()
         or not Path(path_of(request.directory), "dropout").is_dir()
+        or (request.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
     ):
         return None
     why = "done before: same input, configuration and version"
@@ -196,7 +200,7 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions, 
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
         budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
-        strict=options.strict,
+        strict=options.strict, page=options.page,
     )  # fmt: skip
 
 

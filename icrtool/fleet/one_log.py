@@ -49,6 +49,7 @@ class Request:
     overwrite: bool = False
     baseline: bytes = b""
     strict: bool = False
+    page: bool = True
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -123,7 +124,7 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
     from icrtool.output.baseline_file import open_baseline
-    from icrtool.output.run_directory import check_target
+    from icrtool.output.run_directory import PAGE_FILE, check_target
 
     directory = path_of(request.directory)
     check_target(directory, path_of(request.path), overwrite=request.overwrite)
@@ -142,6 +143,11 @@ def _results(request: Request, stage: Stage) -> Row:
     )  # fmt: skip
     stage("writing the report")
     report.write(directory / "dropout", plots=request.plots)
+    if request.page:
+        from icrtool.output.page.run_page import write_page
+
+        stage("writing the page")
+        write_page(run, report, directory / PAGE_FILE, plots=directory)
     return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
 
 

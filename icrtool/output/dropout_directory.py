@@ -137,6 +137,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "usable": run["usable"],
         "unusable_because": run["unusable_because"],
         "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
+        "smoothed": report.smoothed,
         "starts": report.states,
         "starts_counted": report.starts,
         "starts_standing": report.standing,

@@ -22,6 +22,7 @@ from icrtool.records.run import Run
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
+PAGE_FILE = "report.html"
 CHECKSUM_FILE = "B2SUMS"
 """Sums of all files but the pictures, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
 
@@ -33,7 +34,7 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
 
-LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, "events.csv", "report.html",
+LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, EVENTS_FILE, PAGE_FILE,
                "plots", "dropout")  # fmt: skip
 """What a run directory may hold that is icrtool's, though the list of its files does not name it."""
 

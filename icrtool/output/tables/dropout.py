@@ -90,13 +90,13 @@ def headline(report: DropoutReport) -> list[str]:
         return []
     count, numbers = len(calibration.fitted.parameters), calibration.controller_numbers()
     interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
-    without = f"; without slip model: {_reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     radii = f"left/right wheel radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
     parameters = "one parameter" if count == 1 else f"{count} parameters"
     model = f"{calibration.fitted.model.label} ({parameters}, model {calibration.recommended})"
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {_reach_text(best)}{interval}{without}.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
         f"Controller: wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}, {radii}.",
     ]
 
@@ -116,8 +116,8 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
-        more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)} ({first.label}){more}")
+        more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
+        lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
     return lines
 
 
@@ -138,7 +138,8 @@ def ratio_text(numerator: float, denominator: float) -> str:
     return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
 
 
-def _reach_text(one: BudgetDistance) -> str:
+def reach_text(one: BudgetDistance) -> str:
+    """Return how far a model stays within a budget."""
     if one.beyond:
         return f"more than {one.distance_m:g} m"
     low, high = one.between_m

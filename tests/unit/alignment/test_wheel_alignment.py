@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
+from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.estimation.fit import fit
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
@@ -162,3 +164,54 @@ def test_the_unit_of_wheels_is_found_on_a_circle(reversed_side: float) -> None:
     scale = reference_scale(stamps, left, reversed_side * right, fixes)
     assert scale is not None
     assert scale.value == pytest.approx(unit, rel=0.01)
+
+
+def with_gaps(log: RobotLog, *, every_s: float, gap_s: float, from_position: bool) -> RobotLog:
+    """Leave out wheel samples; what remains holds the mean speed to the next sample, as counts give it."""
+    t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
+    kept = np.flatnonzero(np.mod(t + gap_s, every_s) >= gap_s)
+    sides = []
+    for speed in (log.wheels.v_left_mps, log.wheels.v_right_mps):
+        travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(t))])
+        sides.append(np.append(np.diff(travelled[kept]) / np.diff(t[kept]), speed[-1]))
+    return replace(log, wheels=WheelSamples(log.wheels.stamp_ns[kept], *sides, from_position=from_position))
+
+
+def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
+    log = make_log(seconds=180.0)
+    whole = fit(log, CONFIG)
+    runs = [fit(with_gaps(log, every_s=8.0, gap_s=2.0, from_position=kind), CONFIG) for kind in (True, False)]
+    counted, open_ = runs
+    assert not counted.in_gap.any()
+    assert np.count_nonzero(open_.in_gap) == len(open_.summary["wheel_gaps_ns"]) > 20
+    assert any("are bridged" in warning for warning in counted.warnings)
+    assert not any("are bridged" in warning for warning in open_.warnings)
+    distance = whole.summary["drive"]["distance_m"]
+    assert counted.summary["drive"]["distance_m"] == pytest.approx(distance, rel=0.01)
+    assert counted.table.distance_m[-1] == pytest.approx(whole.table.distance_m[-1], rel=0.01)
+    final = counted.summary["icr"]["final"]
+    assert (final["y_icr_right_m"], final["y_icr_left_m"]) == pytest.approx(ICRS[:2], abs=ICR_TOLERANCE_M)
+    trials, missing, full = (dropout_report(run).summary for run in (counted, open_, whole))
+
+    def count(summary):  # type: ignore[no-untyped-def]
+        return int(summary.set_index(["model", "horizon_m"]).loc[("icr", 20.0), "trials"])
+
+    assert count(missing) == 0 or count(missing) < 0.2 * count(full)
+    assert count(trials) > 0.9 * count(full)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_wheel_samples_have_nothing_to_bridge(count: int) -> None:
+    stamps = np.arange(count, dtype=np.int64) * 100_000_000
+    wheels = WheelSamples(stamps, np.ones(count), np.ones(count), from_position=True)
+    assert bridged(wheels, 0.5) == (wheels, "")
+
+
+def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
+    stamps = np.concatenate([np.arange(50), np.arange(200, 250)]).astype(np.int64) * 100_000_000
+    wheels = WheelSamples(stamps, np.ones(100), np.ones(100), from_position=True)
+    assert bridged(wheels, 0.5)[0] is wheels
+    short = replace(wheels, stamp_ns=np.where(stamps > 10**10, stamps - 12 * 10**9, stamps))
+    filled, note = bridged(short, 0.5)
+    assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
+    assert note.startswith("1 gaps")

@@ -330,7 +330,7 @@ def test_a_topic_whose_messages_are_all_damaged_says_so() -> None:
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ("topics.gnss=/other/fix", r"topics\.gnss: /other/fix is not in drive\.bag; it holds /joint_states \("),
+        ("topics.gnss=/other/fix", r"topics\.gnss: /other/fix is not in drive\.bag; did you mean /empty/fix\?"),
         ("topics.gnss=/imu/data", r"topics\.gnss: /imu/data: sensor_msgs/Imu cannot feed it; it needs a GNSS fix"),
         ("topics.heading=/joint_states", r"topics\.heading: /joint_states: sensor_msgs/JointState cannot feed it"),
         (
