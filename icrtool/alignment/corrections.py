@@ -19,6 +19,7 @@ from icrtool.alignment.conventions import (
     convention_notes,
     decide_conventions,
     gyro_sense,
+    senses_by_distance,
 )
 from icrtool.alignment.course_over_ground import Course, measure_course
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
@@ -44,7 +45,9 @@ from icrtool.alignment.wheel_alignment import (
     refuse_standing,
     scaled,
 )
+from icrtool.alignment.wheel_units import refuse_parked
 from icrtool.config import Config
+from icrtool.errors import DataError
 from icrtool.records.run import half_width_m
 from icrtool.records.tables import RobotLog
 
@@ -96,15 +99,17 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         Streams that cannot be used together, a heading that nothing explains, wheels that turn while the robot stands.
     """
     corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
-    as_sent, derived = log, None
+    as_sent, derived, senses = log, None, AS_NAMED
     configured = configured_scales(config)
     log = scaled(log, *configured)
     if not len(log.heading.stamp_ns) and corrects:
-        derived = derive_heading(log, width)
-        log = derived.apply(log)
+        senses = _senses_without_heading(log)
+        derived = _derived_heading(_apply(log, senses), width)
+        log = derived.apply(_apply(log, senses))
     check_streams(log)
     notes = list(dead_or_copied(log))
     sound = not notes
+    notes += convention_notes(Decision(senses, 0.0, None), corrects=True)
     drive = drive_arrays(log, None if derived is None else derived.smoothed)
     windows = cut_windows(drive)
     decision = _decide(log, config, drive, windows, derived)
@@ -142,11 +147,24 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     )  # fmt: skip
     heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored, pose_mirrored=pose_mirrored)
     delays = find_delays(log, config, fit)
-    log = delays.log
     return AlignedStreams(
-        log, wheels, heading, delays, fit, derived,
+        delays.log, wheels, heading, delays, fit, derived,
         (*wheels.warnings, *heading.warnings, *delays.warnings),
     )  # fmt: skip
+
+
+def _senses_without_heading(log: RobotLog) -> Convention:
+    few = min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2
+    return AS_NAMED if few else senses_by_distance(drive_arrays(log))
+
+
+def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
+    """Return the heading of a log without one; a robot that stands is refused as such."""
+    try:
+        return derive_heading(log, width_m)
+    except DataError:
+        refuse_parked(log)
+        raise
 
 
 def _decide(

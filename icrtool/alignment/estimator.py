@@ -61,10 +61,10 @@ OVERLAP = 1.0
 RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
 """A robot answers its wheels late by up to 0.1 s, which no drive separates from a delay of the streams."""
 
-USUAL_APART_S, CLOCK_STD_S = 0.05, 0.06
+USUAL_APART_S, CLOCK_STD_S = 0.05, 0.08
 """A body that slips sideways in proportion to speed and turn rate, or follows a change of speed later than a turn,
 looks as if its position lagged its heading: on 55 rigid-body drives without any delay by 0.05 s on average and by
-0.06 s more or less, whatever the standard deviation that the fit states."""
+0.08 s rms, whatever the standard deviation that the fit states."""
 
 SLIPPING = 0.08
 """Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show

@@ -11,7 +11,7 @@ from icrtool.alignment.estimator import SLIPPING, USUAL_APART_S, AlignmentFit
 from icrtool.config import Config
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
-SIGNIFICANT_SIGMAS = 2.5
+SIGNIFICANT_SIGMAS, APART_SIGMAS = 2.5, 2.0
 SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1
 """A robot follows its wheels by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
@@ -23,9 +23,9 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
-    def differs_from(self, usual_s: float) -> bool:
+    def differs_from(self, usual_s: float, sigmas: float = SIGNIFICANT_SIGMAS) -> bool:
         """Return whether it is known well, and is not the usual one."""
-        return self.std_s < LARGEST_STD_S and abs(self.value_s - usual_s) > SIGNIFICANT_SIGMAS * self.std_s
+        return self.std_s < LARGEST_STD_S and abs(self.value_s - usual_s) > sigmas * self.std_s
 
     @property
     def is_clear(self) -> bool:
@@ -131,7 +131,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     if together:
         common = position.value_s if position.is_clear else 0.0
         return {"heading": common, "position": common}
-    is_apart = apart.differs_from(USUAL_APART_S)
+    is_apart = apart.differs_from(USUAL_APART_S, APART_SIGMAS)
     if is_apart and apart.value_s < 0.0:
         late = position.value_s if position.is_clear else 0.0
         return {"heading": late - apart.value_s, "position": late}

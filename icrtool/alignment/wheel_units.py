@@ -25,6 +25,10 @@ FASTEST_MPS = 100.0
 SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
 """A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
 
+PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
+"""A robot stands where 95 % of its positions lie within this, or within so many of their standard deviations, while its
+wheels turn for this share of the time."""
+
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
@@ -49,13 +53,17 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     ConfigError
         A radius or resolution that is needed and cannot be found from the log.
     DataError
-        Fewer than two usable samples.
+        Fewer than two usable samples; wheels without a unit that turn while the robot stands.
     """
     wheels = log.wheels
     if wheels.unit == "mps":
         return log
     topic = next((stream.topic for stream in log.streams if stream.role == "wheels"), "wheels")
-    factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+    try:
+        factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+    except ConfigError:
+        refuse_parked(log)
+        raise
     warnings = [f"{log.name}: {note}" for note in estimated]
     with np.errstate(over="ignore"):
         left, right = wheels.left * factor, wheels.right * factor
@@ -80,6 +88,33 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     )
     samples = WheelSamples(stamps, left, right, from_position=wheels.from_position)
     return replace(log, wheels=samples, streams=streams, warnings=(*log.warnings, *warnings))
+
+
+def refuse_parked(log: RobotLog) -> None:
+    """Raise where the wheels turn and the positions stay within their noise: a robot on a stand.
+
+    For logs that show no heading or no unit, which a robot on a stand shows neither; one that spins on the spot may.
+
+    Raises
+    ------
+    DataError
+        It stands.
+    """
+    turns = (log.wheels.left != 0.0) | (log.wheels.right != 0.0)
+    place = log.gnss.north_m + 1j * log.gnss.east_m
+    if not len(place) or float(np.mean(turns)) < TURNING_SHARE:
+        return
+    variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
+    known = variance[np.isfinite(variance)]
+    noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+    away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
+    reach_m = float(np.percentile(away, 95))
+    if reach_m < max(PARKED_M, PARKED_SIGMAS * noise_m):
+        raise DataError(
+            log.name,
+            "the wheels turn and the robot does not move",
+            f"95 % of the positions lie within {reach_m:.2f} m: is it on a stand?",
+        )
 
 
 def _spikes(speed: Floats) -> Bools:

@@ -12,6 +12,7 @@ from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
@@ -215,3 +216,22 @@ def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     filled, note = bridged(short, 0.5)
     assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
     assert note.startswith("1 gaps")
+
+
+@pytest.mark.parametrize("unit", ["mps", "counts"])
+def test_a_robot_on_a_stand_is_named_so_without_heading_or_unit(unit: str) -> None:
+    log = make_log(seconds=120.0)
+    rng = np.random.default_rng(2)
+    still = replace(
+        log.gnss,
+        north_m=rng.normal(0.0, 0.02, len(log.gnss.stamp_ns)), east_m=rng.normal(0.0, 0.02, len(log.gnss.stamp_ns)),
+    )  # fmt: skip
+    stand = replace(
+        log,
+        gnss=still,
+        heading=HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0)),
+        wheels=replace(log.wheels, unit=unit),  # type: ignore[arg-type]
+        streams=(replace(log.streams[0], role="wheels"),),
+    )
+    with pytest.raises(DataError, match="stand"):
+        fit(stand, CONFIG)
