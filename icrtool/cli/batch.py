@@ -75,9 +75,9 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.fleet.acceptance import changes_of, format_fleet_markdown, suites_of
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
-    from icrtool.fleet.fleet_files import fleet_document, write_fleet
+    from icrtool.fleet.fleet_files import PLOTS, calibrations_text, fleet_document, write_fleet
+    from icrtool.fleet.roll_up import pooled_calibrations
     from icrtool.output.atomic_file import atomic_file, check_place
-    from icrtool.output.exports.acceptance import write_junit
 
     asked = BatchOptions(
         config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
@@ -101,9 +101,13 @@ def command(
             view.row(row)
     order = {request.row.log: number for number, request in enumerate(requests)}
     rows.sort(key=lambda row: order[row.log])
-    write_fleet(rows, output)
+    calibrations = [] if not asked.ladder else list(pooled_calibrations(rows, output))
+    drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
+    write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     if junit is not None:
+        from icrtool.output.exports.acceptance import write_junit
+
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
         with atomic_file(markdown) as file:
@@ -115,9 +119,11 @@ def command(
 
         write_fleet_page(fleet_document(rows), output)
     if as_json:
-        print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
+        print_json("batch", fleet_document(rows, calibrations) | {"output": escaped(str(output))})
     elif not quiet:
         click.echo(summary_of(rows, output))
+        if calibrations:
+            click.echo(f"\n{shown(calibrations_text(calibrations), keep=chr(10))}", nl=False)
     options.check_compared([(one.relative, bool(one.not_checked)) for row in rows for one in row.verdicts])
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):
@@ -234,9 +240,10 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"{failed_gates} gates failed"] if failed_gates else []
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: fleet.csv, failures.csv, runs/"
+    files = "fleet.csv, failures.csv, calibrations/, plots/, runs/"
+    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {files}"
 
 
-def shown(text: str) -> str:
-    """Return a text of a log's or a library's as a terminal can show it."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+def shown(text: str, keep: str = "") -> str:
+    """Return a text of a log's or a library's as a terminal can show it, with the letters to `keep`."""
+    return "".join(letter if letter.isprintable() or letter in keep else "?" for letter in text)

@@ -19,6 +19,7 @@ from icrtool.fleet.one_log import Request, files_of, path_of
 from icrtool.fleet.recordings import Recording, find_recordings
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
+from icrtool.logs.containers.split_files import files_of_log
 
 RUNS, ROWS = "runs", ".rows"
 
@@ -217,7 +218,7 @@ def _config(one: Recording, known: About, options: BatchOptions) -> Config:
 def _same_files(stored: Sequence[File], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
     try:
-        files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+        files = files_of_log(path)
         if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
             return False
         for file, before in zip(files, stored, strict=True):
@@ -232,8 +233,7 @@ def _same_files(stored: Sequence[File], path: Path) -> bool:
 
 
 def _size(path: Path) -> int:
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return sum(file.stat().st_size for file in files_of_log(path) if file.is_file())
 
 
 def _free_bytes() -> int | None:

@@ -17,6 +17,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -126,7 +127,8 @@ def read_log(
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; or a ``.csv`` of `icrtool.records.frames`
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; ``drive_{0..3}.bag`` for the files of a split
+        recording; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -150,11 +152,12 @@ def read_log(
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: that of the file without its suffix, or of the directory; ``log`` where that is only dots.
+    """Return a log's name: that of its (first) file without suffix, or of the directory; ``log`` where it is only dots.
 
     Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
     """
-    named = Path(os.path.normpath(path.absolute()))
+    files = split_files(path)
+    named = Path(os.path.normpath((files[0] if files else path).absolute()))
     name = named.name if named.is_dir() else named.stem
     return name if name.strip(".") else "log"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from icrtool.errors import OutputError
+from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
@@ -61,7 +62,7 @@ def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = 
 
 def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
-    files = [file for file in log.iterdir() if file.is_file()] if log.is_dir() else [log]
+    files = [file for file in files_of_log(log) if file.is_file()]
     inputs = _inputs_of(directory)
     # A run of an older version does not list the places; its paths may be relative to another directory.
     places = made_from(directory) or {path for one in inputs if Path(path := str(one.get("path"))).is_absolute()}
