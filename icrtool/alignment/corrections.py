@@ -16,12 +16,13 @@ from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,
     Decision,
+    apply_to_drive,
     convention_notes,
     decide_conventions,
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.course_over_ground import Course, measure_course
+from icrtool.alignment.course_over_ground import FEWEST_WINDOWS, Course, measure_course
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
 from icrtool.alignment.heading_alignment import (
@@ -52,6 +53,9 @@ from icrtool.records.run import half_width_m
 from icrtool.records.tables import RobotLog
 
 SIGNIFICANT_SIGMAS = 4.0
+FAR_IN_POSITION_STD, SHORT_DRIVE_M = 30.0, 0.3
+"""A drive of so many standard deviations of the fixes, at least of this each, is no short one."""
+
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
 
@@ -115,7 +119,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     decision = _decide(log, config, drive, windows, derived)
     if corrects:
         log = _apply(log, decision.convention)
-    drive = _apply_to_drive(drive, decision.convention)
+    drive = apply_to_drive(drive, decision.convention)
     notes += convention_notes(decision, corrects=corrects)
     mirrored = decision.convention.heading < 0
     pose_mirrored = mirrored and decision.convention.position < 0 and drive.same_clock
@@ -162,9 +166,19 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     """Return the heading of a log without one; a robot that stands is refused as such."""
     try:
         return derive_heading(log, width_m)
-    except DataError:
+    except DataError as error:
         refuse_parked(log)
-        raise
+        if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < FEWEST_WINDOWS:
+            raise
+        drive = drive_arrays(log)
+        if drive.travel[-1] < FAR_IN_POSITION_STD * max(drive.fix_std_m, SHORT_DRIVE_M):
+            raise
+        raise DataError(
+            log.name,
+            f"no heading in it, and positions of ±{drive.fix_std_m:.1f} m show none at this speed "
+            f"({drive.travel[-1]:.0f} m in {drive.wheel_t[-1]:.0f} s)",
+            "record an orientation (AHRS), use RTK, or drive faster",
+        ) from error
 
 
 def _decide(
@@ -189,16 +203,6 @@ def _apply(log: RobotLog, convention: Convention) -> RobotLog:
         cov = -gnss.cov_north_east_m2
         gnss = replace(gnss, east_m=-gnss.east_m, cov_north_east_m2=cov)
     return replace(log, wheels=replace(wheels, left=left, right=right), gnss=gnss)
-
-
-def _apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
-    left, right = convention.sign_left * drive.v_left, convention.sign_right * drive.v_right
-    return drive._replace(
-        v_left=right if convention.swapped else left,
-        v_right=left if convention.swapped else right,
-        heading=convention.heading * drive.heading,
-        fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
-    )
 
 
 def _turned_over(log: RobotLog) -> RobotLog:

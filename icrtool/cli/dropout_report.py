@@ -49,6 +49,7 @@ class Request:
     baseline: Baseline | None
     strict: bool
     starts: Literal["moving", "all"]
+    without_events: bool
     trials: bool
     seed: int
     formats: tuple[str, ...]
@@ -80,6 +81,9 @@ class Request:
               help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+@click.option(
+    "--without-events", is_flag=True, help="Leave out trials that cross a slip event, and report what they cost."
+)
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
               help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
@@ -97,7 +101,7 @@ def command(
     budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], baseline: Path | None, strict: bool,
     calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
+    ladder: bool, reference: str, starts: Literal["moving", "all"], without_events: bool, trials: bool,
     junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
@@ -124,7 +128,7 @@ def command(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
-        starts=starts, trials=trials,
+        starts=starts, without_events=without_events, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder, page=page,
         smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
     )  # fmt: skip
@@ -331,6 +335,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             outage_s=outages,
             outage_at_s=request.outage_at_s,
             starts=request.starts,
+            without_events=request.without_events,
             comparison=request.ladder,
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,

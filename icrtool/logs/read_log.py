@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Literal
@@ -25,7 +26,15 @@ from icrtool.logs.streams.gyro import find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
-from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
+from icrtool.logs.streams.select import (
+    Candidates,
+    Choice,
+    choose_streams,
+    common_clock,
+    fields_to_take,
+    find_candidates,
+    other_references,
+)
 from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
@@ -164,8 +173,19 @@ def log_name(path: Path) -> str:
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
     """Return the log with its streams chosen and converted; errors as `read_log`."""
+    choice = choose_streams(survey.candidates, config, survey.path, survey.channels)
+    log = _assemble(survey, config, choice)
+    others = []
+    for other in other_references(survey.candidates, choice, config):
+        # one that cannot be used is no alternative
+        with contextlib.suppress(DataError):
+            others.append(_assemble(survey, config, other))
+    return replace(log, other_references=tuple(others)) if others else log
+
+
+def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
+    """Return the log with the streams of a choice, converted."""
     found, name = survey.candidates, survey.name
-    choice = choose_streams(found, config, survey.path, survey.channels)
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     delays = [
         s.stamps.delay_ns / 1e9 if s.stamps.header_ns is not None else None

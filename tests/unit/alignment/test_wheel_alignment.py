@@ -9,12 +9,11 @@ import pytest
 
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.wheel_alignment import bridged
-from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.tables import GyroSamples, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
@@ -134,39 +133,6 @@ def test_a_configured_scale_is_not_touched() -> None:
     assert any("check wheel radius" in warning for warning in check.warnings)
 
 
-def test_wheels_that_spin_show_no_scale_and_no_delay() -> None:
-    log = make_log(seconds=120.0)
-    rng = np.random.default_rng(3)
-    # for five seconds at a time, both sides turn up to twice as far as they move
-    spin = 1.0 + np.repeat(rng.random(24), 250)
-    left, right = spin * log.wheels.v_left_mps, spin * log.wheels.v_right_mps
-    spoilt = with_wheels(log, left, right)
-    found = align_streams(replace(spoilt, heading=moved(spoilt.heading, 0.3)), CONFIG)
-    assert found.wheels.applied == (1.0, 1.0)
-    assert found.delays.applied_heading_s == found.delays.applied_gnss_s == 0.0
-    assert any("the wheels slip" in warning for warning in found.wheels.warnings)
-
-
-def moved(heading: HeadingSamples, late_s: float) -> HeadingSamples:
-    return replace(heading, stamp_ns=heading.stamp_ns + round(late_s * 1e9))
-
-
-@pytest.mark.parametrize("reversed_side", [1.0, -1.0])
-def test_the_unit_of_wheels_is_found_on_a_circle(reversed_side: float) -> None:
-    radius_m, psi = 2.5, np.arange(0.0, 12.0, 0.02)
-    stamps = np.round(psi / 0.2 * 1e9).astype(np.int64)
-    few, wide = slice(0, None, 2), 1.4
-    unit = 0.003
-    left, right = (np.full(len(psi), 0.2 * (radius_m + side * wide / 2) / unit) for side in (1.0, -1.0))
-    known = np.full(len(psi[few]), 1e-4)
-    fixes = PositionFixes(
-        stamps[few], radius_m * np.sin(psi[few]), radius_m * (1 - np.cos(psi[few])), known, known, known
-    )
-    scale = reference_scale(stamps, left, reversed_side * right, fixes)
-    assert scale is not None
-    assert scale.value == pytest.approx(unit, rel=0.01)
-
-
 def with_gaps(log: RobotLog, *, every_s: float, gap_s: float, from_position: bool) -> RobotLog:
     """Leave out wheel samples; what remains holds the mean speed to the next sample, as counts give it."""
     t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
@@ -218,20 +184,28 @@ def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     assert note.startswith("1 gaps")
 
 
-@pytest.mark.parametrize("unit", ["mps", "counts"])
-def test_a_robot_on_a_stand_is_named_so_without_heading_or_unit(unit: str) -> None:
-    log = make_log(seconds=120.0)
-    rng = np.random.default_rng(2)
-    still = replace(
-        log.gnss,
-        north_m=rng.normal(0.0, 0.02, len(log.gnss.stamp_ns)), east_m=rng.normal(0.0, 0.02, len(log.gnss.stamp_ns)),
-    )  # fmt: skip
-    stand = replace(
-        log,
-        gnss=still,
-        heading=HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0)),
-        wheels=replace(log.wheels, unit=unit),  # type: ignore[arg-type]
-        streams=(replace(log.streams[0], role="wheels"),),
-    )
-    with pytest.raises(DataError, match="stand"):
-        fit(stand, CONFIG)
+def test_a_robot_on_a_stand_is_refused() -> None:
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    count = len(log.gnss.north_m)
+    gnss = replace(log.gnss, north_m=rng.normal(3.0, 0.01, count), east_m=rng.normal(-2.0, 0.01, count))
+    heading = replace(log.heading, heading_rad=rng.normal(0.4, 0.01, len(log.heading.heading_rad)))
+    with pytest.raises(DataError, match="the robot does not move"):
+        fit(replace(log, gnss=gnss, heading=heading), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("message_type", "share", "warned"),
+    [("nav_msgs/Odometry", 1.0, True), ("nav_msgs/Odometry", 0.9, False), ("sensor_msgs/JointState", 1.0, False)],
+)
+def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: float, warned: bool) -> None:
+    """A turn rate of the wheels that is the gyro's was not measured by wheels."""
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    speed = (log.wheels.v_left_mps + log.wheels.v_right_mps) / 2
+    rate = np.gradient(np.unwrap(log.heading.heading_rad), 0.02)
+    rate = np.convolve(rate, np.ones(50) / 50, "same") + rng.normal(0.0, 0.002, len(rate))
+    turn = share * rate + (1.0 - share) * rng.normal(0.0, 0.3, len(rate))
+    streams = tuple(replace(stream, message_type=message_type) for stream in log.streams)
+    gyro = GyroSamples("/imu", log.wheels.stamp_ns, rate)
+    fused = replace(with_wheels(log, speed + 0.4 * turn, speed - 0.4 * turn), streams=streams, gyro=gyro)
+    warnings = align_streams(fused, CONFIG).warnings
+    assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned
