@@ -196,9 +196,9 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         from icrtool.logs import read_log
 
         stages.begin("reading")
-        options.load_ahead("pymap3d", "icrtool.estimation.fit")
+        options.load_ahead("pymap3d", "icrtool.calibration.fit")
         measured = read_log(log, request.config, stages.share, start=request.start, end=request.end)
-        from icrtool.estimation.fit import fit
+        from icrtool.calibration.fit import fit
 
         run = fit(
             measured,
