@@ -1,9 +1,9 @@
-"""Which side is which, which way a heading turns: hypotheses compared by their likelihood.
+"""Which side is which, in which sense a heading turns: hypotheses compared by their likelihood.
 
 Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
 with v the mean of the sides' speeds and u half their difference, its changes in ∫u and ∫v. Sides that are swapped or
 reversed exchange v and u or change their signs; a heading or a position of the other handedness turns psi round. One
-robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis says what they
+robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis gives what they
 should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left side. Its cost is the squared
 Mahalanobis distance from there.
 
@@ -41,6 +41,8 @@ ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
+CHORD_S, LEAST_CHORD_M, CHORD_IN_POSITION_STD = 2.0, 0.3, 4.0
+"""Without a heading, distances are compared over this time, where the robot moves clearly."""
 
 
 class Convention(NamedTuple):
@@ -114,7 +116,7 @@ def decide_conventions(
     Parameters
     ----------
     metric : whether positions may be mirrored (a pose in a local frame); geodetic ones are not
-    gyro_sense : +1 where a gyro turns as the heading is named, -1 where the other way, 0 without one
+    gyro_sense : +1 where a gyro turns as the heading is named, -1 where in the opposite sense, 0 without one
     mirror_allowed : whether the heading's handedness is free
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
@@ -141,6 +143,30 @@ def decide_conventions(
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
     return Decision(chosen, named - costs[chosen][0], ranked[1] if close else None)
+
+
+def senses_by_distance(drive: DriveArrays) -> Convention:
+    """Return whether one side counts backwards, by distances alone: for a drive without a heading.
+
+    Of two such sides, that one is reversed with which the robot drives forward.
+    """
+    t = drive.fix_t
+    rows = np.unique(np.floor(t / CHORD_S), return_index=True)[1]
+    chord = np.abs(np.diff(drive.fix[rows]))
+    left, right = (
+        np.diff(np.interp(t[rows], drive.wheel_t, np.concatenate([[0.0], np.cumsum((speed * drive.wheel_dt)[:-1])])))
+        for speed in (drive.v_left, drive.v_right)
+    )
+    moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
+    if np.count_nonzero(moved) < FEWEST_WINDOWS:
+        return AS_NAMED
+    as_named, reversed_ = (
+        float(np.median(np.abs(chord - np.abs(both) / 2)[moved])) for both in (left + right, left - right)
+    )
+    if reversed_ > as_named / 2:
+        return AS_NAMED
+    forward = float((left - right).sum()) > 0.0
+    return AS_NAMED._replace(sign_right=-1) if forward else AS_NAMED._replace(sign_left=-1)
 
 
 TIE = 9.0
@@ -225,7 +251,7 @@ def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
 
 
 def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
-    """Say which sides or senses are not as named; the heading's own is reported with its offset."""
+    """Return sentences on which sides or senses are not as named; the heading's own is reported with its offset."""
     one, done = decision.convention, ": corrected" if corrects else ""
     notes = []
     if one.swapped:
@@ -249,7 +275,7 @@ def _in_words(one: Convention) -> str:
 
 
 def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
-    """Return +1 where the gyro turns as the heading is named, -1 where the other way, 0 without one or in doubt."""
+    """Return +1 where the gyro turns as the heading is named, -1 where in the opposite sense, 0 where not shown."""
     if log.gyro is None or len(drive.heading_t) < 3:
         return 0
     t = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
