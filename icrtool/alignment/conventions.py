@@ -8,7 +8,8 @@ should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a fas
 Mahalanobis distance from there.
 
 Two symmetries are exact: position and heading mirrored together is sides swapped; a heading turned by 180 deg is sides
-swapped and both reversed. There the fewest faults decide, the gyro's sense counting as one.
+swapped and both reversed. There the fewest faults decide; a gyro of the other sense and a robot that hardly ever drives
+forward count as one each.
 """
 
 from __future__ import annotations
@@ -31,8 +32,14 @@ DECISIVE = 25.0
 
 OVERLAP = 8.0
 FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "heading mirrored": 1.0,
-          "position mirrored": 1.5, "turned about": 0.5, "gyro upside down": 1.0}  # fmt: skip
+          "position mirrored": 1.5, "pose mirrored": 0.75, "turned about": 0.5, "gyro upside down": 1.0,
+          "drives backwards": 1.0}  # fmt: skip
+"""Position and heading of one pose that are both mirrored are one fault; that two joints or two topics carry each
+other's names is rarer."""
+
 ABOUT_RAD = math.radians(135.0)
+BACKWARDS_SHARE = 0.8
+"""People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
 
 
@@ -51,14 +58,25 @@ class Convention(NamedTuple):
     heading: int
     position: int
 
-    def faults(self, offset: float, gyro_sense: int) -> float:
+    def faults(self, offset: float, drive: DriveArrays, gyro_sense: int) -> float:
         """Return how many things would be wrong; `gyro_sense` as in `decide_conventions`."""
         count = FAULTS["swapped"] * self.swapped
         signs = self.sign_left + self.sign_right
         count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
-        count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
+        if self.heading < 0 and self.position < 0 and drive.same_clock:
+            count += FAULTS["pose mirrored"]
+        else:
+            count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
+            # an ENU yaw taken for a NED one, or the reverse, is turned by a quarter as well
+            if self.heading < 0 and not drive.same_clock:
+                offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
+        count += FAULTS["drives backwards"] * self._drives_backwards(drive)
         return count + FAULTS["gyro upside down"] * (gyro_sense * self.heading < 0)
+
+    def _drives_backwards(self, drive: DriveArrays) -> bool:
+        distance = (self.sign_left * drive.v_left + self.sign_right * drive.v_right) * drive.wheel_dt
+        return float(-np.minimum(distance, 0.0).sum()) > BACKWARDS_SHARE * float(np.abs(distance).sum()) > 0.0
 
 
 class Decision(NamedTuple):
@@ -118,7 +136,7 @@ def decide_conventions(
     best = min(cost for cost, _ in costs.values())
     if named - best < DECISIVE:
         return Decision(AS_NAMED, 0.0, None)
-    likely = {one: one.faults(offset, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
+    likely = {one: one.faults(offset, drive, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
     ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5

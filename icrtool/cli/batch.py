@@ -16,7 +16,9 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.fit import plot_formats
+from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.options import POSITIVE
+from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from icrtool.fleet.one_log import Request
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 @click.option("--timeout", "timeout_s", metavar="SECONDS", type=POSITIVE, default=1800.0, show_default=True,
               help="End a log that takes longer.")  # fmt: skip
 @click.option("--redo", is_flag=True, help="Process logs again that are done.")
+@click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Distance over which 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option(
@@ -41,12 +44,13 @@ if TYPE_CHECKING:
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
-@click.option("--json", "as_json", is_flag=True, help="Print fleet.json, and nothing else, on standard output.")
+@json_option
 @options.configuration
 @options.verbosity
 def command(
-    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float, redo: bool,
-    budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool, plots: str, as_json: bool,
+    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
+    redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
+    plots: str, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -64,10 +68,9 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
     from icrtool.fleet.fleet_files import fleet_document, write_fleet
-    from icrtool.output.run_directory import json_bytes
 
     asked = BatchOptions(
-        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s,
+        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite,
     )  # fmt: skip
     requests = plan(places, output, asked)
     output.mkdir(parents=True, exist_ok=True)
@@ -85,7 +88,7 @@ def command(
     rows.sort(key=lambda row: order[row.log])
     write_fleet(rows, output)
     if as_json:
-        click.echo(json_bytes(fleet_document(rows)).decode(), nl=False)
+        print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
     elif not quiet:
         click.echo(summary_of(rows, output))
     if any(row.gates_failed for row in rows):
@@ -161,7 +164,7 @@ class View:
         for verdict in row.verdicts:
             if not verdict.passed:
                 value = "no trial of that length" if verdict.value_m is None else f"{verdict.value_m:.4g} m"
-                click.echo(f"FAIL  {shown(row.log)}: {verdict.gate}: {value}", err=True)
+                click.echo(f"FAIL  {verdict.gate}: {value} (log {shown(row.log)})", err=True)
         self._show()
 
     def _show(self) -> None:

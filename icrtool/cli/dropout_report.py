@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS, plot_formats, run_directories
+from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
 from icrtool.cli.options import POSITIVE
 
 if TYPE_CHECKING:
@@ -49,15 +49,14 @@ class Request:
     formats: tuple[str, ...]
     ladder: bool
     smoothed: bool
+    overwrite: bool
     quiet: bool
     verbose: bool
 
 
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory of a log, as in fit."
-)
+@options.place
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Report how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
@@ -86,7 +85,8 @@ class Request:
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, budgets: tuple[float, ...], horizons: str | None,
+    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
+    budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
     junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
@@ -116,9 +116,9 @@ def command(
         calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
-        smoothed=reference == "smoothed", quiet=quiet, verbose=verbose,
+        smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
     )  # fmt: skip
-    sources, places = plan_sources(sources, output, config, (junit, markdown))
+    sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
     with picture_process(formats, fits=bool(places)) as drawer:
         outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
     leave(outcomes, junit=junit, markdown=markdown)
@@ -145,11 +145,21 @@ def parse_horizons(text: str) -> tuple[float, ...]:
 
 
 def plan_sources(
-    sources: tuple[Path, ...], output: Path | None, config: Config, exports: tuple[Path | None, ...]
+    sources: tuple[Path, ...],
+    places: tuple[Path | None, Path | None],
+    config: Config,
+    exports: tuple[Path | None, ...],
+    *,
+    quiet: bool,
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
     Everything that can be refused without reading a log is refused here.
+
+    Parameters
+    ----------
+    places : -o and --into
+    exports : files to be written
     """
     from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
@@ -159,9 +169,11 @@ def plan_sources(
         if export is not None:
             check_place(export)
     sources = sources or (newest_run(RUNS),)
+    sources = logs_of(sources, quiet=quiet)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
-    check_configuration(config, runs_only=not logs, output=output)
-    return sources, dict(zip(logs, run_directories(logs, output), strict=True)) if logs else {}
+    output, into = places
+    check_configuration(config, runs_only=not logs, output=output or into)
+    return sources, dict(zip(logs, run_directories(logs, output, into), strict=True)) if logs else {}
 
 
 def report_all(
@@ -176,8 +188,7 @@ def report_all(
         try:
             yield source, _report_one(source, places.get(source), request, drawer)
         except IcrToolError as err:
-            if len(sources) > 1:
-                click.echo(f"Error: {err}", err=True)
+            options.report_error(err, source)
             yield source, err
 
 
@@ -190,13 +201,9 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
         write_junit(junit, outcomes)
     if markdown is not None:
         write_markdown(markdown, outcomes)
-    failed = [outcome for _, outcome in outcomes if isinstance(outcome, IcrToolError)]
-    if len(failed) == len(outcomes) == 1:
-        raise failed[0]
-    if failed:
-        raise options.not_all_used(len(failed), len(outcomes), "runs and logs")
-    if any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError)):
-        raise SystemExit(3)
+    failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
+    missed = any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError))
+    options.leave(failed, len(outcomes), "runs and logs", gate_failed=missed)
 
 
 def check_configuration(config: Config, *, runs_only: bool, output: Path | None) -> None:
@@ -251,9 +258,9 @@ def _read(directory: Path) -> Run:
 
 def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> Run:
     """Fit a log and write its run directory, as `icrtool fit` does."""
-    from icrtool.output.run_directory import check_target, write_run
+    from icrtool.output.run_directory import check_target, replaced_log, write_run
 
-    check_target(directory)
+    check_target(directory, log, overwrite=request.overwrite)
     with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
 
@@ -261,8 +268,11 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     from icrtool.estimation.fit import fit
 
     run = fit(measured, request.config, smooth=request.smoothed)
-    write_run(run, directory, drawer=drawer)
-    options.warn(run.warnings, quiet=request.quiet)
+    notes: list[str] = []
+    if (before := replaced_log(directory, run)) is not None:
+        notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
+    write_run(run, directory, drawer=drawer, note=notes.append)
+    options.warn((*run.warnings, *notes), quiet=request.quiet)
     if request.verbose:
         for stream in measured.streams:
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)

@@ -7,43 +7,137 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from icrtool.cli import options
 from icrtool.cli.fit import RUNS
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
     from icrtool.output.exports.controllers import Target
+    from icrtool.output.exports.trajectories import TrajectoryFormat
+    from icrtool.records.run import Run
 
-TARGETS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr")
+CONTROLLERS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr")
+TRAJECTORIES = ("evo", "kitti")
+TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 
 @click.command("export")
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=click.Path(path_type=Path))
-@click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the text is for.")
-@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Write it here.")
-@click.option("--force", is_flag=True, help="Also from a run whose ICRs are not usable.")
+@click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
+@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
+              help="Write it here. For evo and kitti, DIR: a file for each path of the run.")  # fmt: skip
+@click.option("--force", is_flag=True, help="Also a calibration of a run whose ICRs are not usable.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
-    """Print a calibration, ready to paste into a robot's controller or filter.
+    """Print a calibration for a robot's controller, or a run for other programs.
 
     CAL.json is a file that `icrtool calibrate -o` wrote. A RUN, a directory that `icrtool fit` wrote, is calibrated
     first, with the same result; without an argument, the newest run below icrtool-runs/. The covariances are measured
     on distance held out of the fit. Target icr: the whole motion model as JSON, in REP-103 (y left).
 
     \b
+    Paths of a RUN (world ENU about the datum, body x forward and y left):
+      evo, kitti    trajectories in TUM or KITTI format: FILE is the filter's; DIR also gets icr and no_slip
+      google-earth  KML: paths, drive over time, outages, slip events
+      qgis          GeoJSON: the same, and states and fixes with attributes
+      foxglove      MCAP: odometry, fixes, ICRs, open-loop error, events; the layout is beside it
+
+    \b
     Example:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for icr season.json -o twist.json
+      icrtool export --for evo icrtool-runs/field -o trajectories
+      icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import atomic_file, check_place
-    from icrtool.output.exports.controllers import format_export
+    from icrtool.output.atomic_file import check_place
 
+    if target in TRAJECTORIES and output is not None and (output.is_dir() or not output.suffix):
+        _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
+        return
+    if target == "foxglove" and output is None:
+        raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
     if output is not None:
         check_place(output)
-    text = format_export(_calibration(source, force=force), cast("Target", target))
-    if output is None:
-        click.echo(text)
+    if target == "foxglove" and output is not None:
+        _write_foxglove(_run(source), output)
         return
+    if target in CONTROLLERS:
+        from icrtool.output.exports.controllers import format_export
+
+        _leave(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
+    else:
+        _leave(_path_text(_run(source), target), output)
+
+
+def _path_text(run: Run, target: str) -> str:
+    """Return the paths of a run in a text format."""
+    if target in TRAJECTORIES:
+        from icrtool.output.exports.paths import paths_of
+        from icrtool.output.exports.trajectories import format_trajectory
+
+        return format_trajectory(paths_of(run)[0], cast("TrajectoryFormat", target))
+    if target == "qgis":
+        from icrtool.output.exports.geojson import format_geojson
+
+        return f"{format_geojson(run)}\n"
+    from icrtool.output.exports.kml import format_kml
+
+    return f"{format_kml(run)}\n"
+
+
+def _leave(text: str, output: Path | None) -> None:
+    """Write a text to its file, or print it."""
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    from icrtool.output.atomic_file import atomic_file
+
     with atomic_file(output) as partial:
-        partial.write_text(f"{text}\n", encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
+
+
+def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
+    """Write a file for each path of a run."""
+    from icrtool.errors import OutputError
+    from icrtool.output.exports.paths import paths_of
+    from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory
+
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as err:
+        raise OutputError(directory, "cannot be made", err.strerror or str(err)) from err
+    for path in paths_of(run):
+        file = directory / f"{path.name}{SUFFIXES[target]}"
+        _leave(format_trajectory(path, target), file)
+        click.echo(f"written to {file}")
+
+
+def _write_foxglove(run: Run, output: Path) -> None:
+    """Write the MCAP file, and the layout beside it."""
+    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.exports.foxglove import write_foxglove
+    from icrtool.output.exports.foxglove_layout import foxglove_layout
+    from icrtool.output.run_directory import json_bytes
+
+    layout = output.with_name(f"{output.stem}.layout.json")
+    check_place(layout)
+    with atomic_file(output) as partial:
+        write_foxglove(run, partial)
+    with atomic_file(layout) as partial:
+        partial.write_bytes(json_bytes(foxglove_layout(run)))
+    click.echo(f"written to {output}; layout for Foxglove: {layout}")
+
+
+def _run(source: Path | None) -> Run:
+    """Read the run whose paths are asked for; one that is not usable has them too."""
+    from icrtool.errors import RunError
+    from icrtool.output.stored_run import newest_run, open_run
+
+    if source is not None and source.is_file():
+        raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")
+    run = open_run(source if source is not None else newest_run(RUNS))
+    if not run.usable:
+        options.warn([f"{run.name}: its ICRs are not usable: {run.summary['unusable_because']}"], quiet=False)
+    return run
 
 
 def _calibration(source: Path | None, *, force: bool) -> Calibration:

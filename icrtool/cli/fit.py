@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
 from icrtool.cli import options
+from icrtool.cli.json_output import json_option, print_json
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.output.figures.drawing_process import DrawingProcess
-    from icrtool.records.run import WarmStart
+    from icrtool.records.run import Run, WarmStart
 
 RUNS = Path("icrtool-runs")
 
@@ -28,7 +29,9 @@ class FitRequest(NamedTuple):
     warm_start: Path | None
     changes_s: tuple[float, ...]
     smooths: bool
+    overwrite: bool
     quiet: bool
+    prints_nothing: bool
     verbose: bool
     start: str | None = None
     end: str | None = None
@@ -36,9 +39,7 @@ class FitRequest(NamedTuple):
 
 @click.command("fit")
 @options.LOGS
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Run directory (several logs: its parent)."
-)
+@options.place
 @click.option(
     "--states", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True, help="Format of the states."
 )
@@ -58,12 +59,14 @@ class FitRequest(NamedTuple):
     help="Inflate the ICR covariance T seconds after the start. Repeatable.",
 )
 @click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
+@json_option
 @options.cut
 @options.configuration
 @options.verbosity
 def command(
-    logs: tuple[Path, ...], output: Path | None, states: str, plots: str,
-    warm_start: Path | None, changes: tuple[float, ...], smooths: bool, start: str | None, end: str | None,
+    logs: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool, states: str, plots: str,
+    warm_start: Path | None, changes: tuple[float, ...], smooths: bool, as_json: bool,
+    start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -81,21 +84,26 @@ def command(
     config = options.load(config_file, robot, sets)
     request = FitRequest(
         config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
-        check_times(changes), smooths, quiet, verbose, start, end,
+        check_times(changes), smooths, overwrite, quiet, quiet or as_json, verbose, start, end,
     )  # fmt: skip
-    directories = run_directories(logs, output)
-    failed: list[IcrToolError] = []
+    logs = logs_of(logs, quiet=quiet)
+    directories = run_directories(logs, output, into)
+    documents: list[dict[str, Any]] = []
+    failed: list[Path] = []
     with options.drawing_process(request.formats) as drawer:
         for log, directory in zip(logs, directories, strict=True):
             try:
-                _fit_one(log, directory, request, drawer)
+                run = _fit_one(log, directory, request, drawer)
             except IcrToolError as err:
-                if len(logs) == 1:
-                    raise
-                failed.append(err)
-                click.echo(f"Error: {err}", err=True)
-    if failed:
-        raise options.not_all_used(len(failed), len(logs), "logs")
+                failed.append(log)
+                options.report_error(err, log)
+                documents.append({"log": escaped(str(log)), "status": "failed", "reason": str(err)})
+            else:
+                place = escaped(str(directory))
+                documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
+    if as_json:
+        print_json("fit", {"logs": documents})
+    options.leave(failed, len(logs), "logs")
 
 
 def check_times(times: tuple[float, ...]) -> tuple[float, ...]:
@@ -118,25 +126,32 @@ def plot_formats(text: str) -> tuple[str, ...]:
     return formats
 
 
-def run_directories(logs: tuple[Path, ...], output: Path | None) -> list[Path]:
-    """Return where each log's run goes: ``icrtool-runs/NAME``, DIR, or ``DIR/NAME`` for several."""
+def logs_of(places: tuple[Path, ...], *, quiet: bool) -> tuple[Path, ...]:
+    """Return the logs among the arguments of a command, those in folders too, and warn of files that are none."""
+    from icrtool.fleet.recordings import logs_among
+
+    logs, beside = logs_among(places)
+    options.warn([f"{escaped(str(file))}: not a log: left out" for file in beside], quiet=quiet)
+    return tuple(logs)
+
+
+def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[Path]:
+    """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
+
+    Logs of one name are distinguished by what their paths differ in.
+    """
     from icrtool.errors import OutputError
-    from icrtool.logs.read_log import log_name
+    from icrtool.fleet.recordings import distinct_names
     from icrtool.output.run_directory import RUN_FILE
 
-    names = [log_name(log) for log in logs]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise OutputError(
-            twice,
-            "two logs have this name, their runs would be one directory",
-            "fit them one at a time, each with its -o",
-        )
+    if output is not None and into is not None:
+        raise click.UsageError("-o and --into both state where the runs go: give one of them")
     if output is not None and len(logs) == 1:
         return [output]
-    if output is not None and (output / RUN_FILE).is_file():
-        raise OutputError(output, "is a run itself", "runs in it would go when it is fitted again: name another place")
-    return [(output or RUNS) / name for name in names]
+    parent = output or into
+    if parent is not None and (parent / RUN_FILE).is_file():
+        raise OutputError(parent, "is a run itself", "runs in it would go when it is fitted again: name another place")
+    return [(parent or RUNS) / name for name in distinct_names(logs)]
 
 
 def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...]:
@@ -167,11 +182,10 @@ def _warm_start(source: Path) -> WarmStart:
     return open_run(source).ended_with
 
 
-def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> None:
-    from icrtool.output.run_directory import check_target, log_of_run, write_run
+def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> Run:
+    from icrtool.output.run_directory import check_target, replaced_log, write_run
 
-    check_target(directory)
-    before = log_of_run(directory)
+    check_target(directory, log, overwrite=request.overwrite)
     start = _warm_start(request.warm_start) if request.warm_start is not None else None
     with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
         from icrtool.logs import read_log
@@ -188,11 +202,11 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         smooth=request.smooths,
     )
     notes: list[str] = []
+    if (before := replaced_log(directory, run)) is not None:
+        notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
     write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
-    replaced = before is not None and before != run.summary["inputs"][0]["path"]
-    note = (f"{directory}: the run of another log was there, {before}: replaced, with its report",) if replaced else ()
-    options.warn((*run.warnings, *_other_robot(request, start), *note, *notes), quiet=request.quiet)
-    if not request.quiet:
+    options.warn((*run.warnings, *_other_robot(request, start), *notes), quiet=request.quiet)
+    if not request.prints_nothing:
         from icrtool.output.tables.run import format_run
 
         click.echo(format_run(run))
@@ -200,3 +214,4 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     for stream in measured.streams:
         if request.verbose or ("chosen over" in stream.why and not request.quiet):
             click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+    return run

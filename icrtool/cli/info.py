@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from icrtool.cli import options
-from icrtool.records.text import LogText
+from icrtool.cli.fit import logs_of
+from icrtool.cli.json_output import json_option, print_json
+from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
+    from icrtool.errors import IcrToolError
+    from icrtool.logs.read_log import Survey
     from icrtool.records.run import Run
     from icrtool.records.tables import RobotLog
 
 
 @click.command("info")
 @options.LOGS
+@json_option
 @options.cut
 @options.configuration
 @options.verbosity
 def command(
-    logs: tuple[Path, ...],
-    start: str | None,
-    end: str | None,
-    config_file: Path | None,
-    robot: str | None,
-    sets: tuple[str, ...],
-    quiet: bool,
-    verbose: bool,
-) -> None:
+    logs: tuple[Path, ...], as_json: bool, start: str | None, end: str | None,
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
+) -> None:  # fmt: skip
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 
     The filter runs as well, and nothing is written: the report includes which ICRs the drive determines, and what to
@@ -41,57 +41,96 @@ def command(
     from icrtool.errors import IcrToolError
 
     config = options.load(config_file, robot, sets)
-    failed = 0
+    failed: list[Path] = []
+    documents: list[dict[str, Any]] = []
+    logs = logs_of(logs, quiet=quiet)
     for log in logs:
+        found = Found(log)
         try:
-            usable = _describe(log, config, (start, end), quiet=quiet, verbose=verbose)
+            _examine(found, config, (start, end), quiet=quiet)
         except IcrToolError as err:
-            click.echo(f"Error: {err}", err=True)
-            usable = False
-        failed += not usable
-    if failed:
-        raise SystemExit(1)
+            found.problem = err
+        if not (quiet or as_json):
+            _print(found, everything=verbose)
+        options.warn(found.warnings, quiet=quiet)
+        if found.problem is not None:
+            failed.append(log)
+            options.report_error(found.problem, log)
+        if as_json:
+            documents.append(_document(found))
+    if as_json:
+        print_json("info", {"logs": documents})
+    options.leave(failed, len(logs), "logs")
 
 
-def _describe(log: Path, config: Config, part: tuple[str | None, str | None], *, quiet: bool, verbose: bool) -> bool:
-    """Print what a log holds; return whether it can be fitted."""
+@dataclass(slots=True)
+class Found:
+    """What was found in a log, as far as reading and fitting it came."""
+
+    log: Path
+    survey: Survey | None = None
+    measured: RobotLog | None = None
+    run: Run | None = None
+    problem: IcrToolError | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those of the last step that was done."""
+        found = self.run if self.run is not None else self.measured
+        if found is not None:
+            return found.warnings
+        return self.survey.problems if self.survey is not None else ()
+
+
+def _examine(found: Found, config: Config, part: tuple[str | None, str | None], *, quiet: bool) -> None:
+    """Read and fit a log: only the filter shows which ICRs the drive determines, and which sensors disagree.
+
+    Raises
+    ------
+    IcrToolError
+        The log cannot be fitted.
+    """
     from icrtool.alignment.wheel_units import with_wheel_speeds
-    from icrtool.errors import IcrToolError
     from icrtool.logs import assemble, read_log, survey_log
-    from icrtool.logs.describe import describe_log, describe_survey
     from icrtool.logs.table_file import is_table
 
     start, end = part
-    survey, measured, run, problem = None, None, None, ""
-    if not is_table(log):
-        with options.progress_bar(f"reading {LogText(log.name)}", quiet=quiet) as progress:
-            survey = survey_log(log, config, progress, start=start, end=end)
-    try:
-        measured = assemble(survey, config) if survey is not None else read_log(log, config, start=start, end=end)
-        measured = with_wheel_speeds(measured, config)
-        run = _try(measured, config)
-    except IcrToolError as err:
-        problem = str(err)
-    if not quiet:
-        if survey is not None:
-            click.echo(describe_survey(survey, measured, everything=verbose))
-        elif measured is not None:
-            click.echo(describe_log(measured))
-        if run is not None:
-            from icrtool.output.tables.run import excitation_lines
-
-            click.echo("\n".join(excitation_lines(run)))
-    found = run if run is not None else measured
-    options.warn(
-        list(found.warnings) if found is not None else list(survey.problems if survey is not None else ()), quiet=quiet
-    )
-    if problem:
-        click.echo(f"Error: {problem}", err=True)
-    return run is not None
-
-
-def _try(measured: RobotLog, config: Config) -> Run:
-    """Fit the log: only the filter shows which ICRs the drive determines, and which sensors disagree."""
+    if is_table(found.log):
+        found.measured = read_log(found.log, config, start=start, end=end)
+    else:
+        with options.progress_bar(f"reading {LogText(found.log.name)}", quiet=quiet) as progress:
+            found.survey = survey_log(found.log, config, progress, start=start, end=end)
+        found.measured = assemble(found.survey, config)
+    found.measured = with_wheel_speeds(found.measured, config)
     from icrtool.estimation.fit import fit
 
-    return fit(measured, config)
+    found.run = fit(found.measured, config)
+
+
+def _print(found: Found, *, everything: bool) -> None:
+    """Print what a log holds."""
+    from icrtool.logs.describe import describe_log, describe_survey
+
+    if found.survey is not None:
+        click.echo(describe_survey(found.survey, found.measured, everything=everything))
+    elif found.measured is not None:
+        click.echo(describe_log(found.measured))
+    if found.run is not None:
+        from icrtool.output.tables.run import excitation_lines
+
+        click.echo("\n".join(excitation_lines(found.run)))
+
+
+def _document(found: Found) -> dict[str, Any]:
+    """Return what a log holds as plain data; ``run`` as in run.json, null where the log cannot be fitted."""
+    from icrtool.logs.survey_document import streams_document, survey_document
+
+    return {
+        "log": escaped(str(found.log)),
+        "status": "done" if found.problem is None else "failed",
+        "reason": str(found.problem) if found.problem is not None else None,
+        **(survey_document(found.survey) if found.survey is not None else {}),
+        "streams": streams_document(found.measured) if found.measured is not None else [],
+        "warnings": list(found.warnings),
+        "run": found.run.summary if found.run is not None else None,
+    }

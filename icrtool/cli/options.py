@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -21,6 +23,8 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
+
+NAMES_SHOWN = 5
 
 # Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
 LOG = click.Path(path_type=Path, readable=False)
@@ -41,6 +45,15 @@ def configuration(command: Command) -> Command:
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def place(command: Command) -> Command:
+    """Add -o, --into and --overwrite, as `output`, `into` and `overwrite`."""
+    command = click.option("--overwrite", is_flag=True, help="Also replace the run of another recording.")(command)
+    command = click.option("--into", metavar="DIR", type=click.Path(path_type=Path),
+                           help="Parent of the run directories, also of one log.")(command)  # fmt: skip
+    return click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path),
+                        help="Run directory of a log; of several logs: its parent.")(command)  # fmt: skip
 
 
 def cut(command: Command) -> Command:
@@ -70,12 +83,34 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
             click.echo(f"Warning: {warning}", err=True)
 
 
-def not_all_used(failed: int, of: int, what: str) -> IcrToolError:
-    """Return an error with the number of inputs that could not be used; each was reported when it occurred."""
-    from icrtool.errors import IcrToolError
+def error_line(err: IcrToolError, source: Path | str) -> str:
+    """Return the line about an error, which names the log or run that it occurred in."""
+    name = shortened(escaped(str(source)), LONGEST_NAME)
+    named = any(part in str(err) for part in (name, escaped(Path(source).name), escaped(Path(source).stem)))
+    return f"Error: {err}" if named else f"Error: {name}: {err}"
 
-    others = "the others were written" if failed < of else "see above"
-    return IcrToolError(f"{failed} of {of} {what}", "could not be used", others)
+
+def report_error(err: IcrToolError, source: Path | str) -> None:
+    """Print the line about an error on standard error."""
+    click.echo(error_line(err, source), err=True)
+
+
+def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = False) -> None:
+    """Exit with the status of a command that had several inputs: 3 if a gate failed, else 1 if an input failed.
+
+    Parameters
+    ----------
+    failed : inputs that could not be used; each was reported when it occurred
+    of : number of inputs
+    """
+    if failed and of > 1:
+        names = [shortened(escaped(str(source)), LONGEST_NAME) for source in failed]
+        listed = ", ".join(names[:NAMES_SHOWN]) + (
+            f" and {len(names) - NAMES_SHOWN} more" if names[NAMES_SHOWN:] else ""
+        )
+        click.echo(f"Error: {len(failed)} of {of} {what} could not be used: {listed}", err=True)
+    if gate_failed or failed:
+        raise SystemExit(3 if gate_failed else 1)
 
 
 def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:

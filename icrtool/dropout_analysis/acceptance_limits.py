@@ -78,14 +78,14 @@ def check_gate(gate: Gate, report: DropoutReport) -> Verdict:
         table = report.comparison
         compared = table.summaries if table is not None else {}
         if table is not None and gate.model in compared:
-            return _verdict(gate, compared[gate.model], np.array(table.horizons_m))
+            return _verdict(gate, compared[gate.model], np.array(table.horizons_m), report.name)
         known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *compared]))
         advice = f"this run has {known}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
-    return _verdict(gate, result.summary, report.horizons_m)
+    return _verdict(gate, result.summary, report.horizons_m, report.name)
 
 
-def _verdict(gate: Gate, summary: Summary, horizons_m: Floats) -> Verdict:
+def _verdict(gate: Gate, summary: Summary, horizons_m: Floats, log: str) -> Verdict:
     places = np.flatnonzero(np.isclose(horizons_m, gate.horizon_m))
     if not len(places):
         known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
@@ -93,7 +93,7 @@ def _verdict(gate: Gate, summary: Summary, horizons_m: Floats) -> Verdict:
     column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
     value = float(getattr(summary, column)[places[0]])
     margin = gate.bound_m - value if gate.relation.startswith("<") else value - gate.bound_m
-    return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m))
+    return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m), log)
 
 
 def _budget_distance(

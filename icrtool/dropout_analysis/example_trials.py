@@ -47,8 +47,8 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     Notes
     -----
     Cornering: the heading changes by about half a turn, or as nearly so as the drive has it. Straight: of the
-    twentieth part of the trials that turns least. Typical: of those, the one with the median error of the momentary
-    ICRs.
+    twentieth part of the trials that end furthest from their start. Typical: of those, the one with the median error
+    of the momentary ICRs.
     """
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
@@ -57,10 +57,10 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     moving = starts[~standing_states(drive)[starts]]
     if not len(moving):
         return ()
-    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(drive.heading)))])
-    turning = turned[ends[moving]] - turned[moving]
-    off = np.abs(np.abs(drive.heading[ends[moving]] - drive.heading[moving]) - np.pi)
-    groups = (moving[off <= off.min() + ALIKE_RAD], moving[turning <= np.quantile(turning, STRAIGHT_SHARE)])
+    last = ends[moving]
+    chord = np.hypot(drive.north[last] - drive.north[moving], drive.east[last] - drive.east[moving])
+    off = np.abs(np.abs(drive.heading[last] - drive.heading[moving]) - np.pi)
+    groups = (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)])
     chosen = (_typical(drive, models[0], ends, group) for group in groups)
     return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 

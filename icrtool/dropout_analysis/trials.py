@@ -180,6 +180,24 @@ def dropout(
     return done()
 
 
+def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
+    """Return the open-loop error of each of the filter's models, from every recorded state.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    horizon_m : distance without GNSS
+
+    Returns
+    -------
+    dict
+        By model name, float64 (n,) [m]; NaN where there is no trial (`dropout` lists the reasons).
+    """
+    drive = drive_of(run)
+    ends = trial_ends(drive, np.array([horizon_m]))
+    return {model.name: open_loop_errors(drive, model.icrs, ends)[:, 0] for model in models_of(run)}
+
+
 def configured_horizons_m(run: Run) -> tuple[float, ...]:
     """Return the horizons [m] of the configuration a run was made with."""
     return run.config.dropout.horizons_m

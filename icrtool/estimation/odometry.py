@@ -18,11 +18,13 @@ class OdometryPath:
     Attributes
     ----------
     north_m, east_m : float64 (n,), at every recorded state
+    heading_rad : float64 (n,), clockwise from north, unwrapped
     end_error_m : distance to the filter's estimate at the last state
     """
 
     north_m: Floats
     east_m: Floats
+    heading_rad: Floats
     end_error_m: float
 
 
@@ -67,7 +69,7 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
     drive = make_drive(table, in_gap, np.empty((0, 2), np.int64))
-    north, east = np.empty(len(table)), np.empty(len(table))
+    north, east, heading = (np.empty(len(table)) for _ in range(3))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
     for first, last in zip([0, *(edges + 1)], [*edges, len(table) - 1], strict=True):
@@ -82,6 +84,7 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
         stretch = slice(first, last + 1)
         north[stretch] = table.north_m[first] + miss_north + ahead_north * np.cos(turned) - ahead_east * np.sin(turned)
         east[stretch] = table.east_m[first] + miss_east + ahead_north * np.sin(turned) + ahead_east * np.cos(turned)
+        heading[stretch] = piece.heading + turned
         miss_north, miss_east = north[last] - table.north_m[last], east[last] - table.east_m[last]
         turned += float(piece.heading[-1] - table.heading_rad[last])
-    return OdometryPath(north, east, float(np.hypot(miss_north, miss_east)))
+    return OdometryPath(north, east, heading, float(np.hypot(miss_north, miss_east)))

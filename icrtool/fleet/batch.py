@@ -41,6 +41,7 @@ class BatchOptions:
     config_file, robot, sets : as in `icrtool.load_config`; a manifest's line comes before the first two
     redo : process logs again that are done
     timeout_s : a log that takes longer is ended
+    overwrite : the run of another recording may be replaced
     """
 
     config_file: Path | None = None
@@ -52,6 +53,7 @@ class BatchOptions:
     ladder: bool = True
     redo: bool = False
     timeout_s: float = 1800.0
+    overwrite: bool = False
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -181,7 +183,7 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions) 
     return Request(
         path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
-        budgets_m=options.budgets_m, ladder=options.ladder,
+        budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
     )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ class Request:
     gates: tuple[str, ...] = ()
     budgets_m: tuple[float, ...] = (0.5,)
     ladder: bool = True
+    overwrite: bool = False
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -120,7 +121,7 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.output.run_directory import check_target
 
     directory = path_of(request.directory)
-    check_target(directory)
+    check_target(directory, path_of(request.path), overwrite=request.overwrite)
     stage("reading")
     log = read_log(path_of(request.path), request.config)
     stage("filtering")

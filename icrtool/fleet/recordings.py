@@ -21,7 +21,9 @@ from icrtool.logs.read_log import log_name
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
 
-OWN_FILES = ("run.json", "fleet.json", "study.json")
+RUN_FILE = "run.json"
+
+OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
 """A folder that holds one of these is a result, not a place of recordings."""
 
 FIRST_BYTES = 65536
@@ -63,6 +65,46 @@ def find_recordings(places: Sequence[Path]) -> list[Recording]:
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
     root = common_parent(places)
     return _named(sorted(found.values(), key=_natural), root)
+
+
+def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the logs that a command is to use, each once, and the files beside them that are no logs.
+
+    A folder that is no recording and no run stands for the recordings below it, if there are any. A file that only has
+    the name of a recording among `places` (``drive.json`` beside ``drive.mcap``, from a pattern of the shell) is left
+    out.
+    """
+    found: dict[str, Path] = {}
+    for place in places:
+        searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
+        below = sorted(_search(place), key=_natural) if searched else []
+        for path in below or [place]:
+            found.setdefault(os.path.realpath(path), path)
+    logs = list(found.values())
+    recordings = [path for path in logs if path.is_dir() or is_recording(path)]
+    stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}
+    beside = [path for path in logs if path not in recordings and _is_beside(_absolute(path), stems)]
+    return [path for path in logs if path not in beside], beside
+
+
+def _is_beside(file: Path, stems: set[Path]) -> bool:
+    """Return whether a file has a recording's name and another suffix: ``drive.truth.csv`` beside ``drive.bag``."""
+    parts = file.name.split(".")
+    return file.is_file() and any(file.parent / f"{'.'.join(parts[:k])}." in stems for k in range(1, len(parts)))
+
+
+def distinct_names(logs: Sequence[Path]) -> list[str]:
+    """Return a name for the run of each log: that of the log, or where two share it, what their paths differ in."""
+    names = [log_name(log) for log in logs]
+    if len({name.casefold() for name in names}) == len(names):
+        return names
+    count = Counter(name.casefold() for name in names)
+    longer = [one.name.replace("/", "-") for one in _named(logs, common_parent(logs))]
+    taken = {name.casefold() for name in names if count[name.casefold()] == 1}
+    for index, name in enumerate(names):
+        if count[name.casefold()] > 1:
+            names[index] = _unique(longer[index], taken)
+    return names
 
 
 def common_parent(places: Sequence[Path]) -> Path:
@@ -141,13 +183,17 @@ def _named(paths: Sequence[Path], root: Path) -> list[Recording]:
         for name, log in zip(short, logs, strict=True)
     ]
     taken: set[str] = set()
-    for index, name in enumerate(names):
-        unique, number = name, 2
-        while unique.casefold() in taken:
-            unique, number = f"{name}-{number}", number + 1
-        taken.add(unique.casefold())
-        names[index] = unique
+    names = [_unique(name, taken) for name in names]
     return [Recording(path, as_text(name), as_text(log)) for path, name, log in zip(paths, names, logs, strict=True)]
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    """Return a name, with a number where it is taken; add it to those that are."""
+    unique, number = name, 2
+    while unique.casefold() in taken:
+        unique, number = f"{name}-{number}", number + 1
+    taken.add(unique.casefold())
+    return unique
 
 
 def _absolute(path: Path) -> Path:

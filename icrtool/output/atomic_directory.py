@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path, PurePosixPath
@@ -71,6 +71,7 @@ def atomic_directory(
     *,
     kind: str,
     names: Collection[str] = (),
+    made_from: Sequence[str] = (),
     note: Callable[[str], None] | None = None,
 ) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
@@ -81,6 +82,7 @@ def atomic_directory(
     ----------
     directory, ours, kind : as in `check_place`
     names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
+    made_from : absolute paths of the files that the content is made from
     note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
 
     Yields
@@ -107,7 +109,7 @@ def atomic_directory(
         with disk.locked(partial):
             yield partial
             check_place(place, ours, kind=kind)
-            done = _put(partial, place, kind, names)
+            done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:
             note(f"{directory}: {done}")
@@ -137,10 +139,10 @@ def restore(directory: Path, ours: IsOurs) -> None:
         disk.rename(max(aside, key=lambda path: path.stat().st_mtime_ns), place)
 
 
-def _put(partial: Path, place: Path, kind: str, names: Collection[str]) -> str:
+def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_from: Sequence[str]) -> str:
     """Move `partial` to `place`; return a line about what the replacement removed and kept, empty where nothing."""
     new = set(files_in(partial))
-    write_own_files(partial, kind)
+    write_own_files(partial, kind, made_from)
     removed: list[PurePosixPath] = []
     kept: list[PurePosixPath] = []
     replaces = place.exists()

@@ -4,29 +4,40 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from icrtool.output import disk
 
 OWN_FILES = ".icrtool-files"
-"""List of the files that were written with a directory: JSON with `schema`, `kind` and `files`."""
+"""List of the files that were written with a directory: JSON with `schema`, `kind`, `files` and `made_from`."""
 
 SCHEMA = "icrtool/files/1"
 
 SUFFIXES = frozenset({".csv", ".json", ".parquet", ".png", ".svg", ".pdf"})
 
 
-def write_own_files(directory: Path, kind: str) -> None:
-    """Write the list of all files in a directory that is about to be put in place."""
+def write_own_files(directory: Path, kind: str, made_from: Sequence[str] = ()) -> None:
+    """Write the list of all files in a directory that is about to be put in place.
+
+    Parameters
+    ----------
+    made_from : absolute paths of the files that its content was made from
+    """
     files = sorted(path.as_posix() for path in files_in(directory))
-    _write(directory / OWN_FILES, kind, files)
+    _write(directory / OWN_FILES, kind, files, made_from)
 
 
 def kind_of(directory: Path) -> str | None:
     """Return the kind of directory that icrtool wrote here; None where no list of its files states one."""
     document = _read(directory)
     return document[0] if document is not None else None
+
+
+def made_from(directory: Path) -> frozenset[str]:
+    """Return the absolute paths of the files that a directory of ours was made from; empty where no list has them."""
+    document = _read(directory)
+    return document[2] if document is not None else frozenset()
 
 
 def files_by_owner(directory: Path, names: Collection[str]) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
@@ -103,16 +114,17 @@ def files_in(directory: Path) -> Iterator[PurePosixPath]:
             yield PurePosixPath((here / name).relative_to(directory).as_posix())
 
 
-def _write(file: Path, kind: str, files: list[str]) -> None:
-    document = {"schema": SCHEMA, "kind": kind, "files": files}
+def _write(file: Path, kind: str, files: list[str], made_from: Sequence[str] = ()) -> None:
+    document = {"schema": SCHEMA, "kind": kind, "files": files, "made_from": list(made_from)}
     file.write_text(json.dumps(document, indent=0) + "\n", encoding="utf-8")
 
 
-def _read(directory: Path) -> tuple[str, frozenset[str]] | None:
+def _read(directory: Path) -> tuple[str, frozenset[str], frozenset[str]] | None:
     try:
         document = json.loads((directory / OWN_FILES).read_bytes())
         if document["schema"] == SCHEMA:
-            return str(document["kind"]), frozenset(map(str, document["files"]))
+            files, sources = (frozenset(map(str, document.get(key, ()))) for key in ("files", "made_from"))
+            return str(document["kind"]), files, sources
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         pass
     return None

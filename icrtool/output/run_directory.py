@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from icrtool.errors import OutputError
 from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
+from icrtool.output.own_files import made_from
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
 from icrtool.records.events import EVENT_COLUMNS
 from icrtool.records.plain_data import plain
@@ -34,15 +38,43 @@ LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREM
 """What a run directory may hold that is icrtool's, though the list of its files does not name it."""
 
 
-def check_target(directory: Path) -> None:
+def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = False) -> None:
     """Refuse a place where a run directory cannot be put, before any work is done for it.
+
+    Parameters
+    ----------
+    log : the run will be made from it; a run of another recording is refused
+    overwrite : a run of another recording may be replaced
 
     Raises
     ------
     OutputError
-        A file or a directory that is not a run of ours is there.
+        A file, a directory that is not a run of ours, or the run of another recording is there.
     """
     check_place(directory, is_run_directory, kind="run directory")
+    if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
+        other = log_of_run(directory) or "data frames"
+        advice = "name another place, or replace it with --overwrite"
+        raise OutputError(directory, f"holds the run of another recording ({other})", advice)
+
+
+def _is_made_from(directory: Path, log: Path) -> bool:
+    """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
+    files = [file for file in log.iterdir() if file.is_file()] if log.is_dir() else [log]
+    inputs = _inputs_of(directory)
+    # A run of an older version does not list the places; its paths may be relative to another directory.
+    places = made_from(directory) or {path for one in inputs if Path(path := str(one.get("path"))).is_absolute()}
+    if any(os.path.realpath(file) in places for file in files):
+        return True
+    return bool(inputs) and all(
+        any(file.stat().st_size == one.get("bytes") and _sha256(file) == one.get("sha256") for file in files)
+        for one in inputs
+    )
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_run(
@@ -72,8 +104,11 @@ def write_run(
     """
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
+    sources = [os.path.realpath(file["path"]) for file in run.summary["inputs"]]
     with (
-        atomic_directory(directory, is_run_directory, kind="run directory", names=LATER_NAMES, note=note) as partial,
+        atomic_directory(
+            directory, is_run_directory, kind="run directory", names=LATER_NAMES, made_from=sources, note=note
+        ) as partial,
         (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
@@ -93,10 +128,24 @@ def write_run(
 
 def log_of_run(directory: Path) -> str | None:
     """Return the path of the log that the run in a directory was made from; None without one."""
+    inputs = _inputs_of(directory)
+    return str(inputs[0].get("path")) if inputs else None
+
+
+def replaced_log(directory: Path, run: Run) -> str | None:
+    """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
+    before, now = _inputs_of(directory), run.summary["inputs"]
+    same = [one.get("sha256") for one in before] == [one["sha256"] for one in now]
+    return str(before[0].get("path")) if before and not same else None
+
+
+def _inputs_of(directory: Path) -> list[dict[str, Any]]:
+    """Return the inputs in a run.json that nobody checked yet."""
     try:
-        return str(json.loads((directory / RUN_FILE).read_bytes())["inputs"][0]["path"])
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
+        inputs = json.loads((directory / RUN_FILE).read_bytes())["inputs"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return []
+    return [one for one in inputs if isinstance(one, dict)] if isinstance(inputs, list) else []
 
 
 def is_run_directory(directory: Path) -> bool:

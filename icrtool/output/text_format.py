@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 TABLE_WIDTH = 100
 """Letters in a line of a printed table."""
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 """What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
@@ -31,6 +34,11 @@ def position_word(summary: Mapping[str, Any]) -> str:
     return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
 
 
+def xml_text(text: str) -> str:
+    """Return text without the characters that XML 1.0 cannot hold; the rest is escaped by the writer."""
+    return _NOT_XML.sub("?", text)
+
+
 def signed(metres: float) -> str:
     """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
     return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
@@ -41,6 +49,12 @@ def length_text(metres: float) -> str:
     if metres < 0.01:
         return f"{1000 * metres:.1f} mm"
     return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
+
+
+def metres_text(metres: float) -> str:
+    """Return an error as ``0.0034 m``, ``0.012 m`` or ``3.45 m``: one unit wherever errors stand side by side."""
+    digits = 4 if metres < 0.01 else 3 if metres < 0.1 else 2
+    return f"{metres:.{digits}f} m"
 
 
 def distance_text(metres: float) -> str:

@@ -192,19 +192,22 @@ class Verdict:
     ----------
     value_m : NaN where the log has no trial of that length
     margin_m : negative where the limit was exceeded
+    log : name of the log
     """
 
     gate: Gate
     value_m: float
     margin_m: float
     passed: bool
+    log: str = ""
 
     def line(self) -> str:
-        """Return the verdict in one line."""
+        """Return the verdict in one line, which names the log."""
         word = "pass" if self.passed else "FAIL"
+        log = f" (log {self.log})" if self.log else ""
         if math.isnan(self.value_m):
-            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log"
-        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m"
+            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log{log}"
+        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m{log}"
 
 
 class TurningSplit(NamedTuple):

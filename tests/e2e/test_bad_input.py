@@ -252,12 +252,6 @@ def somebody_elses_folder(folder: Path) -> list[str]:
     return [str(log(folder)), "-o", str(folder / "out")]
 
 
-def two_logs_of_one_name(folder: Path) -> list[str]:
-    (folder / "a").mkdir()
-    (folder / "b").mkdir()
-    return [str(log(folder / "a")), str(log(folder / "b"))]
-
-
 def config_file(folder: Path, text: str) -> list[str]:
     (folder / "robot.toml").write_text(text)
     return [str(log(folder)), "--config", str(folder / "robot.toml")]
@@ -354,7 +348,6 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "a file in the way": (a_file_in_the_way, "a file is there"),
     "a folder below a file": (a_folder_below_a_file, "is a file"),
     "somebody else's folder": (somebody_elses_folder, "holds something that is not"),
-    "two logs of one name": (two_logs_of_one_name, "two logs have this name"),
 }
 
 RUNS: dict[str, tuple[Callable[[Path], list[str]], str]] = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.cli.export import TARGETS
+from icrtool.cli.export import CONTROLLERS
 from icrtool.output.exports import controllers as export
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,7 +31,7 @@ def run_place(runs: Path) -> Path:
     return runs
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", CONTROLLERS)
 def test_what_is_printed_loads_as_yaml(icrtool, target: str) -> None:
     status, out, err = icrtool("export", "--for", target, "icrtool-runs/mower")
     assert (status, err) == (0, "")
@@ -42,8 +42,8 @@ def test_without_an_argument_the_newest_run_is_taken(icrtool) -> None:
     assert icrtool("export", "--for", "clearpath") == icrtool("export", "--for", "clearpath", "icrtool-runs/mower")
 
 
-def test_the_choices_are_those_of_the_report() -> None:
-    assert TARGETS == export.TARGETS
+def test_the_choices_are_those_of_the_exports() -> None:
+    assert export.TARGETS == CONTROLLERS
 
 
 def test_a_log_is_no_run(icrtool) -> None:
@@ -73,3 +73,47 @@ def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path)
     status, out, _ = icrtool("export", "--for", "clearpath", "--force", "unusable")
     assert status == 0
     assert "# WARNING: not usable: 42 % of the headings rejected" in out
+
+
+@pytest.mark.parametrize("target", ["evo", "kitti", "google-earth", "qgis"])
+def test_a_path_that_is_printed_is_the_one_in_the_file(icrtool, tmp_path: Path, target: str) -> None:
+    status, out, err = icrtool("export", "--for", target, "icrtool-runs/mower")
+    assert (status, err) == (0, "")
+    assert icrtool("export", "--for", target, "-o", tmp_path / "out.txt") == (0, "", "")
+    assert (tmp_path / "out.txt").read_text(encoding="utf-8") == out
+
+
+def test_trajectories_into_a_directory_are_a_file_a_path(icrtool, tmp_path: Path) -> None:
+    status, out, _ = icrtool("export", "--for", "evo", "-o", tmp_path / "evo")
+    assert status == 0
+    assert {file.name for file in (tmp_path / "evo").iterdir()} == {"filter.tum", "icr.tum", "no_slip.tum"}
+    assert out.count("written to") == 3
+
+
+def test_foxglove_needs_a_file_and_gets_a_layout_beside_it(icrtool, tmp_path: Path) -> None:
+    assert icrtool("export", "--for", "foxglove")[0] == 2
+    status, out, _ = icrtool("export", "--for", "foxglove", "-o", tmp_path / "mower.mcap")
+    assert status == 0
+    assert {file.name for file in tmp_path.iterdir()} == {"mower.mcap", "mower.layout.json"}
+    assert "mower.layout.json" in out
+
+
+def test_the_paths_of_a_run_that_is_not_usable_are_exported_with_a_warning(icrtool, runs: Path) -> None:
+    from dataclasses import replace
+
+    from icrtool.output.stored_run import open_run
+
+    run = open_run(runs / "icrtool-runs" / "mower")
+    replace(run, summary=run.summary | {"usable": False, "unusable_because": "it hopped"}).write(
+        runs / "hopping", plots=()
+    )
+    status, out, err = icrtool("export", "--for", "evo", "hopping")
+    assert (status, out.count("\n")) == (0, len(run.table))
+    assert "it hopped" in err
+
+
+def test_a_calibration_file_has_no_paths(icrtool, tmp_path: Path) -> None:
+    (tmp_path / "season.json").write_text("{}", encoding="utf-8")
+    status, out, err = icrtool("export", "--for", "qgis", tmp_path / "season.json")
+    assert (status, out) == (1, "")
+    assert "icrtool fit" in err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,9 +19,15 @@ ROSBAG2_VERSION: Final = 9
 
 
 def write_mcap(
-    path: Path, topics: Sequence[TopicMessages], store: Typestore, *, compression: Compression, definitions: bool
+    path: Path,
+    topics: Sequence[TopicMessages],
+    store: Typestore,
+    *,
+    compression: Compression,
+    definitions: bool,
+    metadata: Mapping[str, str] | None = None,
 ) -> None:
-    """Write one MCAP file of ROS 2 messages (CDR)."""
+    """Write one MCAP file of ROS 2 messages (CDR); `metadata` becomes its metadata record ``icrtool``."""
     from mcap.writer import CompressionType, Writer
 
     kind = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}[compression]
@@ -33,6 +39,8 @@ def write_mcap(
             text = store.generate_msgdef(topic.message_type, ros_version=2)[0] if definitions else ""
             schema = writer.register_schema(topic.message_type, "ros2msg" if definitions else "", text.encode())
             channels.append(writer.register_channel(topic.topic, "cdr", schema))
+        if metadata is not None:
+            writer.add_metadata("icrtool", dict(metadata))
         for index, stamp_ns, data in _in_time_order(topics):
             writer.add_message(channels[index], log_time=stamp_ns, data=data, publish_time=stamp_ns)
         writer.finish()
@@ -94,4 +102,4 @@ def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, 
     order = np.argsort(stamps, kind="stable")
     payloads = [topic.payload for topic in topics]
     for index, stamp_ns, row in zip(indices[order].tolist(), stamps[order].tolist(), rows[order].tolist(), strict=True):
-        yield index, stamp_ns, payloads[index][row].tobytes()
+        yield index, stamp_ns, bytes(payloads[index][row])

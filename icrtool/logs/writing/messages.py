@@ -6,7 +6,7 @@ strings are, so a topic is one byte matrix. The offset of a field is found by ch
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, cast
@@ -48,18 +48,21 @@ class TopicMessages:
     Attributes
     ----------
     stamp_ns : int64 (n,)
-    payload : uint8 (n, size), one message a row
+    payload : uint8 (n, size), one message a row; or the messages, where their sizes differ
     """
 
     topic: str
     message_type: str
     stamp_ns: Ints
-    payload: NDArray[np.uint8]
+    payload: NDArray[np.uint8] | Sequence[bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class _Plan:
-    """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``)."""
+class TopicPlan:
+    """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``).
+
+    `stamp_ns` (n,) and each column (n,) have a row for each message. A field of neither is zero or empty.
+    """
 
     topic: str
     message_type: str
@@ -89,10 +92,10 @@ def serialise_topics(columns: SensorColumns, options: WriteOptions, store: Types
     plans = (*_plan_wheels(columns, options), _plan_position(columns), _plan_heading(columns, options))
     prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
     ros1 = options.container == "bag"
-    return tuple(_serialise(plan, prefix, store, ros1=ros1) for plan in plans if len(plan.stamp_ns))
+    return tuple(serialise_topic(plan, store, prefix=prefix, ros1=ros1) for plan in plans if len(plan.stamp_ns))
 
 
-def _plan_wheels(columns: SensorColumns, options: WriteOptions) -> tuple[_Plan, ...]:
+def _plan_wheels(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     match options.wheels:
         case "joint_states":
             return (_plan_joint_states(columns, options),)
@@ -108,9 +111,9 @@ def _plan_wheels(columns: SensorColumns, options: WriteOptions) -> tuple[_Plan, 
             return _plan_float64_pair(columns)
 
 
-def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> _Plan:
+def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
     radius = options.wheel_radius_m
-    changing = _header_stamp(columns.wheel_stamp_ns)
+    changing = header_stamps(columns.wheel_stamp_ns)
     for joint, name in enumerate(FRONT_AND_REAR_JOINTS):
         left = "left" in name
         travel = columns.wheel_position_left_m if left else columns.wheel_position_right_m
@@ -118,7 +121,7 @@ def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> _Plan:
         changing[f"position.{joint}"] = travel / radius
         changing[f"velocity.{joint}"] = speed / radius
     fixed: dict[str, object] = {"name": list(FRONT_AND_REAR_JOINTS), "position": np.zeros(4), "velocity": np.zeros(4)}
-    return _Plan("/joint_states", "sensor_msgs/msg/JointState", columns.wheel_stamp_ns, fixed, changing)
+    return TopicPlan("/joint_states", "sensor_msgs/msg/JointState", columns.wheel_stamp_ns, fixed, changing)
 
 
 def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where: str) -> dict[str, NDArray[Any]]:
@@ -130,40 +133,42 @@ def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where
     }
 
 
-def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> _Plan:
-    changing = _header_stamp(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist.twist")
+def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+    changing = header_stamps(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist.twist")
     fixed: dict[str, object] = {
         "header.frame_id": "odom",
         "child_frame_id": "base_link",
         "pose.pose.orientation.w": 1.0,
     }
-    return _Plan("/wheel_controller/odom", "nav_msgs/msg/Odometry", columns.wheel_stamp_ns, fixed, changing)
+    return TopicPlan("/wheel_controller/odom", "nav_msgs/msg/Odometry", columns.wheel_stamp_ns, fixed, changing)
 
 
-def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> _Plan:
-    changing = _header_stamp(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist")
+def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+    changing = header_stamps(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist")
     topic, message_type = "/wheel_controller/twist", "geometry_msgs/msg/TwistStamped"
-    return _Plan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing)
+    return TopicPlan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing)
 
 
-def _plan_float64_pair(columns: SensorColumns) -> tuple[_Plan, ...]:
+def _plan_float64_pair(columns: SensorColumns) -> tuple[TopicPlan, ...]:
     sides = (("/left_drive/velocity", columns.wheel_v_left_mps), ("/right_drive/velocity", columns.wheel_v_right_mps))
-    return tuple(_Plan(topic, "std_msgs/msg/Float64", columns.wheel_stamp_ns, {}, {"data": v}) for topic, v in sides)
+    return tuple(
+        TopicPlan(topic, "std_msgs/msg/Float64", columns.wheel_stamp_ns, {}, {"data": v}) for topic, v in sides
+    )
 
 
-def _plan_ticks(columns: SensorColumns, options: WriteOptions) -> tuple[_Plan, ...]:
+def _plan_ticks(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     per_metre = options.counts_per_rev / (2 * np.pi * options.wheel_radius_m)
     sides = (("/lwheel_ticks", columns.wheel_position_left_m), ("/rwheel_ticks", columns.wheel_position_right_m))
     plans = []
     for topic, travel in sides:
         # An Int32 counter wraps around, as numpy's narrowing cast of an integer does.
         counts = np.rint(travel * per_metre).astype(np.int64).astype(np.int32)
-        plans.append(_Plan(topic, "std_msgs/msg/Int32", columns.wheel_stamp_ns, {}, {"data": counts}))
+        plans.append(TopicPlan(topic, "std_msgs/msg/Int32", columns.wheel_stamp_ns, {}, {"data": counts}))
     return tuple(plans)
 
 
-def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> _Plan:
-    changing = _header_stamp(columns.wheel_stamp_ns)
+def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+    changing = header_stamps(columns.wheel_stamp_ns)
     sides = (
         (columns.wheel_position_left_m, columns.wheel_v_left_mps),
         (columns.wheel_position_right_m, columns.wheel_v_right_mps),
@@ -171,13 +176,13 @@ def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> _Pla
     for driver, (travel, speed) in enumerate(sides):
         changing[f"drivers.{driver}.measured_travel"] = (travel / options.wheel_radius_m).astype(np.float32)
         changing[f"drivers.{driver}.measured_velocity"] = (speed / options.wheel_radius_m).astype(np.float32)
-    return _Plan("/feedback", "jackal_msgs/msg/Feedback", columns.wheel_stamp_ns, {}, changing)
+    return TopicPlan("/feedback", "jackal_msgs/msg/Feedback", columns.wheel_stamp_ns, {}, changing)
 
 
-def _plan_position(columns: SensorColumns) -> _Plan:
+def _plan_position(columns: SensorColumns) -> TopicPlan:
     known = np.isfinite(columns.gnss_std_m)
     variance = np.where(known, columns.gnss_std_m, 0.0) ** 2
-    changing = _header_stamp(columns.gnss_stamp_ns) | {
+    changing = header_stamps(columns.gnss_stamp_ns) | {
         "status.status": columns.gnss_status.astype(np.int8),
         "latitude": columns.latitude_deg,
         "longitude": columns.longitude_deg,
@@ -188,14 +193,14 @@ def _plan_position(columns: SensorColumns) -> _Plan:
         "position_covariance_type": np.where(known, 2, 0).astype(np.uint8),
     }
     fixed: dict[str, object] = {"header.frame_id": "gps_link", "status.service": 1}
-    return _Plan("/gps/fix", "sensor_msgs/msg/NavSatFix", columns.gnss_stamp_ns, fixed, changing)
+    return TopicPlan("/gps/fix", "sensor_msgs/msg/NavSatFix", columns.gnss_stamp_ns, fixed, changing)
 
 
-def _plan_heading(columns: SensorColumns, options: WriteOptions) -> _Plan:
+def _plan_heading(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
     # World and body frame change together: in ENU the body's z is up, in NED it is down (REP-145).
     enu = options.heading == "enu"
     yaw = np.pi / 2 - columns.heading_rad if enu else columns.heading_rad
-    changing = _header_stamp(columns.heading_stamp_ns) | {
+    changing = header_stamps(columns.heading_stamp_ns) | {
         "orientation.z": np.sin(yaw / 2),
         "orientation.w": np.cos(yaw / 2),
         "angular_velocity.z": -columns.yaw_rate_radps if enu else columns.yaw_rate_radps,
@@ -206,18 +211,28 @@ def _plan_heading(columns: SensorColumns, options: WriteOptions) -> _Plan:
         "orientation_covariance": np.diag([variance] * 3).ravel(),
         "linear_acceleration.z": GRAVITY_MPS2 if enu else -GRAVITY_MPS2,
     }
-    return _Plan("/imu/data", "sensor_msgs/msg/Imu", columns.heading_stamp_ns, fixed, changing)
+    return TopicPlan("/imu/data", "sensor_msgs/msg/Imu", columns.heading_stamp_ns, fixed, changing)
 
 
-def _header_stamp(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+def header_stamps(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+    """Return the columns of a message's header that hold its stamp."""
     return {
         "header.stamp.sec": (stamp_ns // 1_000_000_000).astype(np.uint32),
         "header.stamp.nanosec": (stamp_ns % 1_000_000_000).astype(np.uint32),
     }
 
 
-def _serialise(plan: _Plan, prefix: str, store: Typestore, *, ros1: bool) -> TopicMessages:
-    message = _blank(store, plan.message_type)
+def serialise_topic(plan: TopicPlan, store: Typestore, *, prefix: str = "", ros1: bool = False) -> TopicMessages:
+    """Return the messages of one topic.
+
+    Parameters
+    ----------
+    plan : its values
+    store : holds the definition of its message type
+    prefix : put before the topic
+    ros1 : serialise as ROS 1 does, else as CDR
+    """
+    message = blank_message(store, plan.message_type)
     for path, value in plan.fixed.items():
         _put(message, path, value)
 
@@ -234,21 +249,21 @@ def _serialise(plan: _Plan, prefix: str, store: Typestore, *, ros1: bool) -> Top
     return TopicMessages(prefix + plan.topic, plan.message_type, plan.stamp_ns, payload)
 
 
-def _blank(store: Typestore, message_type: str) -> object:
+def blank_message(store: Typestore, message_type: str) -> object:
     """Return a message of zeros, empty strings and empty sequences."""
     from rosbags.interfaces import Nodetype
 
     values: dict[str, Any] = {}
     for name, (kind, detail) in cast("list[tuple[str, tuple[Any, Any]]]", store.fielddefs[message_type][1]):
         if kind == Nodetype.NAME:
-            values[name] = _blank(store, detail)
+            values[name] = blank_message(store, detail)
         elif kind == Nodetype.BASE:
             values[name] = "" if detail[0] == "string" else np.zeros((), dtype=detail[0])[()]
         else:
             (element_kind, element), length = detail
             length = length if kind == Nodetype.ARRAY else 0
             if element_kind == Nodetype.NAME:
-                values[name] = [_blank(store, element) for _ in range(length)]
+                values[name] = [blank_message(store, element) for _ in range(length)]
             else:
                 values[name] = [""] * length if element[0] == "string" else np.zeros(length, dtype=element[0])
     return store.types[message_type](**values)

@@ -1,1 +1,1 @@
-"""Results for other programs: controllers, CI."""
+"""Results for other programs: controllers, CI, trajectory evaluation, maps, Foxglove."""

@@ -11,9 +11,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import atomic_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
-from icrtool.output.text_format import run_title
-
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from icrtool.output.text_format import run_title, xml_text
 
 Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
@@ -102,31 +100,26 @@ def format_markdown(report: DropoutReport) -> str:
 
 
 def _gate_suite(report: DropoutReport) -> ET.Element:
-    name = _xml_text(run_title(report.run_summary))
+    name = xml_text(run_title(report.run_summary))
     failures = sum(not verdict.passed for verdict in report.verdicts)
     suite = _suite(name, tests=len(report.verdicts), failures=failures, errors=0)
     for verdict in report.verdicts:
-        case = ET.SubElement(suite, "testcase", classname=name, name=_xml_text(verdict.gate.text))
+        case = ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate.text))
         if not verdict.passed:
-            failure = ET.SubElement(case, "failure", type="gate", message=_xml_text(verdict.line()))
-            failure.text = _xml_text(verdict.line())
+            failure = ET.SubElement(case, "failure", type="gate", message=xml_text(verdict.line()))
+            failure.text = xml_text(verdict.line())
     return suite
 
 
 def _error_suite(name: str, error: IcrToolError) -> ET.Element:
-    suite = _suite(_xml_text(name), tests=1, failures=0, errors=1)
-    case = ET.SubElement(suite, "testcase", classname=_xml_text(name), name="dropout-report")
-    ET.SubElement(case, "error", type=type(error).__name__, message=_xml_text(str(error)))
+    suite = _suite(xml_text(name), tests=1, failures=0, errors=1)
+    case = ET.SubElement(suite, "testcase", classname=xml_text(name), name="dropout-report")
+    ET.SubElement(case, "error", type=type(error).__name__, message=xml_text(str(error)))
     return suite
 
 
 def _suite(name: str, *, tests: int, failures: int, errors: int) -> ET.Element:
     return ET.Element("testsuite", name=name, tests=str(tests), failures=str(failures), errors=str(errors))
-
-
-def _xml_text(text: str) -> str:
-    """Return text without the characters that XML 1.0 cannot hold; the rest is escaped by the writer."""
-    return _NOT_XML.sub("?", text)
 
 
 def _escaped(text: str) -> str:

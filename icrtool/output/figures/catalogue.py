@@ -63,7 +63,8 @@ def dropout_examples(report: DropoutReport) -> Figure:
 def dropout_worst(report: DropoutReport) -> Figure:
     """Return the worst trials; `report` is of `icrtool.dropout_report`."""
     _check(report, report.worst, "worst trials")
-    return _drawn(lambda: draw_worst(run_title(report.run_summary), report.worst))
+    path = report.reference_north_m, report.reference_east_m
+    return _drawn(lambda: draw_worst(run_title(report.run_summary), report.worst, *path))
 
 
 def dropout_outages(report: DropoutReport) -> Figure:

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.figures.style import ICR, MEAN, NO_SLIP, Pen, fill_bins, inches, new_figure
-from icrtool.output.text_format import length_text
+from icrtool.output.text_format import metres_text
 from icrtool.records.dropout import ModelResult, Outage
 from icrtool.records.tables import Floats
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.6, 2.3
+WIDTH_IN, SUMMARY_HEIGHT_IN, PANEL_HEIGHT_IN = 7.2, 4.7, 2.0
 
 PENS = {"icr": ICR, "no_slip": NO_SLIP}
 MARKERS = {"icr": "o", "no_slip": "s"}
@@ -32,10 +32,12 @@ HISTOGRAM_LABELS = {"icr": "ICR", "no_slip": "no slip"}
 P95 = Pen("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
+LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
 DASH = (0, (4.0, 2.0))
 FLATTENING = 2.5
-HISTOGRAM_IN_P95 = 2.0
-"""A histogram is shown up to this many times p95; what lies beyond is stated in words."""
+LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
+"""The histograms of a horizon share one scale: up to the largest p95 and a margin, but at most so many times that of
+the ICRs. The share of trials beyond it is written at its end."""
 
 
 def draw_summary(title: str, report: DropoutReport) -> Figure:
@@ -43,16 +45,18 @@ def draw_summary(title: str, report: DropoutReport) -> Figure:
 
     Where no slip is so far off that the ICR curves would lie on the axis, a second panel has them alone.
     """
-    subtitle = f"Open-loop error over distance without GNSS, from each of {report.states:,} states"
+    subtitle = (
+        f"Open-loop error over distance without GNSS, up to {int(report.counts.trials.max()):,} trials a distance"
+    )
     apart = _flattened(report)
     figure = new_figure(
         title,
-        subtitle + ("; right: without no slip" if apart else ""),
+        subtitle + ("; right: no slip left out" if apart else ""),
         width_in=WIDTH_IN,
         height_in=SUMMARY_HEIGHT_IN,
     )
     panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
-    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.05), wspace=0.28)
+    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.65, bottom=1.15), wspace=0.28)
     constant = _constant_models(report)
     for axes, shown in zip(panels, (("no_slip", "icr", *constant), ("icr", *constant)), strict=False):
         for budget in dict.fromkeys(one.budget_m for one in report.budgets):
@@ -88,10 +92,11 @@ def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figur
     )
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
     margins = inches(figure, left=0.7, right=0.2, top=0.85, bottom=0.9)
-    figure.subplots_adjust(**margins, hspace=0.6)
+    figure.subplots_adjust(**margins, hspace=0.45)
+    end = _histogram_end([result.summary.p95[h] for result in results])
     for axes, result in zip(panels, results, strict=True):
-        _draw_bins(axes, result, h, _look(report, result.name)[0])
-        axes.set_xlabel("Error [m]")
+        _draw_bins(axes, result, h, _look(report, result.name)[0], end)
+    panels[-1].set_xlabel("Error [m]")
     keys = [Line2D([], [], label="95 % of the trials", **P95.keywords())]
     keys.append(Line2D([], [], label="expected value", **MEAN.keywords()))
     figure.legend(handles=keys, loc="lower center", ncols=2, columnspacing=3.0)
@@ -160,21 +165,36 @@ def _real_mark() -> dict[str, Any]:
     return {"linestyle": "none", "marker": "X", "color": "black", "markersize": 7, "zorder": 5, "clip_on": False}
 
 
-def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str) -> None:
-    """Draw the bins of one model at horizon number `h`, its expected value and 95 % with their numbers."""
+def _histogram_end(p95: list[np.floating[Any]]) -> float:
+    """Return the right end [m] of the scale that the panels share, by their p95, that of the ICRs first."""
+    end = min(LEAST_HISTOGRAM_IN_P95 * float(np.nanmax(p95)), MOST_HISTOGRAM_IN_P95 * float(p95[0]))
+    return end if end > 0 else 1.0
+
+
+def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float) -> None:
+    """Draw the bins of one model at horizon number `h` up to `end_m`, and its expected value and 95 %."""
     summary, bins = result.summary, result.histograms[h]
     p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
     width = float(bins.right[0] - bins.left[0])
-    end = min(HISTOGRAM_IN_P95 * p95, float(bins.right[-1])) if p95 > 0 else width
     edges = np.append(bins.left, bins.right[-1])
     fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
     axes.axvline(p95, **P95.keywords())
     axes.axvline(expected, **MEAN.keywords())
     label = HISTOGRAM_LABELS.get(result.name, result.label)
     axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
-    facts = f"expected {length_text(expected)},  95 % within {length_text(p95)},  max {length_text(largest)}"
+    facts = f"expected {metres_text(expected)},  95 % within {metres_text(p95)},  max {metres_text(largest)}"
     axes.set_title(facts, loc="right", pad=4.0)
-    axes.set_xlim(0, end)
+    axes.set_xlim(0, end_m)
+    beyond = float(bins.percent[bins.left >= end_m].sum())
+    if beyond > 0:
+        where: dict[str, Any] = {
+            "xy": (1.0, 0.9),
+            "xycoords": "axes fraction",
+            "ha": "right",
+            "va": "top",
+            "fontsize": 8.0,
+        }
+        axes.annotate(f"{beyond:.{0 if beyond >= 1 else 2}f} % beyond →", **where, bbox=LABEL_BOX)
     axes.set_ylabel(f"Trials [% per {_width_text(width)}]")
     axes.grid(visible=False, axis="x")
 

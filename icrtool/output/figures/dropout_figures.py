@@ -43,7 +43,8 @@ class ReportFigures:
                 name = f"examples_{report.examples[0].horizon_m:02.0f}m"
                 self._draw(write_figure, name, title, report.examples)
             if report.worst:
-                self._draw(write_figure, "worst", title, report.worst)
+                path = report.reference_north_m, report.reference_east_m
+                self._draw(write_figure, "worst", title, report.worst, *path)
             if report.outages:
                 path = report.reference_north_m, report.reference_east_m
                 self._draw(write_figure, "outages", title, *path, report.outages)

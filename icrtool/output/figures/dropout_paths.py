@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
-from icrtool.output.text_format import duration_text, length_text
+from icrtool.output.text_format import duration_text, metres_text
 from icrtool.records.dropout import ExampleTrial, Outage
 from icrtool.records.tables import Floats
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 WIDTH_IN = 7.2
 EXAMPLES_HEIGHT_IN = 4.7
-WORST_COLUMNS = 5
-WORST_CELL_IN = 1.78
+WORST_COLUMNS = 4
+WORST_CELL_IN = 1.95
 OUTAGES_BOX_IN = (2.4, 5.4)
 
 PENS: dict[str, Pen] = {"icr": ICR, "no_slip": NO_SLIP}
@@ -34,11 +34,19 @@ PATH = Pen(FIX_COLOR, width=1.4)
 Box = tuple[float, float, float, float]
 """Left, bottom, right, top [points]."""
 
-MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 4.9
+MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
 """Half the size of a mark, height of a line of text, usual width of a character, in points."""
 LABEL_OFFSETS_PT = tuple(
-    (sign * dx, dy) for dx in (7.0, 16.0) for dy in (9.0, -9.0, 0.0, 18.0, -18.0) for sign in (1, -1)
+    (sign * dx, dy)
+    for dx in (7.0, 16.0, 32.0, 56.0)
+    for dy in (9.0, -9.0, 0.0, 18.0, -18.0, 32.0, -32.0, 48.0, -48.0)
+    for sign in (1, -1)
 )
+LINE_FROM_PT = 20.0
+"""A label further than this from its point has a line to it."""
+NUMBERS_APART = 0.16
+"""Trials that start closer together than this share of the overview's width have one place for their numbers."""
+
 SMALLEST_VIEW_M = 0.5
 CELLS = 1500.0
 
@@ -48,7 +56,7 @@ def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
     horizon = examples[0].horizon_m
     figure = new_figure(
         title,
-        f"Typical trials without GNSS over {horizon:g} m: cornering (left), among the straightest (right)",
+        f"Typical trials without GNSS over {horizon:g} m: cornering (left), straight (right)",
         width_in=WIDTH_IN,
         height_in=EXAMPLES_HEIGHT_IN,
     )
@@ -56,8 +64,8 @@ def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
     figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=1.0, bottom=0.9), wspace=0.34)
     for axes, drive in zip(panels, examples, strict=True):
         _draw_drive(axes, drive, box=(3.0, 2.75))
-        facts = f"from {drive.t_s:.1f} s, turned {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{LABELS[name]} {length_text(error)}" for name, error in drive.errors_m.items())
+        facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
+        errors = ",  ".join(f"{LABELS[name]} {metres_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -65,33 +73,61 @@ def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
     return figure
 
 
-def draw_worst(title: str, worst: Sequence[ExampleTrial]) -> Figure:
-    """Draw the worst trials, each in a cell of its own with its scale."""
-    rows = -(-len(worst) // WORST_COLUMNS)
+def draw_worst(title: str, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> Figure:
+    """Draw the worst trials, each in a cell with its own scale; the first cell shows where on the path they are.
+
+    Parameters
+    ----------
+    north_m, east_m : (n,) the whole path of the reference
+    """
+    rows = -(-(len(worst) + 1) // WORST_COLUMNS)
     figure = new_figure(
         title,
         f"The {len(worst)} worst trials without GNSS over {worst[0].horizon_m:g} m, momentary ICRs, none overlapping",
         width_in=9.6,
-        height_in=1.1 + rows * (WORST_CELL_IN + 0.62),
+        height_in=1.25 + rows * (WORST_CELL_IN + 0.75),
     )
     panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
-    figure.subplots_adjust(**inches(figure, left=0.65, right=0.15, top=0.92, bottom=0.9), wspace=0.3, hspace=0.38)
+    figure.subplots_adjust(**inches(figure, left=0.65, right=0.15, top=1.07, bottom=0.9), wspace=0.3, hspace=0.5)
     figure.supxlabel("East of start [m]", fontsize=9.0, y=0.42 / figure.get_figheight())
     figure.supylabel("North of start [m]", fontsize=9.0, x=0.12 / figure.get_figwidth())
-    for rank, (axes, drive) in enumerate(zip(panels, worst, strict=False), start=1):
-        _draw_drive(axes, drive, box=(1.0, 1.0), ticks=4)
+    _draw_overview(panels[0], worst, north_m, east_m)
+    for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
+        _draw_drive(axes, drive, box=(1.0, 1.0), ticks=5)
         axes.set_title(
-            f"{rank}.  {length_text(drive.errors_m['icr'])}\n"
-            f"{drive.t_s:.1f} s, {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s",
+            f"{rank}.  ICR error {metres_text(drive.errors_m['icr'])}\n"
+            f"at {drive.t_s:.0f} s, turns {_turn_text(drive)}\nat {drive.speed_mean_mps:.2f} m/s",
             loc="left",
             pad=4.0,
             fontsize=8.0,
         )
         axes.tick_params(labelsize=7.5)
-    for axes in panels[len(worst) :]:
+    for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
     _add_keys(figure, worst)
     return figure
+
+
+def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> None:
+    """Draw the whole path and, numbered, where the trials start."""
+    norths, easts = north_m - north_m[0], east_m - east_m[0]
+    (south, north), (west, east) = _view(norths, easts, 1.0)
+    shown = places(norths, easts, (east - west) / CELLS)
+    axes.plot(easts[shown], norths[shown], zorder=2, **PATH.keywords())
+    together: dict[tuple[float, float], list[int]] = {}
+    for rank, drive in enumerate(worst, start=1):
+        place = drive.east_m - float(east_m[0]), drive.north_m - float(north_m[0])
+        near = (one for one in together if math.dist(one, place) < NUMBERS_APART * (east - west))
+        together.setdefault(next(near, place), []).append(rank)
+    for place, ranks in together.items():
+        text = ",".join(map(str, ranks))
+        axes.text(*place, text, fontsize=7.5, fontweight="bold", ha="center", va="center", zorder=3)
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    axes.set_aspect("equal")
+    axes.locator_params(nbins=4, steps=[1, 2, 5, 10])
+    axes.tick_params(labelsize=7.5)
+    axes.set_title("where they start\non the whole path\n(from its first point)", loc="left", pad=4.0, fontsize=8.0)
 
 
 def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[Outage]) -> Figure:
@@ -193,7 +229,7 @@ def _outages_text(outages: Sequence[Outage]) -> str:
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
             span = duration_text(lengths[0])
             span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
-            parts.append(f"{len(ours)} {kind} of {span}, end error up to {length_text(worst)}")
+            parts.append(f"{len(ours)} {kind} of {span}, end error up to {metres_text(worst)}")
     return "Outages: " + "; ".join(parts)
 
 
@@ -219,7 +255,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, fl
     crossed = [_box_about(place) for place in crossings]
     upper = (axes.get_xlim()[1] - lowest[1]) * points_per_metre, (axes.get_ylim()[1] - lowest[0]) * points_per_metre
     for number, one in enumerate(outages, start=1):
-        text = f"{number}: {length_text(one.end_error_m)}"
+        text = f"{number}: {metres_text(one.end_error_m)}"
         offset = _free_offset(point(one, -1), CHARACTER_PT * len(text), taken, crossed, upper)
         if offset is not None:
             taken.append(_label_box(point(one, -1), CHARACTER_PT * len(text), offset))
@@ -229,7 +265,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, fl
 def _free_offset(
     place: tuple[float, float], width: float, taken: list[Box], crossed: list[Box], upper: tuple[float, float]
 ) -> tuple[float, float] | None:
-    """Return where a label of this width can stand: off all that is taken, if it can off the lines it would cross."""
+    """Return where a label of this width can stand: off all that is taken, off the lines too where it can."""
     for obstacles in ([*taken, *crossed], taken):
         for offset in LABEL_OFFSETS_PT:
             box = _label_box(place, width, offset)
@@ -263,4 +299,7 @@ def _write(axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[f
         fontsize=8.0,
         zorder=6,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+        arrowprops={"arrowstyle": "-", "color": "0.5", "linewidth": 0.6}
+        if math.hypot(*offset_pt) > LINE_FROM_PT
+        else None,
     )

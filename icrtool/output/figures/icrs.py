@@ -10,12 +10,14 @@ from matplotlib.patches import Patch
 
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
+    BAD_FIX_COLOR,
     BAND_COLOR,
     BAR_COLOR,
     CHANGE,
     HALF_WIDTH,
     MEAN,
     OUTAGE_COLOR,
+    Pen,
     TimeAxis,
     fill_bins,
     inches,
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 WIDTH_IN = 7.2
 
 LINE_COLOR = "black"
+SEGMENT = Pen("#e08214", width=1.6)
 # Plain text: mathtext costs more than the rest of a figure.
 NAMES = {
     "y_icr_right_m": "ICR y right [m]",
@@ -95,14 +98,16 @@ def draw_icr_clusters(run: Run) -> Figure:
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
     spans = [float(np.ptp(percentiles(value, CLUSTER_RANGE_PERCENT))) for value in values]
     span = max(*spans, 2 * LEAST_HALF_RANGE_M)
-    for axes, column, value in zip(panels, columns, values, strict=True):
+    no_slip_shown = [
         _draw_histogram(axes, run, column, value, weight, span)
+        for axes, column, value in zip(panels, columns, values, strict=True)
+    ]
     panels[0].set_ylabel("Time [%]")
     keys = [
         Patch(color=BAR_COLOR, linewidth=0, label=f"estimates, bins of {_bin_width(span):g} m"),
         Line2D([], [], label="mean", **MEAN.keywords()),
     ]
-    if run.track_width_m is not None:
+    if any(no_slip_shown):
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
     return figure
@@ -142,6 +147,27 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     axes.set_xlim(span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3))
     axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
     axes.locator_params(axis="y", nbins=5)
+    _draw_segments(axes, run, column, unit)
+    _mark_clipped(axes, t, value)
+
+
+def _draw_segments(axes: Axes, run: Run, column: str, unit_s: float) -> None:
+    """Draw the mean of each stretch between the given terrain changes."""
+    for segment in run.summary["segments"]:
+        if (mean := segment["mean"][column]) is not None:
+            span = segment["begin_s"] / unit_s, segment["end_s"] / unit_s
+            axes.plot(span, (mean, mean), zorder=2.5, **SEGMENT.keywords())
+
+
+def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
+    """Write the extreme of an estimate at the edge of the panel that cuts it off."""
+    low, high = axes.get_ylim()
+    for row, edge, arrow in ((int(value.argmin()), low, "↓"), (int(value.argmax()), high, "↑")):
+        if not low <= value[row] <= high:
+            axes.annotate(
+                f"{arrow} {signed(value[row])}", (t[row], edge), ha="left", va="top" if edge == high else "bottom",
+                fontsize=7.5, color=BAD_FIX_COLOR,
+            )  # fmt: skip
 
 
 def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
@@ -184,13 +210,14 @@ def _estimate_keys(run: Run) -> list[Line2D | Patch]:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     if run.changes_s:
         keys.append(Line2D([], [], label="terrain change", **CHANGE.keywords()))
+        keys.append(Line2D([], [], label="mean between", **SEGMENT.keywords()))
     if len(run.outages_ns):
         keys.append(Patch(color=OUTAGE_COLOR, linewidth=0, label="no usable GNSS"))
     return keys
 
 
-def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Floats, span_m: float) -> None:
-    """Draw percent of time over value, and show `span_m` of it."""
+def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Floats, span_m: float) -> bool:
+    """Draw percent of time over value, and show `span_m` of it; return whether the place of no slip is in view."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
     width = _bin_width(span_m)
@@ -203,13 +230,17 @@ def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Fl
     if mean is not None:
         axes.axvline(mean, **MEAN.keywords())
         title = f"{signed(mean)} ± {std:.3f} m"
+    no_slip_shown = False
     if (track := run.track_width_m) is not None:
-        axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
+        no_slip_shown = bool(low <= SIDES[column] * track / 2 <= high)
+        if no_slip_shown:
+            axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
         title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"
     axes.set_title(title, pad=4.0)
     axes.set_xlabel(NAMES[column])
     axes.locator_params(axis="x", nbins=3, min_n_ticks=2)
     axes.grid(visible=False, axis="x")
+    return no_slip_shown
 
 
 def _bin_width(span_m: float) -> float:

@@ -32,12 +32,12 @@ def draw_ladder(title: str, rungs: Sequence[Rung], horizons_m: Sequence[float], 
     groups = sum(1 for rung in rungs if rung.measured_heading) > 0
     figure = new_figure(
         title,
-        f"Open-loop error after {horizons_m[h]:g} m, {blocks} blocks of way held out in turn",
+        f"Open-loop error after {horizons_m[h]:g} m, 95 % / expected; {blocks} blocks of the drive held out in turn",
         width_in=WIDTH_IN,
         height_in=1.65 + ROW_IN * (len(rungs) + 0.6 * groups),
     )
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=2.75, right=0.85, top=0.62, bottom=0.9))
+    figure.subplots_adjust(**inches(figure, left=2.75, right=1.05, top=0.62, bottom=0.9))
     _draw_rows(axes, rungs, h)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -69,8 +69,8 @@ def _draw_rows(axes: Axes, rungs: list[Rung], h: int) -> None:
             [expected], [y], marker=marker, color=color, markerfacecolor="white", markersize=6.5, linestyle="none"
         )
         axes.annotate(
-            f"{p95:.2f} m", (p95, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8, color="0.2",
-            annotation_clip=False,
+            f"{p95:.2f} / {expected:.2f} m", (p95, y), xytext=(7, 0), textcoords="offset points", va="center",
+            fontsize=8, color="0.2", annotation_clip=False,
         )  # fmt: skip
         places.append(y)
         note = FITTED[rung.fitted]

@@ -55,21 +55,23 @@ def draw_convergence(result: StudyResult) -> Figure:
         times = np.sort(np.asarray(result.columns["settle_s"])[chosen])
         share = 100 * np.arange(1, len(times) + 1) / len(times)
         settled = np.isfinite(times)
+        start = np.zeros(min(settled.sum(), 1))
         below.step(
-            np.maximum(times[settled], 0.01), share[settled], where="post", color=PATH_COLORS[place % 6],
+            np.maximum([*times[settled][: len(start)], *times[settled]], 0.01),
+            [*start, *share[settled]],
+            where="post",
+            color=PATH_COLORS[place % 6],
             linestyle=PATH_DASHES[place % 6],
             label=level["value"] if len(request.presets) == 1 else f"{level['value']}, {level['series']}",
-        )  # fmt: skip
+        )
     below.axvspan(5.0, 15.0, color="0.92", zorder=0)
     below.set_xscale("log")
     below.set_ylim(0, 103)
     below.set_xlabel("All three ICRs within 10 % of the truth after [s]   (grey: 5-15 s, the paper's driven robots)")
     below.set_ylabel("Runs [%]")
-    keys, labels = below.get_legend_handles_labels()
-    keys += _icr_keys()
-    figure.legend(
-        keys, [*labels, *NAMES], loc="lower center", ncols=min(len(keys), 8), columnspacing=1.2, handlelength=2.2
-    )
+    right.legend(handles=_icr_keys(), loc="upper right", ncols=3, columnspacing=1.2, handlelength=2.2)
+    keys = below.get_legend_handles_labels()[0]
+    figure.legend(handles=keys, loc="lower center", ncols=min(len(keys), 6), columnspacing=1.2, handlelength=2.2)
     return figure
 
 

@@ -21,7 +21,7 @@ from icrtool.output.figures.style import (
     inches,
     new_figure,
 )
-from icrtool.output.text_format import distance_text, duration_text, position_word, run_title
+from icrtool.output.text_format import distance_text, duration_text, metres_text, position_word, run_title
 from icrtool.records.measurements import Fixes
 from icrtool.records.run import Run
 from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats
@@ -42,6 +42,11 @@ LARGEST_DETOUR = 0.75
 
 SMALLEST_VIEW_M = 2.0
 FAR_M = 20_000.0
+TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
+MOST_TIMES = 12
+TIME_CLEARANCE = 0.06
+"""At most so many times are written beside the path, none closer to another than this share of the view."""
+TIME_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
@@ -58,7 +63,11 @@ SLIP_LOOK: dict[str, Any] = {
     "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": SLIP_COLOR,
     "linestyle": "none", "zorder": 4.6,
 }  # fmt: skip
-REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": BAD_FIX_COLOR}
+JUMP_LOOK: dict[str, Any] = {
+    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": BAD_FIX_COLOR,
+    "linestyle": "none", "zorder": 4.4,
+}  # fmt: skip
+REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
 
@@ -90,6 +99,9 @@ def draw_trajectory(run: Run, odometry: Odometry) -> Figure:
         if path is not None:
             label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
             _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
+            axes.plot(path.east_m[-1:], path.north_m[-1:], marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    _draw_jumps(axes, run)
+    _draw_times(axes, run, cell)
     _draw_events(axes, run)
     ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
     axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
@@ -180,6 +192,36 @@ def _draw_events(axes: Axes, run: Run) -> None:
             axes.plot(east, north, color=SLIP_COLOR, linewidth=3.0, zorder=4.5)
             axes.plot(east[:1], north[:1], label=label, **SLIP_LOOK)
             label = "_"
+
+
+def _draw_jumps(axes: Axes, run: Run) -> None:
+    """Mark where the position reference jumped, each where the filter was at that time."""
+    table = run.table
+    stamps = np.array([jump["stamp_ns"] for jump in run.summary["gnss"]["jump_list"]], np.int64)
+    if len(stamps):
+        rows = np.clip(np.searchsorted(table.stamp_ns, stamps), 0, len(table) - 1)
+        largest = max(jump["size_m"] for jump in run.summary["gnss"]["jump_list"])
+        axes.plot(table.east_m[rows], table.north_m[rows], label=f"jump, up to {metres_text(largest)}", **JUMP_LOOK)
+
+
+def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
+    """Write the time beside the filter's path every so many seconds or minutes, where it does not cover another one."""
+    table = run.table
+    span = float(table.t_s[-1])
+    every = next((step for step in TIME_STEPS_S if span / step <= MOST_TIMES), TIME_STEPS_S[-1])
+    clear = TIME_CLEARANCE * cell_m * CELLS
+    written = [np.array([table.east_m[0], table.north_m[0]]), np.array([table.east_m[-1], table.north_m[-1]])]
+    for time in np.arange(every, span, every):
+        row = int(np.searchsorted(table.t_s, time))
+        place = np.array([table.east_m[row], table.north_m[row]])
+        if min(float(np.hypot(*(place - other))) for other in written) > clear:
+            written.append(place)
+            text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
+            axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
+            axes.annotate(
+                text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0,
+                color="0.25", zorder=4.9, bbox=TIME_BOX, annotation_clip=True,
+            )  # fmt: skip
 
 
 def _draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, label: str, order: float) -> None:

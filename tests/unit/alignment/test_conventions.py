@@ -66,6 +66,24 @@ def test_a_single_fault_is_named_itself(drive: DriveArrays, one: Convention) -> 
     assert found.convention == one
 
 
+@pytest.mark.parametrize("swapped", [True, False])
+def test_what_drives_forward_is_likelier_than_what_drives_backwards(drive: DriveArrays, swapped: bool) -> None:
+    """Swapped sides with a heading of the other handedness, as ENU yaw taken for NED gives it."""
+    one = AS_NAMED._replace(swapped=swapped, heading=-1)
+    log = spoilt(drive, one)
+    log = log._replace(heading=log.heading + np.pi / 2)
+    found = decide_conventions(log, cut_windows(drive), metric=False)
+    assert found.convention == one
+    assert found.as_likely is None
+
+
+def test_a_mirrored_pose_is_likelier_than_swapped_sides(drive: DriveArrays) -> None:
+    one = AS_NAMED._replace(heading=-1, position=-1)
+    found = decide_conventions(spoilt(drive, one)._replace(same_clock=True), cut_windows(drive), metric=True)
+    assert found.convention == one
+    assert found.as_likely == AS_NAMED._replace(swapped=True)
+
+
 def test_geodetic_positions_are_never_mirrored(drive: DriveArrays) -> None:
     mirrored = spoilt(drive, AS_NAMED._replace(position=-1))
     assert decide_conventions(mirrored, cut_windows(drive), metric=False).convention.position == 1

@@ -1,0 +1,290 @@
+"""A run as MCAP for Foxglove and other ROS 2 tools, with a layout that shows it.
+
+World ``map``: ENU about the datum of the run; bodies x forward, y left, z up (REP-103). Body ``base_link`` is the
+filter's, ``icr_odometry`` and ``no_slip_odometry`` are where wheel speeds alone lead. Stamps are those of the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool import __version__
+from icrtool.dropout_analysis.trials import errors_from_states
+from icrtool.kernels.filter_records import GATED, UNSEEN
+from icrtool.kernels.kinematics import body_velocity
+from icrtool.logs.writing.containers import write_mcap
+from icrtool.logs.writing.messages import (
+    TopicMessages,
+    TopicPlan,
+    blank_message,
+    header_stamps,
+    load_typestore,
+    serialise_topic,
+)
+from icrtool.output.exports.paths import (
+    ExportPath,
+    Globe,
+    PathName,
+    globe_of,
+    line_rows,
+    outage_rows,
+    paths_of,
+    rows_apart,
+)
+from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.tables import FIXED_FIX, Floats, Ints
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+INTERVAL_S = 0.05
+"""States are written 20 times a second at most."""
+
+ERROR_HORIZON_M = 10.0
+
+WORLD = "map"
+BODIES: dict[PathName, str] = {
+    "filter": "base_link", "smoothed": "smoothed", "icr": "icr_odometry", "no_slip": "no_slip_odometry",
+}  # fmt: skip
+
+GBAS_FIX, PLAIN_FIX = 2, 0
+"""Codes of NavSatStatus."""
+
+DIAGONAL_KNOWN = 2
+"""Code of NavSatFix for a covariance of which the diagonal is known."""
+
+ICRS, ERROR, EVENT = "icrtool_msgs/msg/TrackIcrs", "icrtool_msgs/msg/OpenLoopError", "icrtool_msgs/msg/Event"
+
+_ICR_FIELDS = "".join(
+    f"float64 {name}\nfloat64 std_{name}\nfloat64 {name[:-2]}_minus_std_m\nfloat64 {name[:-2]}_plus_std_m\n"
+    for name in ICR_COLUMNS
+)
+DEFINITIONS = {
+    ICRS: f"# Track ICRs [m]; body frame: x forward, y right.\nstd_msgs/Header header\n{_ICR_FIELDS}",
+    ERROR: (
+        "# Open-loop error [m] after horizon_m of driving from this state; NaN where a model has none.\n"
+        "std_msgs/Header header\nfloat64 horizon_m\nfloat64 icr_m\nfloat64 icr_final_m\nfloat64 no_slip_m\n"
+    ),
+    EVENT: (
+        "# Begin of a slip event or an outage; kind is none at its end. x_m, y_m in the world frame.\n"
+        "std_msgs/Header header\nstring kind\nfloat64 duration_s\nfloat64 x_m\nfloat64 y_m\nfloat64 distance_m\n"
+        "float64 severity\nfloat64 confidence\n"
+    ),
+}
+"""Message types of our own; the file holds their definitions."""
+
+
+def write_foxglove(run: Run, path: Path) -> None:
+    """Write the MCAP file of a run, compressed with zstd.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    path : the file to make or to replace
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+
+    Notes
+    -----
+    Topics: ``/tf``; ``/filter/odometry``, ``/icr/odometry``, ``/no_slip/odometry`` (``/smoothed/odometry`` where the
+    run has it), and ``path`` beside each; ``/filter/fix``, ``/gnss/fix`` and ``/gnss/fix_rejected`` where the run has a
+    place on the globe; ``/icrs``, ``/open_loop_error``, ``/events`` and ``/outages``.
+    """
+    store, globe, paths = _typestore(), globe_of(run), paths_of(run)
+    rows = rows_apart(run.table.stamp_ns, INTERVAL_S)
+    plans = [
+        _transforms(paths, rows, store),
+        *(_odometry(run, path, rows) for path in paths),
+        *(_fixes(run, rows, globe) if globe is not None else ()),
+        _icrs(run, rows),
+        _errors(run),
+    ]
+    topics = [serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
+    topics += [_whole_path(path, store) for path in paths]
+    topics += [_event_topic("/events", _slip_events(run), store), _event_topic("/outages", _outages(run), store)]
+    about = {
+        "tool_version": __version__, "log": run.name, "robot": run.config.robot.name or "", "usable": str(run.usable),
+        "unusable_because": run.summary["unusable_because"] or "",
+        "datum": "" if globe is None else " ".join(f"{value!r}" for value in globe),
+    }  # fmt: skip
+    write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about)
+
+
+@cache
+def _typestore() -> Typestore:
+    from rosbags.typesys import get_types_from_msg
+
+    store = load_typestore(ros1=False)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> TopicPlan:
+    """Return /tf: one message a state, with the pose of each path."""
+    stamps = paths[0].stamp_ns[rows]
+    kind = "geometry_msgs/msg/TransformStamped"
+    fixed: dict[str, object] = {"transforms": [blank_message(store, kind) for _ in paths]}
+    columns: dict[str, NDArray[Any]] = {}
+    for number, path in enumerate(paths):
+        place, (z, w) = f"transforms.{number}", path.quaternion
+        fixed |= {f"{place}.header.frame_id": WORLD, f"{place}.child_frame_id": BODIES[path.name]}
+        columns |= {f"{place}.{name}": values for name, values in header_stamps(stamps).items()}
+        columns |= {
+            f"{place}.transform.translation.x": path.x_m[rows],
+            f"{place}.transform.translation.y": path.y_m[rows],
+            f"{place}.transform.rotation.z": z[rows],
+            f"{place}.transform.rotation.w": w[rows],
+        }
+    return TopicPlan("/tf", "tf2_msgs/msg/TFMessage", stamps, fixed, columns)
+
+
+def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
+    """Return the poses of a path; its twist is what its ICRs make of the wheel speeds."""
+    table, stamps, (z, w) = run.table, path.stamp_ns[rows], path.quaternion
+    icrs = (column[rows] if len(column) > 1 else np.repeat(column, len(rows)) for column in path.icrs)
+    speeds = (column.tolist() for column in (table.v_left_mps[rows], table.v_right_mps[rows], *icrs))
+    v_x, v_y, omega = np.array([body_velocity(*row) for row in zip(*speeds, strict=True)]).T
+    columns = header_stamps(stamps) | {
+        "pose.pose.position.x": path.x_m[rows],
+        "pose.pose.position.y": path.y_m[rows],
+        "pose.pose.orientation.z": z[rows],
+        "pose.pose.orientation.w": w[rows],
+        "twist.twist.linear.x": v_x,
+        "twist.twist.linear.y": -v_y,
+        "twist.twist.angular.z": -omega,
+    }
+    states = {"filter": table, "smoothed": run.smoothed}.get(path.name)
+    if states is not None:
+        columns |= {
+            "pose.covariance.0": states.std_east_m[rows] ** 2,
+            "pose.covariance.7": states.std_north_m[rows] ** 2,
+            "pose.covariance.35": states.std_heading_rad[rows] ** 2,
+        }
+    fixed: dict[str, object] = {"header.frame_id": WORLD, "child_frame_id": BODIES[path.name]}
+    return TopicPlan(f"/{path.name}/odometry", "nav_msgs/msg/Odometry", stamps, fixed, columns)
+
+
+def _whole_path(path: ExportPath, store: Typestore) -> TopicMessages:
+    """Return a message at the first state that holds all of a path, thinned."""
+    name = "nav_msgs/msg/Path"
+    message: Any = blank_message(store, name)
+    rows, (z, w) = line_rows(path.x_m, path.y_m), path.quaternion
+    message.header.frame_id = WORLD
+    _set_stamp(message, int(path.stamp_ns[0]))
+    columns = (path.x_m, path.y_m, z, w, path.stamp_ns)
+    for x_m, y_m, qz, qw, stamp in zip(*(column[rows].tolist() for column in columns), strict=True):
+        pose: Any = blank_message(store, "geometry_msgs/msg/PoseStamped")
+        pose.header.frame_id = WORLD
+        _set_stamp(pose, stamp)
+        pose.pose.position.x, pose.pose.position.y = x_m, y_m
+        pose.pose.orientation.z, pose.pose.orientation.w = qz, qw
+        message.poses.append(pose)
+    return TopicMessages(f"/{path.name}/path", name, path.stamp_ns[:1], [bytes(store.serialize_cdr(message, name))])
+
+
+def _fixes(run: Run, rows: Ints, globe: Globe) -> tuple[TopicPlan, ...]:
+    """Return the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
+    table, fixes, code = run.table, run.sensors.fixes, run.gnss.code
+    status = np.where(fixes.fix_class == FIXED_FIX, GBAS_FIX, PLAIN_FIX).astype(np.int8)
+    body = np.full(len(rows), PLAIN_FIX, np.int8)
+    used, rejected = np.flatnonzero((code != UNSEEN) & (code != GATED)), np.flatnonzero(code == GATED)
+    variances = fixes.var_east_m2, fixes.var_north_m2
+    plans = [
+        _fix_plan("/filter/fix", BODIES["filter"], table.stamp_ns[rows], (table.east_m[rows], table.north_m[rows]),
+                  (table.std_east_m[rows] ** 2, table.std_north_m[rows] ** 2), body, globe)
+    ]  # fmt: skip
+    for topic, chosen in (("/gnss/fix", used), ("/gnss/fix_rejected", rejected)):
+        place = fixes.east_m[chosen], fixes.north_m[chosen]
+        variance = variances[0][chosen], variances[1][chosen]
+        plans.append(_fix_plan(topic, "antenna", fixes.stamp_ns[chosen], place, variance, status[chosen], globe))
+    return tuple(plans)
+
+
+def _fix_plan(
+    topic: str, frame: str, stamp_ns: Ints, place_m: tuple[Floats, Floats], variance_m2: tuple[Floats, Floats],
+    status: NDArray[np.int8], globe: Globe,
+) -> TopicPlan:  # fmt: skip
+    latitude, longitude = globe.places(*place_m)
+    columns = header_stamps(stamp_ns) | {
+        "status.status": status,
+        "latitude": latitude,
+        "longitude": longitude,
+        "position_covariance.0": variance_m2[0],
+        "position_covariance.4": variance_m2[1],
+    }
+    fixed: dict[str, object] = {
+        "header.frame_id": frame, "status.service": 1, "altitude": globe.height_m,
+        "position_covariance_type": DIAGONAL_KNOWN,
+    }  # fmt: skip
+    return TopicPlan(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, fixed, columns)
+
+
+def _icrs(run: Run, rows: Ints) -> TopicPlan:
+    table = run.table
+    stamps, columns = table.stamp_ns[rows], header_stamps(table.stamp_ns[rows])
+    for name in ICR_COLUMNS:
+        value, std = getattr(table, name)[rows], getattr(table, f"std_{name}")[rows]
+        columns |= {name: value, f"std_{name}": std}
+        columns |= {f"{name[:-2]}_minus_std_m": value - std, f"{name[:-2]}_plus_std_m": value + std}
+    return TopicPlan("/icrs", ICRS, stamps, {"header.frame_id": BODIES["filter"]}, columns)
+
+
+def _errors(run: Run) -> TopicPlan:
+    """Return the open-loop errors from the states that have a trial."""
+    errors = errors_from_states(run, ERROR_HORIZON_M)
+    rows = rows_apart(run.table.stamp_ns, INTERVAL_S)
+    rows = rows[np.isfinite(errors["icr"][rows])]
+    unknown = np.full(len(run.table), np.nan)
+    columns = header_stamps(run.table.stamp_ns[rows])
+    columns |= {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
+    fixed: dict[str, object] = {"header.frame_id": BODIES["filter"], "horizon_m": ERROR_HORIZON_M}
+    return TopicPlan("/open_loop_error", ERROR, run.table.stamp_ns[rows], fixed, columns)
+
+
+def _slip_events(run: Run) -> Iterator[dict[str, Any]]:
+    for event in run.summary["events"]:
+        yield {
+            "kind": event["kind"], "begin_ns": event["begin_ns"], "end_ns": event["end_ns"],
+            "x_m": event["east_m"], "y_m": event["north_m"], "distance_m": event["distance_m"],
+            "severity": event["severity"], "confidence": event["confidence"],
+        }  # fmt: skip
+
+
+def _outages(run: Run) -> Iterator[dict[str, Any]]:
+    table = run.table
+    for (begin_ns, end_ns), rows in outage_rows(run):
+        distance = table.distance_m[rows]
+        yield {
+            "kind": "outage", "begin_ns": begin_ns, "end_ns": end_ns, "x_m": float(table.east_m[rows.start]),
+            "y_m": float(table.north_m[rows.start]), "distance_m": float(distance[-1] - distance[0]),
+        }  # fmt: skip
+
+
+def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> TopicMessages:
+    """Return a message at the begin of each event, and one of kind none at its end."""
+    stamps, payload = [], []
+    for event in events:
+        for kind, stamp in ((event["kind"], event["begin_ns"]), ("none", event["end_ns"])):
+            message: Any = blank_message(store, EVENT)
+            message.header.frame_id, message.kind = WORLD, kind
+            _set_stamp(message, stamp)
+            for name in ("x_m", "y_m", "distance_m", "severity", "confidence"):
+                setattr(message, name, event.get(name, 0.0))
+            message.duration_s = (event["end_ns"] - event["begin_ns"]) / 1e9
+            stamps.append(stamp)
+            payload.append(bytes(store.serialize_cdr(message, EVENT)))
+    return TopicMessages(topic, EVENT, np.array(stamps, np.int64), payload)
+
+
+def _set_stamp(message: Any, stamp_ns: int) -> None:  # noqa: ANN401 - a message with a header
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
