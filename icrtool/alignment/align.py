@@ -7,17 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from icrtool.alignment.corrections import align_streams, start_icrs
+from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.findings import alignment_findings, start_icrs
 from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
-from icrtool.alignment.heading_alignment import HeadingCheck
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.stream_delays import StreamDelays
-from icrtool.alignment.wheel_alignment import WheelCheck
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
-from icrtool.records.measurements import Finding, Fixes, FixStatistics, Measurements, SensorData
+from icrtool.records.measurements import Fixes, FixStatistics, Measurements, SensorData
 from icrtool.records.run import half_width_m
 from icrtool.records.tables import PositionFixes, RobotLog
 
@@ -68,7 +66,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
     return Measurements(
         sensors=sensors,
-        findings=_findings(wheels, heading, delays) | found.robot_findings(),
+        findings=alignment_findings(found, aligned.antenna_m),
         sections={
             "wheels": wheels.summary(),
             "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
@@ -130,30 +128,6 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
         forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
         right if given.antenna_right_m == "auto" else given.antenna_right_m,
     )
-
-
-def _findings(wheels: WheelCheck, heading: HeadingCheck, delays: StreamDelays) -> dict[str, Finding]:
-    degrees = math.degrees
-    return {
-        "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
-        "heading_offset_deg": _finding(
-            degrees(heading.offset_rad), degrees(heading.offset_std_rad), degrees(heading.applied_offset_rad)
-        ),
-        "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
-        "position_delay_s": _finding(*delays.gnss, delays.applied_gnss_s),
-    }
-
-
-def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:
-    """Return one estimate; `nothing` is the correction that changes nothing."""
-    known = math.isfinite(value) and math.isfinite(std)
-    if applied != nothing:
-        why = "corrected"
-    elif known:
-        why = "not corrected: too small, too uncertain, or not told apart from wheel slip"
-    else:
-        why = "not corrected: this drive does not show it"
-    return Finding(value if known else None, std if known else None, applied, why)
 
 
 def _fix_statistics(quality: FixQuality) -> FixStatistics:

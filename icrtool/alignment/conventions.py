@@ -22,7 +22,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
-from icrtool.records.tables import Floats, Ints
+from icrtool.records.tables import Floats, Ints, RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 """How far robots lie from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry = 0."""
@@ -246,3 +246,20 @@ def _in_words(one: Convention) -> str:
     parts += ["a reversed left side"] * (one.sign_left < 0) + ["a reversed right side"] * (one.sign_right < 0)
     parts += ["a mirrored heading"] * (one.heading < 0) + ["mirrored positions"] * (one.position < 0)
     return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"
+
+
+def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
+    """Return +1 where the gyro turns as the heading is named, -1 where the other way, 0 without one or in doubt."""
+    if log.gyro is None or len(drive.heading_t) < 3:
+        return 0
+    t = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
+    turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * log.gyro.rate_radps[:-1])])
+    edges = t[0] + np.unique(np.floor(t - t[0]))
+    by_gyro, by_heading = (
+        np.diff(np.interp(edges, t, turned)),
+        np.diff(np.interp(edges, drive.heading_t, drive.heading)),
+    )
+    if len(by_gyro) < FEWEST_WINDOWS or not (np.ptp(by_gyro) > 0 and np.ptp(by_heading) > 0):
+        return 0
+    correlation = float(np.corrcoef(by_gyro, by_heading)[0, 1])
+    return int(np.sign(correlation)) if abs(correlation) > 0.5 else 0

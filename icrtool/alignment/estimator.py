@@ -39,10 +39,11 @@ NAMES = (
 A, M, C, L, K, Q, G, D, TP, TH = range(10)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 0.01, math.inf, 0.15, 0.5])
+PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5])
 """They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
 far to either side. Delays of position and heading of one
-robot usually agree to 0.15 s."""
+robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without that, a drive at
+constant speed does not separate the drift from unequal wheels."""
 
 MIDDLE_STD_M = 0.1
 """The middle of the ICRs lies this near to the antenna, to either side."""
@@ -167,10 +168,12 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         fit = robust_least_squares(
             model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
         )
+        covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
     except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(covariance).all():
         # exact data on one circle: nothing separates the parameters
         return None
-    covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
     covariance[TH, TH] += RESPONSE_STD_S**2
     if not drive.same_clock:
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))

@@ -1,9 +1,9 @@
-"""What is known of the wheels: scale, dead, copied and held encoders."""
+"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders; wheels that turn in vain."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,10 @@ from icrtool.alignment.course_over_ground import (
     FEWEST_WINDOWS,
     Course,
 )
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.alignment.estimator import AlignmentFit
+from icrtool.config import Config
+from icrtool.errors import DataError
 from icrtool.records.tables import RobotLog, WheelSamples
 
 SMALLEST_TURN_RAD = math.radians(20.0)
@@ -20,50 +24,89 @@ NEVER_MOVES_SHARE = 0.02
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 
+SMALLEST_SCALE_ERROR, SCALE_SIGMAS, USUAL_SCALE_STD = 0.01, 2.0, 0.04
+"""A scale is corrected by what remains of it beside a prior: wheels roll at their nominal radius to 4 %."""
+
+SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
+"""Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
+
+LARGEST_SCALE_CORRECTION = 0.15
+FACTOR_TWO_TOLERANCE = 0.04
+"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
+
+STANDS_SHARE, STILL = 0.8, 0.2
+"""The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
+
+FUSED_CORRELATION = 0.9995
+"""A turn rate of the wheels that follows the gyro this closely was made of it."""
+
 
 @dataclass(frozen=True, slots=True)
-class WheelCheck:
-    """What the comparison found, and the log with what was certain put right.
+class WheelAlignment:
+    """The estimate, and the log with what was certain corrected.
 
     Attributes
     ----------
-    scale, scale_std : way by the position reference per way by the wheels; NaN when it could not be told
-    applied_scale : what both sides were multiplied with
+    scale, scale_std : distance by the position reference per distance by the wheels; NaN where not shown
+    applied : what the speeds of the left and of the right side were multiplied with
+    configured : what they were multiplied with before, by the configuration
     held_share : share of samples, while moving, that repeat the one before
     """
 
     log: RobotLog
     scale: float
     scale_std: float
-    applied_scale: float
+    applied: tuple[float, float]
+    configured: tuple[float, float]
     held_share: float
     warnings: tuple[str, ...]
     course: Course | None
 
+    @property
+    def applied_scale(self) -> float:
+        """Mean of what both sides were multiplied with."""
+        return (self.applied[0] + self.applied[1]) / 2
+
     def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json."""
+        """Return the numbers for run.json; ``applied_left_scale`` and its like hold the configured scale."""
         known = math.isfinite(self.scale)
         return {
             "scale": self.scale if known else None,
             "scale_std": self.scale_std if known else None,
             "applied_scale": self.applied_scale,
+            "applied_left_scale": self.applied[0] * self.configured[0],
+            "applied_right_scale": self.applied[1] * self.configured[1],
             "held_share": self.held_share,
         }
 
 
+def configured_scales(config: Config) -> tuple[float, float]:
+    """Return the configured scales of the sides as they are named; ``auto`` is 1."""
+    left, right = config.wheels.left_scale, config.wheels.right_scale
+    return 1.0 if left == "auto" else left, 1.0 if right == "auto" else right
+
+
+def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
+    """Return the log with the speeds of its sides multiplied; the same log where both factors are 1."""
+    if left == right == 1.0:
+        return log
+    wheels = log.wheels
+    return replace(log, wheels=replace(wheels, left=left * wheels.v_left_mps, right=right * wheels.v_right_mps))
+
+
 def dead_or_copied(log: RobotLog) -> list[str]:
-    """Say when a side never moves while the other does, or is a copy of the other while the robot turns."""
+    """Return a warning where a side never moves while the other does, or copies the other while the robot turns."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
-    way_left, way_right = float(np.abs(left).sum()), float(np.abs(right).sum())
-    most = max(way_left, way_right)
+    total_left, total_right = float(np.abs(left).sum()), float(np.abs(right).sum())
+    most = max(total_left, total_right)
     if most == 0.0:
         return []
-    if min(way_left, way_right) < NEVER_MOVES_SHARE * most:
-        side = "left" if way_left < way_right else "right"
+    if min(total_left, total_right) < NEVER_MOVES_SHARE * most:
+        side = "left" if total_left < total_right else "right"
         meaning = "the ICRs mean nothing then; topics.wheels chooses others"
         return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
-        return ["left and right wheels tell the same all the time while the robot turns: one is a copy of the other"]
+        return ["left and right wheels are equal throughout while the robot turns: one is a copy of the other"]
     return []
 
 
@@ -78,8 +121,100 @@ def held_share(wheels: WheelSamples) -> float:
 
 
 def held_note(wheels: WheelSamples, share: float) -> list[str]:
-    """Say how often held wheel values change."""
+    """Return a warning where wheel values are held, with how often they change."""
     if share <= HELD_SHARE:
         return []
     rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
     return [f"wheel values are held: they change {rate:.1f} times a second while moving"]
+
+
+def refuse_standing(log: RobotLog, drive: DriveArrays, windows: DriveWindows) -> None:
+    """Raise where the wheels turn and the position does not: a robot on a stand, or held."""
+    begin, end = windows.begin, windows.end
+    if len(begin) < FEWEST_WINDOWS:
+        return
+    turned = np.abs(np.interp(drive.fix_t[end], drive.heading_t, drive.heading)
+                    - np.interp(drive.fix_t[begin], drive.heading_t, drive.heading))  # fmt: skip
+    v, w = drive.v_left + drive.v_right, drive.v_left - drive.v_right
+    nose = np.exp(1j * np.interp(drive.wheel_t, drive.heading_t, drive.heading))
+    laid, apart = (np.concatenate([[0.0], np.cumsum((rate / 2 * drive.wheel_dt)[:-1])]) for rate in (v * nose, w))
+    laid, apart = (
+        np.abs(np.interp(drive.fix_t[end], drive.wheel_t, one) - np.interp(drive.fix_t[begin], drive.wheel_t, one))
+        for one in (laid, apart)
+    )
+    went = np.abs(drive.fix[end] - drive.fix[begin])
+    moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
+    clear = np.maximum(laid, apart) > windows.length_m / 4
+    if np.count_nonzero(clear) >= FEWEST_WINDOWS and float((~moved)[clear].mean()) > STANDS_SHARE:
+        place = drive.fix - (np.median(drive.fix.real) + 1j * np.median(drive.fix.imag))
+        raise DataError(
+            log.name,
+            f"the wheels turn ({drive.travel[-1]:.0f} m) and the robot does not move",
+            f"95 % of the positions lie within {float(np.percentile(np.abs(place), 95)):.2f} m: is it on a stand?",
+        )
+
+
+def find_scales(
+    fit: AlignmentFit | None, config: Config, *, sound: bool, corrects: bool
+) -> tuple[tuple[float, float], list[str]]:
+    """Return the factors to apply to the speeds of the left and of the right side, and what to report.
+
+    Notes
+    -----
+    The difference of the sides is the asymmetry of the turn rate over its gain: a robot that veers where both sides
+    report one speed. Both factors keep the scale as their mean.
+    """
+    if fit is None:
+        return (1.0, 1.0), []
+    given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
+    may = corrects and sound and not given
+    scale, notes = _common_scale(fit, may=may)
+    difference, std = _side_difference(fit)
+    if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS * std):
+        return (scale, scale), notes
+    side, other = ("left", "right") if difference < 0 else ("right", "left")
+    text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
+    text = f"{text} where both report the same distance"
+    if may and abs(difference) <= LARGEST_SCALE_CORRECTION:
+        notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
+        return (scale * (1.0 + difference / 2), scale * (1.0 - difference / 2)), notes
+    return (scale, scale), [*notes, f"{text}: check wheel radii and tyre pressures"]
+
+
+def _side_difference(fit: AlignmentFit) -> tuple[float, float]:
+    """Return left over right scale, minus 1, and its standard deviation, to first order."""
+    (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
+    if turn <= 0.0:
+        return 0.0, math.inf
+    return asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
+
+
+def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
+    """Return the factor to apply to both sides, and what to report."""
+    scale, std = fit.estimate("scale")
+    error = abs(scale - 1.0)
+    # a heading that scatters makes the path along it shorter by half its variance
+    if error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
+        return 1.0, []
+    if error <= LARGEST_SCALE_CORRECTION:
+        scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
+    text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
+    twice = any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))
+    if may and (error <= LARGEST_SCALE_CORRECTION or twice):
+        return scale, [f"{text}: corrected; wheels.left_scale and right_scale set it"]
+    return 1.0, [f"{text}: check wheel radius, encoder resolution and units"]
+
+
+def fused_note(log: RobotLog) -> list[str]:
+    """Warn of wheels that are another filter's output: their turn rate is the gyro's."""
+    stream = next((one for one in log.streams if one.role == "wheels"), None)
+    fused_type = stream is not None and any(word in stream.message_type for word in ("Odometry", "Twist"))
+    if stream is None or not fused_type or log.gyro is None:
+        return []
+    t = (log.wheels.stamp_ns - log.gyro.stamp_ns[0]) / 1e9
+    rate = np.interp(t, (log.gyro.stamp_ns - log.gyro.stamp_ns[0]) / 1e9, log.gyro.rate_radps)
+    apart = log.wheels.v_left_mps - log.wheels.v_right_mps
+    if not (np.ptp(rate) > 0.1 and np.ptp(apart) > 0 and float(np.corrcoef(rate, apart)[0, 1]) > FUSED_CORRELATION):
+        return []
+    fact = f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip"
+    return [f"{fact}; name the wheels' own topic with topics.wheels"]

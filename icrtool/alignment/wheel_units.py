@@ -39,8 +39,8 @@ class Scale:
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
 
-    What no wheel can have done is left out; configured scales of the sides are applied. What was used, and what had
-    to be estimated, stands in the stream's ``why`` and in the warnings.
+    What no wheel can have done is left out. What was used, and what had to be estimated, stands in the stream's
+    ``why`` and in the warnings.
 
     Raises
     ------
@@ -56,8 +56,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
     warnings = [f"{log.name}: {note}" for note in estimated]
     with np.errstate(over="ignore"):
-        left = wheels.left * factor * _side_scale(config.wheels.left_scale)
-        right = wheels.right * factor * _side_scale(config.wheels.right_scale)
+        left, right = wheels.left * factor, wheels.right * factor
     stamps = wheels.stamp_ns
     possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
     if not possible.all():
@@ -90,11 +89,6 @@ def _spikes(speed: Floats) -> Bools:
     usual = float(np.quantile(size, USUAL_SHARE))
     spikes: Bools = (size > max(SPIKE_MPS, SPIKE_RATIO * usual)) & (size > SPIKE_RATIO * around)
     return spikes
-
-
-def _side_scale(scale: float | str) -> float:
-    """Return a side's configured scale; ``auto`` is 1 here, and judged where position and heading are known."""
-    return scale if isinstance(scale, float | int) else 1.0
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:

@@ -23,7 +23,7 @@ def calibrate(runs: Run | Sequence[Run]) -> Calibration:
     Raises
     ------
     ConfigError
-        Runs of different robots, wheel radii or scales, one run twice, or a track width that is not known.
+        Runs of different robots or wheel radii, one run twice, or a track width that is not known.
     DataError
         Too short a drive.
     """
@@ -35,10 +35,9 @@ def calibrate_runs(runs: Sequence[Run]) -> CalibrationResult:
     if not runs:
         raise ConfigError("runs", "none is given", "name at least one run or log")
     robots = [robot_of(run) for run in runs]
-    for key, unit in (("wheel_radius_m", "robot."), ("left_scale", "wheels."), ("right_scale", "wheels.")):
-        if len(found := {robot[key] for robot in robots}) > 1:
-            why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
-            raise ConfigError(f"{unit}{key}", why, "fit them with the same value: parameters refer to it")
+    if len(found := {robot["wheel_radius_m"] for robot in robots}) > 1:
+        why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
+        raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     result = calibrate_recordings([gyro_recording_of(run) for run in runs], robots[0])
     warnings = tuple(dict.fromkeys(warning for run in runs for warning in use_warnings(run, alone=len(runs) == 1)))
     return replace(result, calibration=replace(result.calibration, warnings=warnings))
@@ -46,12 +45,7 @@ def calibrate_runs(runs: Sequence[Run]) -> CalibrationResult:
 
 def robot_of(run: Run) -> dict[str, Any]:
     """Return what a calibration holds of the robot of a run, but for its track width."""
-    config = run.config
-    scales = {
-        key: 1.0 if value == "auto" else float(value)
-        for key, value in (("left_scale", config.wheels.left_scale), ("right_scale", config.wheels.right_scale))
-    }
-    return {"name": config.robot.name, "wheel_radius_m": config.robot.wheel_radius_m, **scales}
+    return {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
 
 
 def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:

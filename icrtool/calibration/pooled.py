@@ -63,11 +63,11 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
     drive, inputs = drive_of(run), run.summary.get("inputs", [])
-    scale = float(run.summary.get("wheels", {}).get("applied_scale", 1.0))
+    left_scale, right_scale = run.wheel_scales
     plain = Recording(
         name=run.name,
         t_s=run.table.t_s,
-        drive=drive._replace(v_left=drive.v_left / scale, v_right=drive.v_right / scale),
+        drive=drive._replace(v_left=drive.v_left / left_scale, v_right=drive.v_right / right_scale),
         gyro_radps=None,
         width_m=width,
         path=inputs[0]["path"] if inputs else "",
@@ -119,7 +119,7 @@ def calibrate(recordings: Sequence[Recording], robot: Mapping[str, Any] | None =
     Parameters
     ----------
     recordings : one or many, of one robot
-    robot : what else its calibration holds of it: name, wheel_radius_m, left_scale, right_scale
+    robot : what else its calibration holds of it: name, wheel_radius_m
 
     Raises
     ------

@@ -152,7 +152,7 @@ class Calibration:
 
     Attributes
     ----------
-    robot : name (or None), track_width_m, wheel_radius_m (or None), left_scale, right_scale as configured
+    robot : name (or None), track_width_m, wheel_radius_m (or None); older files: left_scale, right_scale as configured
     fitted : the recommended model; others : every model, by name
     gyro : the recommended model with a gyro, None where a log has none
     typical : curvature and speed at which ICRs and multiplier are stated

@@ -205,8 +205,10 @@ def sandwich_covariance(
     meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
     inverse = np.linalg.solve(information, np.eye(len(pull)))
     sandwich = inverse @ meat @ inverse
-    grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
-    covariance: Floats = sandwich * np.outer(grown, grown)
+    # exact data that do not separate the parameters leave no finite covariance
+    with np.errstate(over="ignore", invalid="ignore"):
+        grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
+        covariance: Floats = sandwich * np.outer(grown, grown)
     return (covariance + covariance.T) / 2.0, information, count
 
 

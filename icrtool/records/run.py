@@ -141,6 +141,16 @@ class Run:
         return WarmStart(icrs, covariance, self.track_width_m)
 
     @property
+    def wheel_scales(self) -> tuple[float, float]:
+        """What the recorded speeds of the left and right side were multiplied with, from those at the nominal radius.
+
+        It holds configured and estimated scales; dividing by it gives back the speeds that the wheels reported.
+        """
+        wheels = self.summary.get("wheels", {})
+        common = wheels.get("applied_scale", 1.0)
+        return float(wheels.get("applied_left_scale", common)), float(wheels.get("applied_right_scale", common))
+
+    @property
     def usable(self) -> bool:
         """Whether the ICRs may be used; `summary` says why not (``unusable_because``)."""
         return bool(self.summary["usable"])

@@ -1,4 +1,4 @@
-"""The wheel doctor: what wheel data get wrong is found, named, and put right where it is certain."""
+"""What wheel data get wrong is found, reported, and corrected where it is certain."""
 
 from __future__ import annotations
 
@@ -41,6 +41,8 @@ def test_good_wheels_are_left_as_they_are() -> None:
         (lambda left, right: (-left, -right), "both wheels count backwards"),
         (lambda left, right: (1.07 * left, 1.07 * right), "goes 93"),
         (lambda left, right: (0.95 * left, 0.95 * right), "goes 105"),
+        (lambda left, right: (1.02 * left, 0.98 * right), "left side goes 4"),
+        (lambda left, right: (0.93 * left, 0.97 * right), "right side goes 4"),
     ],
 )
 def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
@@ -68,7 +70,16 @@ def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  
     log = make_log(seconds=120.0)
     check = align_streams(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG).wheels
     assert any(words in warning for warning in check.warnings)
-    assert check.applied_scale == 1.0
+    assert check.applied == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(("left", "right"), [(1.02, 0.98), (1.08, 1.03), (0.95, 0.95)])
+def test_a_run_stores_the_scales_of_its_sides_and_they_can_be_undone(left: float, right: float) -> None:
+    log = make_log(seconds=120.0)
+    run = fit(with_wheels(log, left * log.wheels.v_left_mps, right * log.wheels.v_right_mps), CONFIG)
+    assert run.wheel_scales == pytest.approx((1 / left, 1 / right), abs=0.008)
+    assert run.table.v_left_mps / run.wheel_scales[0] == pytest.approx(left * log.wheels.v_left_mps)
+    assert run.table.v_right_mps / run.wheel_scales[1] == pytest.approx(right * log.wheels.v_right_mps)
 
 
 def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
@@ -115,5 +126,5 @@ def test_a_configured_scale_is_not_touched() -> None:
     log = make_log(seconds=120.0)
     spoilt = with_wheels(log, 1.07 * log.wheels.v_left_mps, 1.07 * log.wheels.v_right_mps)
     check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"])).wheels
-    assert check.applied_scale == 1.0
+    assert check.applied == (1.0, 1.0)
     assert any("check wheel radius" in warning for warning in check.warnings)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import choose, hold_out, plan_folds
 from icrtool.calibration.pooled import CalibrationResult, block_predictor, calibrate, predictor, recording_of
 from icrtool.config import parse_config
@@ -189,15 +190,17 @@ def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:
         calibrate([make_recording(SIX, TRUTH, 0, 12.0)])
 
 
-def test_an_applied_scale_of_a_run_is_undone() -> None:
-    run = fit(make_log(0, 60.0), parse_config({"robot": {"track_width_m": 0.6}}))
-    plain = recording_of(run)
-
-    class Scaled:
-        name, table, in_gap, outages_ns, track_width_m = run.name, run.table, run.in_gap, run.outages_ns, 0.6
-        summary = {**run.summary, "wheels": {"applied_scale": 0.8}}  # noqa: RUF012 - a stand-in
-
-    np.testing.assert_allclose(recording_of(Scaled()).drive.v_left, plain.drive.v_left / 0.8)  # type: ignore[arg-type]
+@pytest.mark.parametrize("scales", [(0.95, 0.95), (0.96, 1.03)])
+def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[float, float]) -> None:
+    log = make_log(0, 60.0)
+    given = {"left_scale": scales[0], "right_scale": scales[1]}
+    runs = [fit(log, parse_config({"robot": {"track_width_m": 0.6}, "wheels": wheels})) for wheels in ({}, given)]
+    assert runs[1].wheel_scales == pytest.approx(scales)
+    assert runs[1].table.v_left_mps == pytest.approx(scales[0] / runs[0].wheel_scales[0] * runs[0].table.v_left_mps)
+    for one, other in zip(*(recording_of(run).drive[1:3] for run in runs), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    robots = [robot_of(run) for run in runs]
+    assert robots[0] == robots[1]
 
 
 def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:

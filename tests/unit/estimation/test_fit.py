@@ -96,7 +96,7 @@ def test_a_heading_offset_is_found_applied_and_said() -> None:
 
 
 def test_a_configured_heading_offset_is_used_as_it_is() -> None:
-    config = load_config(sets=[WIDTH, "frames.heading_offset_deg=12.0"])
+    config = load_config(sets=[WIDTH, "frames.heading_offset_deg=-12.0"])
     run = fit(make_log(heading_offset_deg=12.0), config)
     assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(12.0)
     assert not any("off the course" in warning for warning in run.warnings)
