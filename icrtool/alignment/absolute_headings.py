@@ -60,10 +60,10 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
     t, angle = t[inside], angle[inside]
     if not len(t):
         return AbsoluteHeading(t, angle, angle, angle)
-    G = np.interp(t, turn.t, turn.integrated())
+    turned = np.interp(t, turn.t, turn.integrated())
     first = np.flatnonzero(np.diff(np.floor(t / cell_s), prepend=-1.0) > 0)
     count = np.diff(first, append=len(t))
     last = first + count - 1
-    mean = np.add.reduceat(np.exp(1j * (angle - G)), first)
+    mean = np.add.reduceat(np.exp(1j * (angle - turned)), first)
     rate = np.add.reduceat(np.interp(t, turn.t, turn.rate), first) / count
-    return AbsoluteHeading(t[last], np.angle(mean * np.exp(1j * G[last])), 1.0 / np.sqrt(count), rate)
+    return AbsoluteHeading(t[last], np.angle(mean * np.exp(1j * turned[last])), 1.0 / np.sqrt(count), rate)

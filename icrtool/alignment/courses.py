@@ -1,9 +1,14 @@
 """Courses over ground: the direction in which fixes moved, compared with wheels laid along an integrated turn rate.
 
 Over windows of driven distance the fixes p_i are regressed on the wheels' speed laid along the integrated turn rate,
-S_i = ∫ v e^{jG} (both about their means): the angle of sum p_i S_i* is the heading at the window's end, G being 0 there.
-What turns it further is linear: an error δpsi(t) of the heading by Re(sum ∫ δpsi v e^{jG} S_i*)/sum |S_i|^2, an ICR ahead
-of the antenna by x Im(sum -e^{jG_i} S_i*)/sum |S_i|^2, positions that lag by tau by tau Im(sum -v_i e^{jG_i} S_i*)/sum |S_i|^2.
+S_i = ∫ v e^{jG}, both about their means: the angle of sum p_i S_i* is the heading at the window's end, G being 0
+there.
+What turns it further is linear, each divided by sum |S_i|^2:
+
+    an error δpsi(t) of the heading           Re(sum ∫ δpsi v e^{jG} S_i*)
+    an ICR ahead of the antenna               x Im(sum -e^{jG_i} S_i*)
+    positions that lag by tau                 tau Im(sum -v_i e^{jG_i} S_i*)
+
 Wheels that run backwards turn S round.
 """
 
@@ -55,7 +60,10 @@ class TurnRate(NamedTuple):
         return np.concatenate([[0.0], np.cumsum(np.diff(self.t) * (self.rate[:-1] + self.rate[1:]) / 2)])
 
     def stamp_std(self) -> Floats:
-        """Return what its stamps turn the heading by (n,) [rad]: a rate may be the mean over either neighbour interval."""
+        """Return what an error of its stamps turns the heading by (n,) [rad].
+
+        A rate may be the mean over the interval before its stamp, or after it.
+        """
         delay = float(np.median(np.diff(self.t))) / 2.0 if self.delay_std_s is None else self.delay_std_s
         return np.abs(self.rate) * delay
 
@@ -109,7 +117,6 @@ class Courses(NamedTuple):
 
 def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses:
     """Cut the drive into windows of distance that follow one another, and measure the course in each."""
-    angle_at = turn.integrated()
     corrected = turn._replace(rate=turn.rate - guess.bias).integrated()
     v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
     middle = drive.wheel_t + drive.wheel_dt / 2
@@ -141,8 +148,8 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     def product(values: Complexes) -> Complexes:
         return np.asarray(np.add.reduceat(values * np.conj(path), first), np.complex128)
 
-    G = np.interp(t, turn.t, corrected)
-    swing = np.exp(1j * G)
+    turned = np.interp(t, turn.t, corrected)
+    swing = np.exp(1j * turned)
     whole = laid(step)
     path = centred(whole - guess.x * swing)
     speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
@@ -155,10 +162,10 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     kept &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
     of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
-    of_scale = product(centred(laid(step * psi) - guess.x * G * swing)).real / square - G[end]
+    of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     # about no bias, no x and no delay
     bias_at = np.interp(t[end], turn.t, guess.bias)
-    angle = np.angle(seen * np.exp(1j * G[end])) + bias_at * of_bias + guess.x * of_x + guess.late * of_delay
+    angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.late * of_delay
     found = Courses(
         t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, drive.fix_std_m / np.sqrt(square),
         np.abs(seen), product(centred(laid(u * nose))).real / square,

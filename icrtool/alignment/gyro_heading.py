@@ -2,15 +2,15 @@
 
 Each source has an error model whose sizes the likelihood of the log chooses: a turn rate has a random walk of its
 integral and of its bias; a course has the noise of the fixes and an ICR that varies from window to window; an absolute
-heading (attitude sensor, bearing between two antennas) has a constant offset, an error that wanders slowly, white noise
-and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale, delays, ICR) come from the whole
-log; what varies in time has a causal estimate (the past alone, constants excepted) and a smoothed one.
+heading (attitude sensor, bearing between two antennas) has a constant offset, an error that wanders slowly, white
+noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale, delays, ICR) come from
+the whole log; what varies in time has a causal estimate (the past alone, constants excepted) and a smoothed one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -40,7 +40,7 @@ LONGEST_STEP_S = 1.0
 """A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
 
 LEAST_COURSE_STD_RAD = math.radians(0.05)
-ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 4, 0.15, math.radians(1.0)
+ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
 MOST_SWEEPS = 3
 """A delay of the fixes up to this, and a bias that turns a window by this, are linear; larger ones take rounds."""
 
@@ -121,16 +121,17 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
-    guess, found = Guess(np.zeros(len(turn.t))), None
-    for round_ in range(ROUNDS):
+    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t))), (), stands=stands)
+    if problem.courses < FEWEST_COURSES:
+        return None
+    noises = problem.usual()
+    guess = problem.guess(noises)
+    for _ in range(ROUNDS):
         problem = _Problem(drive, turn, guess, (), stands=stands)
         if problem.courses < FEWEST_COURSES:
             return None
-        if round_ == 0:
-            guess = problem.guess(problem.usual())
-            continue
         # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
-        noises = problem.choose(NOISES, problem.usual())
+        noises = problem.choose(NOISES, noises)
         better = problem.guess(noises)
         turned = float(np.abs(better.bias - guess.bias).max()) * problem.window_s
         if turned < LARGE_BIAS_RAD and abs(better.late - guess.late) < LONG_DELAY_S:
@@ -196,7 +197,9 @@ class _Problem:
         """Sort the events by time, with steps that measure nothing between those far apart."""
         sorted_t = np.sort(t)
         gap = np.flatnonzero(np.diff(sorted_t) > 2.0 * LONGEST_STEP_S)
-        fill = [np.arange(sorted_t[i] + LONGEST_STEP_S, sorted_t[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in gap]
+        fill = [
+            np.arange(sorted_t[i] + LONGEST_STEP_S, sorted_t[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in gap
+        ]
         extra = np.concatenate([*fill, np.empty(0)])
         n = len(extra)
         t, kind = np.concatenate([t, extra]), np.concatenate([kind, np.full(n, NOTHING)])
@@ -223,7 +226,13 @@ class _Problem:
             r[self.kind == ABSOLUTE + i] *= noises[f"{i} white"] ** 2
         angle = (self.kind == COURSE) | (self.kind >= ABSOLUTE)
         return HeadingEvents(
-            np.diff(self.t, prepend=self.t[:1]), np.diff(self.at, prepend=self.at[:1]), self.holes, self.z, self.h, r, angle
+            np.diff(self.t, prepend=self.t[:1]),
+            np.diff(self.at, prepend=self.at[:1]),
+            self.holes,
+            self.z,
+            self.h,
+            r,
+            angle,
         )
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
@@ -281,7 +290,8 @@ class _Problem:
         """Return the courses' innovations in standard deviations, but for the first ones."""
         course = self.kind == COURSE
         z = passes.innovation[course] / np.sqrt(passes.variance[course])
-        return z[len(z) // 20 + 2 :]
+        settled: Floats = z[len(z) // 20 + 2 :]
+        return settled
 
     def _alike(self, passes: HeadingPasses) -> float:
         """Return by how much courses of windows that follow one another err alike, by slip that the model lacks."""
@@ -299,18 +309,15 @@ class _Problem:
         """Return the noises with those of the grids that have the largest likelihood, one after the other."""
         from icrtool.kernels.heading_kalman import heading_log_likelihood
 
-        some = slice(0, MOST_EVENTS)
-
         def likelihood(name: str, value: float) -> float:
             tried = noises | {name: value}
-            events = self.events(tried)
-            return heading_log_likelihood(type(events)(*(one[some] for one in events)), self.model(tried))
+            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
 
         for _ in range(MOST_SWEEPS):
             before = dict(noises)
             for name, values in grids.items():
-                best = max(values, key=lambda value, name=name: likelihood(name, float(value)))
-                noises = noises | {name: float(best)}
+                costs = [likelihood(name, float(value)) for value in values]
+                noises = noises | {name: float(values[int(np.argmax(costs))])}
             if noises == before:
                 break
         return noises

@@ -12,7 +12,7 @@ from icrtool.alignment.absolute_headings import antenna_heading, attitude_headin
 from icrtool.alignment.courses import TurnRate
 from icrtool.alignment.drive_windows import DriveArrays, drive_arrays
 from icrtool.alignment.estimator import ATTITUDE_STD_RAD
-from icrtool.alignment.gyro_heading import OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
+from icrtool.alignment.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
 from icrtool.alignment.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
 from icrtool.records.tables import Floats, GyroAxes, GyroSamples, HeadingSamples, RobotLog, StreamChoice
@@ -24,10 +24,13 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
-LARGEST_RATE_HZ = 20.0
+LARGEST_RATE_HZ = 100.0
+WHEELS_CORRELATION_S = 5.0
+"""A heading estimated with the wheels errs alike for about this long: a few courses."""
+
 LEAST_OFFSET_SIGMAS = 4.0
 LARGEST_SPREAD = 3.0
-"""Courses that scatter about the estimate by more than so many of their standard deviations contradict the turn rate."""
+"""Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
 
 LONGEST_HOLE_S = 1.0
 """No heading is estimated within a longer hole of the turn rate."""
@@ -45,7 +48,8 @@ class DerivedHeading:
     source : what it was made of; topic : of its parts
     estimate : causal and smoothed; causal, smoothed : the same as samples, the causal ones for the filter
     gyro : the turn rate that was used, None where it is the wheels'
-    attitude : the attitude sensor's own heading, corrected, None where none was used
+    attitude : the attitude sensor's own heading, corrected, None where none was used; attitude_offset : what was
+        subtracted from it, and its standard deviation [rad]
     why : its parts and standard deviation, for the user
     """
 
@@ -56,7 +60,16 @@ class DerivedHeading:
     smoothed: HeadingSamples
     gyro: GyroSamples | None
     attitude: HeadingSamples | None
+    attitude_offset: tuple[float, float] | None
     why: str
+
+    @property
+    def correlation_s(self) -> float:
+        """How long the filter takes its errors to be correlated.
+
+        An estimate by a gyro is the best one at each moment; one by the wheels holds what the filter does with them.
+        """
+        return WHEELS_CORRELATION_S if self.source == "wheels_course" else 0.0
 
     def apply(self, log: RobotLog) -> RobotLog:
         """Return the log with the causal heading, and the turn rate that agrees with it."""
@@ -96,21 +109,25 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             raise DataError(
                 log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
             )
-        found = _derived(log, estimate, turn, None, "wheels", length, None)
+        found = _derived(log, estimate, turn, None, length, None)
     return found
 
 
-def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
+def fuse_heading(log: RobotLog, drive: DriveArrays, *, mirrored: bool = False) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
-    None without a gyro, where the gyro contradicts the courses over ground, and where the stated heading alone is as
-    good.
+    None without a gyro, where the gyro contradicts the courses over ground, where the stated heading alone is as good,
+    and where it is the position reference's own.
 
     Parameters
     ----------
     drive : of the log, its heading of the right handedness
+    mirrored : that of the log is of the other one
     """
-    stated = HeadingSamples(log.heading.stamp_ns, log.heading.heading_rad, log.heading.var_rad2)
+    if drive.same_clock:
+        return None
+    sense = -1.0 if mirrored else 1.0
+    stated = HeadingSamples(log.heading.stamp_ns, sense * log.heading.heading_rad, log.heading.var_rad2)
     found = _with_gyro(log, drive, stated)
     if found is None or found.estimate.median_std > math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD):
         return None
@@ -137,7 +154,11 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
         pair, length = _pair(log, turn)
         absolute += [pair] if pair is not None else []
         estimate = estimate_heading(drive, turn, absolute)
-        if estimate is not None and stated is not None and abs(_offset(estimate)) < LEAST_OFFSET_SIGMAS * _offset_std(estimate):
+        if (
+            estimate is not None
+            and stated is not None
+            and abs(_offset(estimate)) < LEAST_OFFSET_SIGMAS * _offset_std(estimate)
+        ):
             # as a sensor that is mounted along the robot
             absolute[0] = absolute[0]._replace(offset_std=ATTITUDE_STD_RAD)
             estimate = estimate_heading(drive, turn, absolute)
@@ -145,8 +166,12 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
             continue
         if best is None or estimate.median_std < best.estimate.median_std:
             topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
-            best = _derived(log, estimate, turn, topic, "gyro", length, stated)
+            best = _derived(log, estimate, turn, topic, length, stated)
     return best
+
+
+def _has_offset(estimate: HeadingEstimate) -> bool:
+    return abs(_offset(estimate)) > LEAST_OFFSET_SIGMAS * _offset_std(estimate)
 
 
 def _offset(estimate: HeadingEstimate) -> float:
@@ -164,7 +189,7 @@ def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]
 
 
 def _derived(
-    log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None, rate_name: str,
+    log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None,
     baseline_m: float, stated: HeadingSamples | None,
 ) -> DerivedHeading:  # fmt: skip
     """Return the record of an estimate."""
@@ -178,17 +203,27 @@ def _derived(
         source = "antenna_pair"
         parts.insert(0, f"two antennas {baseline_m:.2f} m apart")
         names.insert(0, log.other_receivers[0].topic)
-    attitude = None
+    attitude, attitude_offset = None, None
     if stated is not None:
         source = "fused"
         parts.insert(0, f"orientation (errs by {math.degrees(attitude_error(estimate)):.1f}°)")
         names.insert(0, topics.get("heading", "orientation"))
-        attitude = replace(stated, heading_rad=stated.heading_rad - _offset(estimate))
+        attitude_offset = _offset(estimate), _offset_std(estimate)
+        lag = round(float(estimate.constants[LAG]) * 1e9)
+        attitude = replace(stated, stamp_ns=stated.stamp_ns - lag, heading_rad=stated.heading_rad - attitude_offset[0])
     std = math.degrees(estimate.median_std)
     causal, smoothed = _samples(estimate, turn, epoch)
     gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None
     return DerivedHeading(
-        source, " + ".join(names), estimate, causal, smoothed, gyro, attitude, f"{', '.join(parts)}; σ {std:.2f}°"
+        source,
+        " + ".join(names),
+        estimate,
+        causal,
+        smoothed,
+        gyro,
+        attitude,
+        attitude_offset,
+        f"{', '.join(parts)}; σ {std:.2f}°",
     )
 
 

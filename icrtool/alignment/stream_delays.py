@@ -95,7 +95,7 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
         elif field and what == "position" and applied["heading"] and _on_one_clock(fit, delay):
             applied[what] = applied["heading"]
             notes.append(f"{log.name}: the position is corrected alike: nothing shows that its delay differs")
-        elif field and delay.is_clear:
+        elif field and delay.is_clear and (what == "heading" or together or applied["heading"] or _differs(apart)):
             applied[what] = delay.value_s
             lags = ("lag" if together else "lags") if delay.value_s > 0 else ("lead" if together else "leads")
             subject = "the position and its heading" if together else f"the {what}"
@@ -115,6 +115,11 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
         shifted, found["heading"], found["position"], apart, together,
         applied["heading"], applied["position"], tuple(notes),
     )  # fmt: skip
+
+
+def _differs(apart: Delay) -> bool:
+    """Return whether the position has a delay of its own: the heading, which has none, shares a robot's response."""
+    return abs(apart.value_s) > SIGNIFICANT_SIGMAS * apart.std_s
 
 
 def delayed(log: RobotLog, delay_s: float) -> RobotLog:

@@ -27,7 +27,8 @@ LARGEST_CHANGE_RAD = 2.5
 HOLE_IN_INTERVALS, SHORTEST_HOLE_S = 5.0, 0.1
 """A turn rate has a hole where its interval is so many times the usual one, and at least so long."""
 
-PRIOR_ROWS = 1.0
+LEAST_AXIS = 0.3
+"""A gyro that shows less than this share of the course changes shows no axis."""
 
 
 def wheel_rate(drive: DriveArrays, width_m: float) -> TurnRate:
@@ -74,7 +75,7 @@ def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Flo
     if len(y) < 6:
         return up, "z up"
     noise = max(mad_std(_wrapped(y - columns[:, :3] @ up)), math.radians(0.1))
-    prior = noise**2 * np.diag([PRIOR_ROWS, PRIOR_ROWS, PRIOR_ROWS, 1.0 / math.radians(1.0) ** 2])
+    prior = noise**2 * np.diag([1.0, 1.0, 1.0, 1.0 / math.radians(1.0) ** 2])
     found, weights = np.zeros(4), np.ones(len(y))
     for _ in range(5):
         weighted = columns * weights[:, None]
@@ -83,7 +84,7 @@ def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Flo
         weights = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
     bias = found[3] * columns[:, 3]
     size = float(np.linalg.norm(found[:3]))
-    if not 0.3 < size:
+    if size <= LEAST_AXIS:
         return up, "z up"
     axis = found[:3] / size
     main = int(np.argmax(np.abs(axis)))

@@ -41,6 +41,13 @@ class HeadingEvents(NamedTuple):
     r: Floats
     angle: Bools
 
+    def cut(self, count: int) -> HeadingEvents:
+        """Return the first events."""
+        return HeadingEvents(
+            self.dt[:count], self.turn[:count], self.extra[:count], self.z[:count], self.h[:count], self.r[:count],
+            self.angle[:count],
+        )  # fmt: skip
+
 
 class HeadingModel(NamedTuple):
     """Start and process of the states.
@@ -87,7 +94,7 @@ def heading_log_likelihood(events: HeadingEvents, model: HeadingModel) -> float:
 
 
 @njit
-def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:
+def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:  # noqa: C901, PLR0912 - one event, in one place
     n, k = events.h.shape
     x, P = model.x, model.P
     T, Ph, phi = np.empty((k, k)), np.empty(k), np.ones(k)
@@ -123,7 +130,9 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> 
         if events.angle[i]:
             y -= 2.0 * math.pi * round(y / (2.0 * math.pi))
         size = abs(y) / math.sqrt(S)
-        likelihood -= 0.5 * (math.log(S) + (size**2 if size < HUBER_SIGMAS else HUBER_SIGMAS * (2.0 * size - HUBER_SIGMAS)))
+        likelihood -= 0.5 * (
+            math.log(S) + (size**2 if size < HUBER_SIGMAS else HUBER_SIGMAS * (2.0 * size - HUBER_SIGMAS))
+        )
         if stored:
             out.innovation[i], out.variance[i] = y, S
         S *= max(size / HUBER_SIGMAS, 1.0)

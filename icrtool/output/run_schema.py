@@ -183,6 +183,7 @@ class FilterDocument(TypedDict):
     reference_delay_s: float
     heading_correlation_s: float
     heading_from_position: bool
+    heading_is_estimated: bool
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
     icr_start: IcrStartDocument | None
