@@ -15,7 +15,7 @@ READY := $(VENV)/.ready
 PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo format format-check lint words types test stress fuzz bench unseen samples wheel-check check constraints clean
+.PHONY: help setup demo format format-check lint words types test stress fuzz bench unseen docs samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -69,6 +69,10 @@ bench: $(READY)  ## speed and memory, as ratios to other tools
 
 unseen: $(READY)  ## right, hedged or wrong on 120 physics drives with random sensors and troubles (an hour the first time)
 	$(BIN)/python benchmarks/unseen.py --drives build/unseen-drives --cases 120
+
+docs: $(READY)  ## build the documentation site into build/docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	@echo "Pages: build/docs/index.html"
 
 samples: $(READY)  ## simulate the sample logs again
 	$(BIN)/python $(SAMPLES)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Build the wheel from a clean source archive, install it alone in a fresh environment, and run the demo there.
+# Build the wheel from a clean source archive, check it, install it as a tool (as uvx and pipx do), and run the demo there.
 # A package file that was left out of the wheel, or an import of a development package, fails here and nowhere else.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -15,32 +15,34 @@ fi
 
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
-bin=$scratch/venv/bin
+tools=$(dirname "$build_python")
+export UV_TOOL_DIR=$scratch/tools UV_TOOL_BIN_DIR=$scratch/bin UV_NO_CONFIG=1
 
 echo "check-wheel: build"
 "$build_python" -m build --outdir "$scratch/dist" . >"$scratch/build.log" 2>&1 || { cat "$scratch/build.log" >&2; exit 1; }
 wheel=$(ls "$scratch"/dist/*.whl)
+"$build_python" -m twine check --strict "$scratch"/dist/* >"$scratch/twine.log" || { cat "$scratch/twine.log" >&2; exit 1; }
+# W002: the same message definition stands in two packages of messages.
+"$tools/check-wheel-contents" --no-config --ignore W002 "$wheel" >"$scratch/contents.log" || { cat "$scratch/contents.log" >&2; exit 1; }
 "$build_python" -m zipfile --list "$wheel" >"$scratch/contents"
 git ls-files --cached --others --exclude-standard icrtool | while read -r file; do
     [[ ! -e $file ]] || grep -qF "$file " "$scratch/contents" || { echo "check-wheel: $file is not in the wheel" >&2; exit 1; }
 done
 
-# pip cannot hold a local wheel's dependencies to hashes; the same files passed that test in `make setup`.
+# Constraints hold no hashes for a local wheel's dependencies; the same files passed that test in `make setup`.
 echo "check-wheel: install"
 sed -E -e '/^ +--hash/d' -e 's/ *\\$//' constraints.txt >"$scratch/pins.txt"
-"$python" -m venv "$scratch/venv"
-"$bin/python" -m pip install --quiet --disable-pip-version-check --no-compile --constraint "$scratch/pins.txt" "$wheel"
-"$bin/python" -m pip check --disable-pip-version-check >/dev/null
+"$tools/uv" tool install --quiet --python "$python" --constraints "$scratch/pins.txt" "$wheel"
 
 echo "check-wheel: run"
 cp -R sample_logs "$scratch/sample_logs"
 [[ $demo_log == sample_logs/* ]] || cp "$demo_log" "$scratch/"
 [[ $demo_log == sample_logs/* ]] || demo_log=$(basename "$demo_log")
 cd "$scratch"
-"$bin/python" -I -c 'import icrtool, sys; sys.exit(not icrtool.__file__.startswith(sys.prefix))'
-"$bin/icrtool" --help >/dev/null
-"$bin/icrtool" fit "$demo_log" ${demo_options[@]+"${demo_options[@]}"} -o run
-"$bin/icrtool" dropout-report run
+"$UV_TOOL_DIR/icrtool/bin/python" -I -c 'import icrtool, sys; sys.exit(not icrtool.__file__.startswith(sys.prefix))'
+"$UV_TOOL_BIN_DIR/icrtool" --help >/dev/null
+"$UV_TOOL_BIN_DIR/icrtool" fit "$demo_log" ${demo_options[@]+"${demo_options[@]}"} -o run
+"$UV_TOOL_BIN_DIR/icrtool" dropout-report run
 for result in run/run.json run/states.csv run/plots/trajectory.png run/plots/icr_estimates.png \
     run/dropout/summary.csv run/dropout/plots/summary.png; do
     [[ -s $result ]] || { echo "check-wheel: $result is missing" >&2; exit 1; }

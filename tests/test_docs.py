@@ -28,7 +28,12 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    *(str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").rglob("*.md"))),
+)
 EXAMPLE = CONFIGURATION.split("```toml\n")[1].split("```")[0]
 
 
@@ -51,7 +56,7 @@ def test_every_command_has_help_and_stands_in_the_documentation(command: str) ->
     assert result.exit_code == 0
     assert "Usage" in result.output
     assert "\\b" not in result.output
-    pages = README + "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
+    pages = README + "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
     assert f"icrtool {command}" in pages
 
 

@@ -166,7 +166,10 @@ def calibrate(log: RobotLog, config: Config | None = None, *, x_icr_m: float | N
     aligned = align_streams(log, config)
     checked = aligned.wheels
     found = estimate(aligned.as_named, config)
-    found = replace(found, values=found.values * np.where(np.isin(NAMES, SCALES), checked.applied_scale, 1.0))
+    factors = np.ones(len(NAMES))
+    factors[[NAMES.index(name) for name in SCALES]] = checked.applied
+    factors[NAMES.index("offset")] = -1.0
+    found = replace(found, values=found.values * factors)
     direct = tuple(_verdict(found, name) for name in NAMES)
     derived = _derive(found, direct, _known_antenna(log, config), x_icr_m)
     return Calibration(

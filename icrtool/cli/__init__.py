@@ -19,15 +19,15 @@ def main() -> None:
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)
-    end_in_order(main.__code__)
     try:
-        from icrtool.cli.standard_streams import standard_streams
+        with end_in_order(main.__code__):
+            from icrtool.cli.standard_streams import standard_streams
 
-        with standard_streams() as output:
-            status = _run()
-            if output.lost:
-                sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
-                status = status or 1
+            with standard_streams() as output:
+                status = _run()
+                if output.lost:
+                    sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
+                    status = status or 1
     except KeyboardInterrupt:
         # During imports, or while a last message is printed.
         status = INTERRUPTED

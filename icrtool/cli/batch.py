@@ -44,13 +44,18 @@ if TYPE_CHECKING:
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.baseline
+@click.option(
+    "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
+)
+@click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
 @json_option
 @options.configuration
 @options.verbosity
 def command(
     places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
     redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
-    plots: str, as_json: bool,
+    plots: str, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -66,12 +71,20 @@ def command(
       icrtool batch season/ -o results --robot husky-a200
       icrtool batch logs.csv -o results -j 4 --gate "icr.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
+    from icrtool.fleet.acceptance import changes_of, format_fleet_markdown, suites_of
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
     from icrtool.fleet.fleet_files import fleet_document, write_fleet
+    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.exports.acceptance import write_junit
 
     asked = BatchOptions(
-        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite,
+        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
+        strict,
     )  # fmt: skip
+    for file in (junit, markdown):
+        if file is not None:
+            check_place(file)
+    compared = options.open_baseline(baseline, gates)
     requests = plan(places, output, asked)
     output.mkdir(parents=True, exist_ok=True)
     view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
@@ -87,14 +100,22 @@ def command(
     order = {request.row.log: number for number, request in enumerate(requests)}
     rows.sort(key=lambda row: order[row.log])
     write_fleet(rows, output)
+    missing = compared.missing(row.log for row in rows) if compared is not None else []
+    if junit is not None:
+        write_junit(junit, suites_of(rows), "batch")
+    if markdown is not None:
+        with atomic_file(markdown) as file:
+            file.write_bytes(format_fleet_markdown(rows, missing).encode("utf-8", errors="backslashreplace"))
+    if compared is not None:
+        options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
     if as_json:
         print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
     elif not quiet:
         click.echo(summary_of(rows, output))
-    if any(row.gates_failed for row in rows):
-        raise SystemExit(3)
-    if any(row.status == "failed" for row in rows):
-        raise SystemExit(1)
+    options.check_compared([(one.relative, bool(one.not_checked)) for row in rows for one in row.verdicts])
+    missed = any(row.gates_failed for row in rows)
+    if missed or any(row.status == "failed" for row in rows):
+        raise SystemExit(3 if missed else 1)
 
 
 @contextmanager
@@ -163,8 +184,7 @@ class View:
             click.echo(line_of(row))
         for verdict in row.verdicts:
             if not verdict.passed:
-                value = "no trial of that length" if verdict.value_m is None else f"{verdict.value_m:.4g} m"
-                click.echo(f"FAIL  {verdict.gate}: {value} (log {shown(row.log)})", err=True)
+                click.echo(shown(verdict.line), err=True)
         self._show()
 
     def _show(self) -> None:

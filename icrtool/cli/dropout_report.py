@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
+    from icrtool.output.baseline_file import Baseline
     from icrtool.output.exports.acceptance import Outcome
     from icrtool.output.figures.drawing_process import DrawingProcess
     from icrtool.records.dropout import Gate
@@ -43,6 +44,8 @@ class Request:
     budgets_m: tuple[float, ...]
     calibrations: tuple[Calibration, ...]
     gates: tuple[Gate, ...]
+    baseline: Baseline | None
+    strict: bool
     starts: Literal["moving", "all"]
     trials: bool
     seed: int
@@ -63,6 +66,7 @@ class Request:
 @click.option(
     "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
 )
+@options.baseline
 @click.option("--calibration", "calibrations", metavar="CAL.json", type=click.Path(path_type=Path), multiple=True,
               help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
 @click.option("--outage", "outages", metavar="SECONDS", type=POSITIVE, multiple=True,
@@ -87,7 +91,8 @@ class Request:
 def command(
     sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
     budgets: tuple[float, ...], horizons: str | None,
-    gates: tuple[str, ...], calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
+    gates: tuple[str, ...], baseline: Path | None, strict: bool,
+    calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
     junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -114,7 +119,8 @@ def command(
     request = Request(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         calibrations=tuple(open_calibration(file) for file in calibrations),
-        gates=tuple(parse_gate(text) for text in gates), starts=starts, trials=trials,
+        gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
+        starts=starts, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
         smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
     )  # fmt: skip
@@ -195,14 +201,16 @@ def report_all(
 def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdown: Path | None) -> None:
     """Write the exports, and leave with the status that the outcomes ask for."""
     from icrtool.errors import IcrToolError
-    from icrtool.output.exports.acceptance import write_junit, write_markdown
+    from icrtool.output.exports.acceptance import suite_of, write_junit, write_markdown
 
     if junit is not None:
-        write_junit(junit, outcomes)
+        write_junit(junit, [suite_of(name, outcome) for name, outcome in outcomes])
     if markdown is not None:
         write_markdown(markdown, outcomes)
     failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
     missed = any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError))
+    verdicts = [one for _, outcome in outcomes if not isinstance(outcome, IcrToolError) for one in outcome.verdicts]
+    options.check_compared([(bool(one.gate.baseline_factor), bool(one.not_checked)) for one in verdicts])
     options.leave(failed, len(outcomes), "runs and logs", gate_failed=missed)
 
 
@@ -290,12 +298,16 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
     if request.outage_at_s and not forced_lengths_s(run, outages):
         raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
     stamps = run.table.stamp_ns if request.trials else None
+    inputs = run.summary["inputs"]
+    baseline = request.baseline.find(run.name, inputs) if request.baseline is not None else None
     with report_writer(directory / DROPOUT_DIRECTORY, drawer, stamps) as writer:
         report = dropout_report(
             run,
             horizons_m=horizons,
             budgets_m=request.budgets_m,
             gates=request.gates,
+            baseline=baseline,
+            strict=request.strict,
             calibrations=request.calibrations,
             outage_s=outages,
             outage_at_s=request.outage_at_s,
@@ -307,4 +319,6 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             watch=writer.watch,
         )
         writer.finish(report)
+    if baseline is not None:
+        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
     return report

@@ -1,7 +1,10 @@
-"""Ctrl-C and SIGTERM: they end a command in order, and wait while modules are imported.
+"""Ctrl-C and SIGTERM: they end a command in order, and by force where that takes too long.
 
-An exception in the middle of an import can leave the import lock held, and other threads then wait for ever. In the
-middle of llvmlite's bookkeeping it is lost, or reported as an error of llvmlite.
+In order means by an exception in the main thread, whose handlers remove what is half written. It waits while modules
+are imported: an exception in the middle of an import can leave the import lock held, and other threads then wait for
+ever; in the middle of llvmlite's bookkeeping it is lost, or reported as an error of llvmlite. And the interpreter
+raises it only after the compiled loop, or the call of a library, that the main thread is in. So a second thread
+watches the time: after `GRACE_S` it removes what is half written and ends the process.
 """
 
 from __future__ import annotations
@@ -10,32 +13,100 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import CodeType, FrameType
+
+from icrtool.records.unfinished import remove_unfinished
 
 INTERRUPTED, TERMINATED = 130, 143
 """Exit status of a program that a signal ended: 128 plus the number of the signal."""
 
+GRACE_S = 0.5
+"""Time in which a command may end in order after a signal [s]."""
+
 LLVMLITE = f"{os.sep}llvmlite{os.sep}"
+
+OVER = 0
+"""Stands for the end of the block where the number of a signal is read."""
 
 AGAIN_S = 0.005
 """A signal that had to wait is handled again after this time [s]."""
 
 
-def end_in_order(boundary: CodeType) -> None:
-    """Have SIGINT raise KeyboardInterrupt and SIGTERM leave with `TERMINATED`, once no module is being loaded.
+@contextmanager
+def end_in_order(boundary: CodeType) -> Iterator[None]:
+    """Have SIGINT raise KeyboardInterrupt and SIGTERM leave with `TERMINATED`, at the latest after `GRACE_S`.
+
+    The exceptions come once no module is being loaded, and are still raised after the block; the limit ends with it.
 
     Parameters
     ----------
     boundary : code of the function that catches both; what is loaded further out is no matter
     """
-    if threading.current_thread() is threading.main_thread():
-        ending = _Ending(boundary)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, ending.come)
-        if hasattr(signal, "setitimer"):
-            signal.signal(signal.SIGALRM, ending.come_again)
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ending = _Ending(boundary)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, ending.come)
+    if not hasattr(signal, "setitimer"):
+        yield  # Windows
+        return
+    signal.signal(signal.SIGALRM, ending.come_again)
+    with _watched():
+        try:
+            yield
+        finally:
+            # The interpreter forgets the handler of the alarm before it ends, and the alarm would kill it.
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """End the process `GRACE_S` after a signal that is handled, if it still is in the block."""
+    arrived, signalled = os.pipe()
+    os.set_blocking(signalled, False)
+    # The system's handler of a signal writes its number there at once, whatever the interpreter is doing.
+    before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
+    over = threading.Event()
+    thread = threading.Thread(target=_watch, args=(arrived, over), name="interrupts", daemon=True)
+    # It inherits this: where the main thread holds signals, another thread must not receive them either.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGALRM})
+    thread.start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    try:
+        yield
+    finally:
+        over.set()
+        signal.set_wakeup_fd(before)
+        # The end of the pipe would not be enough: a forked process has a copy of this side.
+        os.write(signalled, bytes([OVER]))
+        os.close(signalled)
+
+
+def _watch(arrived: int, over: threading.Event) -> None:
+    """Wait for SIGINT or SIGTERM, then for the end of the block, and end the process where that does not come."""
+    while (number := os.read(arrived, 1)[0]) != OVER:
+        if number in (signal.SIGINT, signal.SIGTERM) and not over.wait(GRACE_S):
+            end_by_force(INTERRUPTED if number == signal.SIGINT else TERMINATED)
+    os.close(arrived)
+
+
+def end_by_force(status: int) -> None:
+    """Remove what this process is writing, end its processes, and end it, whatever its threads do."""
+    # No import here: the main thread may hold its lock.
+    active_children = getattr(sys.modules.get("multiprocessing"), "active_children", list)
+    for child in active_children():
+        child.kill()
+        child.join(GRACE_S / 4)
+    remove_unfinished()
+    with suppress(OSError):
+        if status == INTERRUPTED:
+            os.write(2, b"Aborted!\n")
+    os._exit(status)
 
 
 class _Ending:
@@ -44,10 +115,13 @@ class _Ending:
     def __init__(self, boundary: CodeType) -> None:
         self._boundary = boundary
         self._waiting: int | None = None
+        self._ended = False
 
     def come(self, number: int, frame: FrameType | None) -> None:
         """End the command, or wait; asked a second time, do not wait."""
-        if self._waiting is None and hasattr(signal, "setitimer") and self._loading(frame):
+        if self._ended:
+            return  # what is half written is being removed, in limited time
+        if self._waiting is None and self._loading(frame) and hasattr(signal, "setitimer"):
             self._waiting = number
             signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
         else:
@@ -71,6 +145,7 @@ class _Ending:
         if self._waiting is not None:
             self._waiting = None
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+        self._ended = hasattr(signal, "setitimer")
         if number == signal.SIGTERM:
             # Killed by a timeout or at a shutdown, a command still removes what is half written.
             sys.exit(TERMINATED)

@@ -17,6 +17,7 @@ from icrtool.records.text import LONGEST_NAME, escaped, shortened
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
+    from icrtool.output.baseline_file import Baseline
     from icrtool.output.figures.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -54,6 +55,42 @@ def place(command: Command) -> Command:
                            help="Parent of the run directories, also of one log.")(command)  # fmt: skip
     return click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path),
                         help="Run directory of a log; of several logs: its parent.")(command)  # fmt: skip
+
+
+def baseline(command: Command) -> Command:
+    """Add --baseline and --strict-gates, as `baseline` and `strict`."""
+    command = click.option("--strict-gates", "strict", is_flag=True,
+                           help="A gate on the baseline fails by its number, not only beyond the interval of the "
+                           "difference.")(command)  # fmt: skip
+    return click.option("--baseline", metavar="REPORT.json|DIR", type=click.Path(path_type=Path),
+                        help="Earlier report, run or batch to compare with; a gate may then read "
+                        "\"icr.p95@10m <= 1.1 * baseline\".")(command)  # fmt: skip
+
+
+def open_baseline(place: Path | None, gates: Sequence[str]) -> Baseline | None:
+    """Find the reports of --baseline; refuse gates that need one where there is none."""
+    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.errors import ConfigError
+    from icrtool.output.baseline_file import open_baseline
+
+    relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]
+    if place is None and relative:
+        raise ConfigError(f"gate {relative[0]!r}", "needs an earlier report", "name it with --baseline REPORT.json|DIR")
+    return open_baseline(place) if place is not None else None
+
+
+def check_compared(verdicts: Sequence[tuple[bool, bool]]) -> None:
+    """Refuse a baseline that has none of the logs: a gate that is never checked would always pass.
+
+    Parameters
+    ----------
+    verdicts : for each, whether its limit is relative to the baseline, and whether it was not checked
+    """
+    from icrtool.errors import ConfigError
+
+    relative = [not_checked for is_relative, not_checked in verdicts if is_relative]
+    if relative and all(relative):
+        raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
 
 
 def cut(command: Command) -> Command:

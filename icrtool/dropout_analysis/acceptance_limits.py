@@ -9,15 +9,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
+from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Summary
 from icrtool.records.dropout import BudgetDistance, Gate, Verdict
 from icrtool.records.tables import Floats
 
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
     r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
-    r"(?P<relation><=|>=|<|>)\s*(?P<bound>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*m?\s*$"
+    rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER})\s*m?|"
+    rf"(?:(?P<factor>{_NUMBER})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER})\s*m?)?)\s*$"
 )
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
@@ -53,47 +57,73 @@ def parse_gate(text: str) -> Gate:
     Raises
     ------
     ConfigError
-        The text is not of the form ``model.metric@HORIZONm <= bound``.
+        The text is neither of the form ``model.metric@HORIZONm <= bound`` nor ``… <= FACTOR * baseline + OFFSET m``.
     """
     match = _FORM.match(text)
     if match is None:
-        form = "model.p50|p95|expected|max@HORIZONm <= metres"
+        form = "model.p50|p95|expected|max@HORIZONm <= metres, or <= [FACTOR *] baseline [+ METRES m]"
         raise ConfigError(f"gate {text!r}", f"not of the form {form}", 'for example "icr.p95@10m <= 3.8"')
-    horizon_m, bound_m = float(match["horizon"]), float(match["bound"])
+    horizon_m = float(match["horizon"])
     if not horizon_m > 0:
         raise ConfigError(f"gate {text!r}", "a horizon of 0 m is no drive", "name a distance, for example @10m")
-    return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m)
+    factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
+    bound_m = float((match["bound"] or match["offset"] or "0").replace(" ", ""))
+    return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m, factor)
 
 
-def check_gate(gate: Gate, report: DropoutReport) -> Verdict:
+def check_gate(
+    gate: Gate, report: DropoutReport, baseline: BaselineReport | None = None, *, strict: bool = False
+) -> Verdict:
     """Compare a report with an acceptance limit.
+
+    Parameters
+    ----------
+    baseline : what a limit relative to the baseline is compared with; without one such a limit is not checked
+    strict : a relative limit is missed by the number alone, not only beyond the interval of the difference
 
     Raises
     ------
     ConfigError
-        A model or horizon that the report does not have.
+        A model or horizon that the report, or the baseline, does not have.
     """
-    result = report.result(gate.model)
-    if result is None:
-        table = report.comparison
-        compared = table.summaries if table is not None else {}
-        if table is not None and gate.model in compared:
-            return _verdict(gate, compared[gate.model], np.array(table.horizons_m), report.name)
-        known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *compared]))
-        advice = f"this run has {known}; no_slip needs robot.track_width_m"
-        raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
-    return _verdict(gate, result.summary, report.horizons_m, report.name)
-
-
-def _verdict(gate: Gate, summary: Summary, horizons_m: Floats, log: str) -> Verdict:
+    summary, horizons_m, sums = _numbers(gate, report)
     places = np.flatnonzero(np.isclose(horizons_m, gate.horizon_m))
     if not len(places):
         known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
         raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m for {gate.model}", f"use {known}")
+    h = int(places[0])
     column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
-    value = float(getattr(summary, column)[places[0]])
-    margin = gate.bound_m - value if gate.relation.startswith("<") else value - gate.bound_m
-    return Verdict(gate, value, margin, _RELATIONS[gate.relation](value, gate.bound_m), log)
+    value = float(getattr(summary, column)[h])
+    if gate.baseline_factor and baseline is None:
+        return Verdict(gate, value, math.nan, True, report.name, not_checked="this log is not in the baseline")
+    half_width, before = math.nan, math.nan
+    if gate.baseline_factor and baseline is not None:
+        row = baseline.row(gate)
+        before = row.values_m[gate.metric]
+        half_width = difference_half_width(
+            sums[h] if sums else None, row.sums, gate.metric, gate.baseline_factor,
+            same_recording=baseline.is_of(report.run_summary),
+        )  # fmt: skip
+    bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
+    margin = bound - value if gate.relation.startswith("<") else value - bound
+    passed = _RELATIONS[gate.relation](value, bound)
+    if not strict and not passed and margin + half_width >= 0.0:
+        passed = True
+    return Verdict(gate, value, margin, passed, report.name, bound, before, half_width)
+
+
+def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[BlockSums | None, ...]]:
+    """Return the numbers of the model that a gate names, its horizons, and its block sums where there are any."""
+    result = report.result(gate.model)
+    if result is not None:
+        return result.summary, report.horizons_m, result.block_sums
+    table = report.comparison
+    compared = table.summaries if table is not None else {}
+    if table is not None and gate.model in compared:
+        return compared[gate.model], np.array(table.horizons_m), ()
+    known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *compared]))
+    advice = f"this run has {known}; no_slip needs robot.track_width_m"
+    raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
 
 
 def _budget_distance(

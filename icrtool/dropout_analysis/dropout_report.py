@@ -11,6 +11,7 @@ from icrtool.calibration.model_comparison import Comparison, compare_models
 from icrtool.calibration.pooled import predictor, recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
@@ -37,6 +38,8 @@ def dropout_report(
     calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
+    baseline: BaselineReport | None = None,
+    strict: bool = False,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     watch: ReportWatch | None = None,
@@ -56,6 +59,8 @@ def dropout_report(
         ``calibration:STEM`` of its file where there are several
     comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
     reference : what trials are compared with: the filter's states or the smoother's
+    baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
+    strict : such limits are missed by the number alone, not only beyond the confidence interval of the difference
     seed : of the bootstrap
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
     watch : called with the report as it grows: with outages and single trials before the first model, after each model
@@ -97,7 +102,8 @@ def dropout_report(
     return replace(
         report,
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
-        verdicts=tuple(check_gate(gate, report) for gate in limits),
+        verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),
+        baseline=baseline,
         by_turning=split_by_turning(compared, starts=starts),
         no_comparison=why,
     )

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from icrtool.calibration.model_comparison import Ladder
     from icrtool.calibration.record import Calibration
+    from icrtool.dropout_analysis.baseline import BaselineReport
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -65,6 +66,7 @@ class DropoutReport:
     by_turning : straight and turning trials apart
     comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     calibrations : those with a row of their own
+    baseline : an earlier report that this one is compared with
     expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
 
@@ -93,6 +95,7 @@ class DropoutReport:
     no_comparison: str = ""
     calibrations: tuple[UsedCalibration, ...] = ()
     expected: tuple[str, ...] = ()
+    baseline: BaselineReport | None = None
 
     @property
     def calibration(self) -> Calibration | None:

@@ -14,6 +14,7 @@ from icrtool.dropout_analysis.reference_error import reference_error
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.block_sums import block_sums
 from icrtool.kernels.error_statistics import (
     Blocks,
     bootstrap_intervals,
@@ -318,7 +319,8 @@ def _summarise(
         summary = summarise_sorted([ordered])
         intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
-        return ModelResult(model.name, model.label, summary, intervals, (bins,))
+        sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
+        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,))
 
     return _joined(list(pool.map(summarise, range(len(blocks)))))
 
@@ -338,4 +340,5 @@ def _joined(parts: list[ModelResult]) -> ModelResult:
         Summary(*_columns(part.summary for part in parts)),
         Intervals(*_columns(part.intervals for part in parts)),
         tuple(one for part in parts for one in part.histograms),
+        tuple(one for part in parts for one in part.block_sums),
     )

@@ -41,6 +41,7 @@ class BatchOptions:
     config_file, robot, sets : as in `icrtool.load_config`; a manifest's line comes before the first two
     redo : process logs again that are done
     timeout_s : a log that takes longer is ended
+    baseline : earlier report, run or batch to compare with; `strict`: as in `icrtool.dropout_report`
     overwrite : the run of another recording may be replaced
     """
 
@@ -54,6 +55,8 @@ class BatchOptions:
     redo: bool = False
     timeout_s: float = 1800.0
     overwrite: bool = False
+    baseline: Path | None = None
+    strict: bool = False
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -80,7 +83,14 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
     searched = [place for place in places if not is_manifest(place)]
     searched += [place for entry in entries for place in entry.places]
-    return [_request(one, about(one.path, entries), output, options) for one in find_recordings(searched)]
+    baseline = ""
+    if options.baseline is not None:
+        from icrtool.output.baseline_file import open_baseline
+
+        if options.baseline.resolve() == output.resolve():
+            raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
+        baseline = open_baseline(options.baseline).digest
+    return [_request(one, about(one.path, entries), output, options, baseline) for one in find_recordings(searched)]
 
 
 def finished(request: Request) -> Row | None:
@@ -171,10 +181,11 @@ def _stage(watch: Watch, log: str) -> Callable[[str], None]:
     return lambda stage: watch(log, stage)
 
 
-def _request(one: Recording, known: About, output: Path, options: BatchOptions) -> Request:
+def _request(one: Recording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
     config = _config(one, known, options)
     document = {"config": config.effective(), "version": __version__, "plots": options.plots, "gates": options.gates,
-                "budgets": options.budgets_m, "ladder": options.ladder, "robot": known.robot}  # fmt: skip
+                "budgets": options.budgets_m, "ladder": options.ladder, "robot": known.robot,
+                "baseline": baseline, "strict": options.strict}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
     row = Row(one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot, group=known.group, tags=known.tags, key=key)
     place = blake2b(os.fsencode(one.name), digest_size=16).hexdigest()
@@ -184,6 +195,8 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions) 
         path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
         budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
+        baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
+        strict=options.strict,
     )  # fmt: skip
 
 

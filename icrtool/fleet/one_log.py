@@ -19,6 +19,7 @@ from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text,
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
+    from icrtool.records.dropout import Verdict
 
 Stage = Callable[[str], None]
 
@@ -32,6 +33,7 @@ class Request:
     path : of the log
     row : what is known of it before: names, robot, group, tags, key
     directory : of the run
+    baseline : place of an earlier report or batch to compare with; empty: none
     row_file : where the row is written, for a batch that continues this one
     """
 
@@ -45,6 +47,8 @@ class Request:
     budgets_m: tuple[float, ...] = (0.5,)
     ladder: bool = True
     overwrite: bool = False
+    baseline: bytes = b""
+    strict: bool = False
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -118,6 +122,7 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
+    from icrtool.output.baseline_file import open_baseline
     from icrtool.output.run_directory import check_target
 
     directory = path_of(request.directory)
@@ -129,7 +134,12 @@ def _results(request: Request, stage: Stage) -> Row:
     stage("writing the run")
     run.write(directory, plots=request.plots)
     stage("dropout analysis")
-    report = dropout_report(run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder)
+    place = path_of(request.baseline) if request.baseline else None
+    baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
+    report = dropout_report(
+        run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder, baseline=baseline,
+        strict=request.strict,
+    )  # fmt: skip
     stage("writing the report")
     report.write(directory / "dropout", plots=request.plots)
     return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
@@ -139,9 +149,6 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
     icr = summary["icr"]
     multiplier, multiplier_std = multiplier_of(summary)
     final, std = icr.get("final") or {}, icr.get("final_std") or {}
-    verdicts = [
-        GateVerdict(one.gate.text, _finite(one.value_m), _finite(one.margin_m), one.passed) for one in report.verdicts
-    ]
     return replace(
         request.row,
         status="done",
@@ -155,7 +162,9 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
         errors=_errors(report),
         outages=len(report.outages),
         warnings=len(summary["warnings"]),
-        verdicts=tuple(verdicts),
+        verdicts=tuple(_verdict(replace(one, log=request.row.log)) for one in report.verdicts),
+        baseline=_baseline_numbers(report),
+        changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
     )
 
@@ -171,6 +180,26 @@ def _errors(report: DropoutReport) -> dict[str, float | None]:
     for budget in report.budgets:
         errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = _finite(budget.distance_m)
     return errors
+
+
+def _verdict(one: Verdict) -> GateVerdict:
+    low, high = one.interval_m
+    return GateVerdict(
+        one.gate.text, _finite(one.value_m), _finite(one.margin_m), one.passed, one.line(),
+        bool(one.gate.baseline_factor), _finite(one.bound_m), _finite(one.baseline_m), _finite(low), _finite(high),
+        one.not_checked,
+    )  # fmt: skip
+
+
+def _baseline_numbers(report: DropoutReport) -> dict[str, float | None]:
+    """Return the baseline's p95 and expected errors under the names of `_errors`."""
+    rows = report.baseline.rows if report.baseline is not None else {}
+    return {
+        f"{model}_{metric}_{horizon_m:g}m_m": _finite(row.values_m[metric])
+        for (model, horizon_m), row in rows.items()
+        if horizon_m in HORIZONS_M and report.result(model) is not None
+        for metric in ("p95", "expected")
+    }
 
 
 def _finite(value: Any) -> float | None:  # noqa: ANN401 - a number of numpy's or Python's

@@ -26,12 +26,25 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class GateVerdict:
-    """What became of an acceptance limit."""
+    """What became of an acceptance limit; as `icrtool.records.dropout.Verdict`, None where that has NaN.
+
+    Attributes
+    ----------
+    line : the verdict in one line
+    relative : the limit is one on the baseline
+    """
 
     gate: str
     value_m: float | None
     margin_m: float | None
     passed: bool
+    line: str = ""
+    relative: bool = False
+    bound_m: float | None = None
+    baseline_m: float | None = None
+    margin_low_m: float | None = None
+    margin_high_m: float | None = None
+    not_checked: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +63,8 @@ class Row:
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
     outages, warnings : how many
+    baseline : of the same names as `errors`, numbers of the log's report in the baseline
+    changes : how log, configuration and version differ from those of the baseline
     key : hash of configuration, request and version
     """
 
@@ -73,6 +88,8 @@ class Row:
     outages: int | None = None
     warnings: int | None = None
     verdicts: tuple[GateVerdict, ...] = ()
+    baseline: dict[str, float | None] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
     inputs: tuple[File, ...] = ()
     key: str = ""
     tool_version: str = ""

@@ -24,6 +24,10 @@ import msgspec
 
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.fleet.row import Row
+from icrtool.records.unfinished import remove_unfinished
+
+GRACE_S = 0.3
+"""Time in which a process may remove what it is writing before it is killed [s]."""
 
 LONGEST_DETAILS = 4000
 """Letters kept of what a process printed before it died."""
@@ -82,15 +86,21 @@ class Worker:
         last = f": {details.splitlines()[-1]}" if details else ""
         return failed(request, f"{why}{last}", details=details, repeatable=False)
 
+    def ask_to_end(self) -> None:
+        """Close its input: it removes what it is writing, and ends."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # its other end is gone
+                self._process.stdin.close()
+
     def close(self) -> None:
         """End the process, whatever it does."""
+        self.ask_to_end()
         process, self._process = self._process, None
         if process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(GRACE_S)
             process.kill()
             process.wait()
-            if process.stdin is not None:
-                with suppress(OSError):  # its other end is gone
-                    process.stdin.close()
         if self._errors is not None:
             self._errors.close()
             self._errors = None
@@ -147,6 +157,8 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
 
 def close_all() -> None:
     """End the worker processes of all threads."""
+    for worker in list(_all):
+        worker.ask_to_end()
     while _all:
         _all.pop().close()
 
@@ -186,7 +198,8 @@ def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:
     def read() -> None:
         for line in stream:
             lines.put(line)
-        # Whoever asked is gone.
+        # Whoever asked is gone, or ends this process.
+        remove_unfinished()
         os._exit(1)
 
     threading.Thread(target=read, daemon=True).start()

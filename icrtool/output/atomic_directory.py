@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from icrtool.errors import OutputError
 from icrtool.output import disk
 from icrtool.output.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
+from icrtool.records.unfinished import end, unfinished
 
 IsOurs = Callable[[Path], bool]
 """Whether a directory is one that we wrote and may replace."""
@@ -105,11 +106,12 @@ def atomic_directory(
         for left in _hidden(place):
             _clean(left, place, names)
         partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
-        partial.mkdir()
-        with disk.locked(partial):
-            yield partial
-            check_place(place, ours, kind=kind)
-            done = _put(partial, place, kind, names, made_from)
+        with unfinished(partial):
+            partial.mkdir()
+            with disk.locked(partial):
+                yield partial
+                check_place(place, ours, kind=kind)
+                done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:
             note(f"{directory}: {done}")
@@ -155,7 +157,9 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_fro
                 place, f"holds {_listed(lost, set())}, which icrtool did not write", "move it elsewhere first"
             )
     disk.sync_tree(partial)
-    old = _exchange(partial, place) if replaces else None
+    # From here on its name may be that of the old directory, whose files are looked after below.
+    end(partial)
+    old = exchange(partial, place) if replaces else None
     if old is None:
         disk.rename(partial, place)
     disk.sync(place.parent)
@@ -169,8 +173,8 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_fro
     return f"replaced: {'; '.join(parts)}" if parts else ""
 
 
-def _exchange(partial: Path, place: Path) -> Path:
-    """Put `partial` into the place of a directory; return where that one is now."""
+def exchange(partial: Path, place: Path) -> Path:
+    """Put `partial` into the place of a directory, in one step where that can be; return where the old one is now."""
     if disk.exchange(partial, place):
         return partial
     old = partial.with_suffix(".old")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
+from icrtool.records.unfinished import unfinished
 
 
 @contextmanager
@@ -32,12 +33,13 @@ def atomic_file(file: Path) -> Iterator[Path]:
             if disk.is_abandoned(left):
                 disk.remove(left)
         partial = place.with_name(f"{prefix}{secrets.token_hex(4)}{suffix}")
-        partial.touch(exist_ok=False)
-        with disk.locked(partial):
-            yield partial
-            disk.sync(partial)
-            _check_kind(file, place)
-            disk.replace(partial, place)
+        with unfinished(partial):
+            partial.touch(exist_ok=False)
+            with disk.locked(partial):
+                yield partial
+                disk.sync(partial)
+                _check_kind(file, place)
+                disk.replace(partial, place)
         disk.sync(place.parent)
     except OSError as err:
         raise OutputError(file, "cannot be written", err.strerror or str(err)) from err

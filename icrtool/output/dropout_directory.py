@@ -16,6 +16,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
+from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
@@ -162,13 +163,19 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
             {
                 **asdict(verdict.gate),
                 "value_m": verdict.value_m,
+                "value_bound_m": verdict.bound_m,
+                "baseline_m": verdict.baseline_m,
                 "margin_m": verdict.margin_m,
+                "margin_low_m": verdict.interval_m[0],
+                "margin_high_m": verdict.interval_m[1],
+                "not_checked": verdict.not_checked or None,
                 "passed": verdict.passed,
                 "verdict": verdict.line(),
             }
             for verdict in report.verdicts
         ],
         "passed": report.passed,
+        "baseline": _baseline_document(report),
         "outages": [
             {
                 "kind": one.kind,
@@ -215,7 +222,27 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     rows = [{name: columns[name][row] for name in shared} for row in mine]
     used = next((one for one in report.calibrations if one.name == result.name), None)
     knows = used.fitted_text if used is not None else KNOWS.get(result.name)
-    return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows}
+    blocks = [
+        {"horizon_m": float(horizon), **_sums_document(sums)}
+        for horizon, sums in zip(report.horizons_m, result.block_sums, strict=False)
+        if sums is not None
+    ]
+    return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows, "blocks": blocks}
+
+
+def _sums_document(sums: BlockSums) -> dict[str, Any]:
+    """Return block sums with the digits that matter."""
+    return sums._asdict() | {"errors_m": [float(f"{error:.6g}") for error in sums.errors_m]}
+
+
+def _baseline_document(report: DropoutReport) -> dict[str, Any] | None:
+    one = report.baseline
+    if one is None:
+        return None
+    same = one.is_of(report.run_summary)
+    changes = list(one.changes(report.run_summary))
+    return {"path": one.path, "log": one.log, "tool_version": one.tool_version, "same_recording": same,
+            "changes": changes}  # fmt: skip
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from icrtool.errors import DataError, OutputError
+from icrtool.output.atomic_directory import exchange
+from icrtool.records.unfinished import unfinished
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
 
@@ -44,13 +45,16 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
         if place.is_dir() and not (place / "metadata.yaml").is_file():
             raise OutputError(place, "is a directory and no bag", "it is left alone; choose another name")
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{log.name}.", dir=log.absolute().parent) as scratch:
-            fresh = Path(scratch)
+        with (
+            tempfile.TemporaryDirectory(prefix=f".{log.name}.", dir=log.absolute().parent) as scratch,
+            unfinished(fresh := Path(scratch)),
+        ):
             yield fresh / places[0].name, fresh / places[1].name
             for place in places:
                 if place.is_dir():
-                    shutil.move(place, fresh / f"old {place.name}")
-                (fresh / place.name).replace(place)
+                    exchange(fresh / place.name, place)
+                else:
+                    (fresh / place.name).replace(place)
     except OSError as err:
         raise OutputError(log, "cannot be written", err.strerror or str(err)) from err
 

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
 from icrtool.records.tables import Floats
 
@@ -22,13 +23,14 @@ CHOICE_HORIZON_M = 10.0
 
 
 class ModelResult(NamedTuple):
-    """The errors of one model's trials, by horizon."""
+    """The errors of one model's trials, by horizon; `block_sums` has None where there is too little path."""
 
     name: str
     label: str
     summary: Summary
     intervals: Intervals
     histograms: tuple[Histogram, ...]
+    block_sums: tuple[BlockSums | None, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,13 @@ class BudgetDistance(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One acceptance limit: ``icr.p95@10m <= 3.8``."""
+    """One acceptance limit: ``icr.p95@10m <= 3.8``, or ``icr.p95@10m <= 1.1 * baseline + 0.1 m``.
+
+    Attributes
+    ----------
+    bound_m : [m] the bound, beside the share of the baseline
+    baseline_factor : what the baseline's number is multiplied with; 0 where the limit does not name the baseline
+    """
 
     text: str
     model: str
@@ -182,6 +190,7 @@ class Gate:
     horizon_m: float
     relation: str
     bound_m: float
+    baseline_factor: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +200,13 @@ class Verdict:
     Attributes
     ----------
     value_m : NaN where the log has no trial of that length
-    margin_m : negative where the limit was exceeded
+    margin_m : negative where the number exceeds the bound
+    passed : of a limit relative to the baseline also where the interval of the difference reaches the bound
     log : name of the log
+    bound_m : that of the gate, with the baseline's share
+    baseline_m : the baseline's number, NaN without one
+    half_width_m : half the 95 % confidence interval of the difference to the baseline, NaN without one
+    not_checked : why the limit was not checked; empty where it was
     """
 
     gate: Gate
@@ -200,14 +214,35 @@ class Verdict:
     margin_m: float
     passed: bool
     log: str = ""
+    bound_m: float = math.nan
+    baseline_m: float = math.nan
+    half_width_m: float = math.nan
+    not_checked: str = ""
+
+    @property
+    def interval_m(self) -> tuple[float, float]:
+        """Interval of the margin [m]; NaN without one."""
+        return self.margin_m - self.half_width_m, self.margin_m + self.half_width_m
 
     def line(self) -> str:
         """Return the verdict in one line, which names the log."""
         word = "pass" if self.passed else "FAIL"
         log = f" (log {self.log})" if self.log else ""
+        if self.not_checked:
+            return f"none  {self.gate.text}: not checked: {self.not_checked}{log}"
         if math.isnan(self.value_m):
             return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log{log}"
-        return f"{word}  {self.gate.text}: {self.value_m:.4g} m, margin {self.margin_m:+.4g} m{log}"
+        return f"{word}  {self.gate.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
+
+    def _bound_text(self) -> str:
+        margin = f", margin {self.margin_m:+.4g} m"
+        if not self.gate.baseline_factor:
+            return margin
+        interval = ", no interval"
+        if not math.isnan(self.half_width_m):
+            low, high = self.interval_m
+            interval = f" (95 %: {low:+.4g} to {high:+.4g} m)"
+        return f", bound {self.bound_m:.4g} m (baseline {self.baseline_m:.4g} m){margin}{interval}"
 
 
 class TurningSplit(NamedTuple):

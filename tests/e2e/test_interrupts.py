@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,9 @@ def command():
     import loading
     signal.pause()
 
-end_in_order(command.__code__)
 try:
-    command()
+    with end_in_order(command.__code__):
+        command()
 except KeyboardInterrupt:
     print("interrupted")
 """
@@ -69,3 +70,31 @@ def test_an_import_further_out_is_no_matter(tmp_path: Path) -> None:
 def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
     before = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); signal.pause = lambda: None\n"
     assert load(tmp_path, signal.SIGINT, before=before) == (0, ["loaded"])
+
+
+COMPUTING = """
+import hashlib, os, signal, sys, threading
+from pathlib import Path
+from icrtool.cli.interrupts import end_in_order
+from icrtool.records.unfinished import unfinished
+
+def command():
+    folder = Path(sys.argv[1])
+    with unfinished(folder):
+        folder.mkdir()
+        (folder / "file").write_text("half")
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # minutes of compiled code that looks for no signal
+
+with end_in_order(command.__code__):
+    command()
+"""
+
+
+def test_compiled_code_that_looks_for_no_signal_is_ended_and_leaves_nothing(tmp_path: Path) -> None:
+    begin = time.monotonic()
+    command = [sys.executable, "-c", COMPUTING, str(tmp_path / "half")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "")
+    assert not (tmp_path / "half").exists()
+    assert time.monotonic() - begin < 10

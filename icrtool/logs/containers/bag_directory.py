@@ -16,6 +16,7 @@ from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATI
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag
+from icrtool.records import unfinished
 from icrtool.records.tables import Ints
 
 _LARGEST_METADATA_BYTES, _MOST_FILES, _DEEPEST = 1 << 18, 10_000, 20
@@ -73,6 +74,7 @@ class BagDirectory:
             part.close()
         if self._scratch is not None:
             self._scratch.cleanup()
+            unfinished.end(Path(self._scratch.name))
 
     def begin_ns(self) -> int | None:
         """Return the log time of the first message of all files, None where one of them has no index."""
@@ -150,6 +152,7 @@ class BagDirectory:
 
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix="icrtool-")
+            unfinished.begin(Path(self._scratch.name))
         folder = Path(self._scratch.name) / str(len(self.files))
         folder.mkdir(exist_ok=True)
         target = folder / file.stem

@@ -11,6 +11,7 @@ from icrtool.errors import OutputError
 from icrtool.logs.writing.containers import write_bag, write_db3, write_mcap
 from icrtool.logs.writing.messages import load_typestore, serialise_topics
 from icrtool.logs.writing.records import Compression, Container, SensorColumns, WheelMessages, WriteOptions
+from icrtool.records.unfinished import unfinished
 
 __all__ = ["Compression", "Container", "SensorColumns", "WheelMessages", "WriteOptions", "write_log"]
 
@@ -46,15 +47,18 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
     store = load_typestore(ros1=options.container == "bag")
     topics = serialise_topics(columns, options, store)
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-            unfinished = Path(scratch) / path.name
+        with (
+            tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch,
+            unfinished(Path(scratch)),
+        ):
+            partial = Path(scratch) / path.name
             if options.container == "mcap":
-                write_mcap(unfinished, topics, store, compression=options.compression, definitions=options.definitions)
+                write_mcap(partial, topics, store, compression=options.compression, definitions=options.definitions)
             elif options.container == "bag":
-                write_bag(unfinished, topics, store, compression=options.compression)
+                write_bag(partial, topics, store, compression=options.compression)
             else:
-                write_db3(unfinished, topics, store, compression=options.compression, definitions=options.definitions)
-            unfinished.rename(path)
+                write_db3(partial, topics, store, compression=options.compression, definitions=options.definitions)
+            partial.rename(path)
     except (OSError, sqlite3.Error) as err:
         reason = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
         raise OutputError(path, "cannot be written", reason) from err

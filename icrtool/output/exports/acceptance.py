@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
+from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import atomic_file
@@ -17,27 +20,52 @@ Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
 
 
-def write_junit(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
-    """Write JUnit XML: a suite a run, a test case a gate.
+class Case(NamedTuple):
+    """One acceptance limit of a log: its text, its verdict in one line, and why it was not checked, if it was not."""
+
+    gate: str
+    passed: bool
+    line: str
+    not_checked: str = ""
+
+
+class Suite(NamedTuple):
+    """The acceptance limits of a log; `error`: why the log could not be used, empty if it could."""
+
+    log: str
+    cases: Sequence[Case] = ()
+    error: str = ""
+
+
+def suite_of(name: str, outcome: Outcome) -> Suite:
+    """Return the acceptance limits of a report, or of a log that has none."""
+    if isinstance(outcome, IcrToolError):
+        return Suite(name, error=str(outcome))
+    cases = [Case(one.gate.text, one.passed, one.line(), one.not_checked) for one in outcome.verdicts]
+    return Suite(run_title(outcome.run_summary), cases)
+
+
+def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
+    """Write JUnit XML: a suite a log, a test case a gate.
 
     Parameters
     ----------
     path : the file to make or to replace, whole or not at all
-    outcomes : name and outcome of each run; one that could not be used is a suite with one error
+    suites : a log that could not be used is a suite with one error
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    suites = ET.Element("testsuites", name="icrtool dropout-report")
-    for name, outcome in outcomes:
-        suites.append(_error_suite(name, outcome) if isinstance(outcome, IcrToolError) else _gate_suite(outcome))
-    for total in ("tests", "failures", "errors"):
-        suites.set(total, str(sum(int(suite.get(total, "0")) for suite in suites)))
-    ET.indent(suites)
+    root = ET.Element("testsuites", name=f"icrtool {command}")
+    for one in suites:
+        root.append(_suite(one, command))
+    for total in ("tests", "failures", "errors", "skipped"):
+        root.set(total, str(sum(int(suite.get(total, "0")) for suite in root)))
+    ET.indent(root)
     with atomic_file(path) as partial:
-        partial.write_bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True) + b"\n")
+        partial.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
 def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
@@ -45,7 +73,8 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 
     Parameters
     ----------
-    path, outcomes : as in `write_junit`
+    path : as in `write_junit`
+    outcomes : name and outcome of each run
 
     Raises
     ------
@@ -55,7 +84,7 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
     parts = []
     for name, outcome in outcomes:
         if isinstance(outcome, IcrToolError):
-            parts.append(f"## {_escaped(name)}\n\nCould not be used: {_escaped(str(outcome))}\n")
+            parts.append(f"## {escaped_markdown(name)}\n\nCould not be used: {escaped_markdown(str(outcome))}\n")
         else:
             parts.append(format_markdown(outcome))
     with atomic_file(path) as partial:
@@ -73,18 +102,20 @@ def format_markdown(report: DropoutReport) -> str:
                 f"{metres_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
                 for h in shown
             ]
-            rows.append([f"{_escaped(result.label)}, {label}", *cells])
+            rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
     icr, no_slip = report.result("icr"), report.result("no_slip")
     if icr is not None and no_slip is not None:
         ratios = [ratio_text(float(no_slip.summary.p95[h]), float(icr.summary.p95[h])) for h in shown]
         rows.append(["no slip : ICR, 95 %", *ratios])
-    lines = [f"## {_escaped(run_title(report.run_summary))}", ""]
+    lines = [f"## {escaped_markdown(run_title(report.run_summary))}", ""]
     if report.verdicts:
         word = "All gates passed." if report.passed else "**A gate failed.**"
-        lines += [word, "", *(f"- {_escaped(verdict.line())}" for verdict in report.verdicts), ""]
+        lines += [word, "", *(f"- {escaped_markdown(verdict.line())}" for verdict in report.verdicts), ""]
     lines += [f"Open loop from each of {report.states:,} states. In words:", ""]
-    lines += [f"- {_escaped(line)}" for line in budget_lines(report.budgets)]
+    lines += [f"- {escaped_markdown(line)}" for line in budget_lines(report.budgets)]
     lines += ["", *("| " + " | ".join(row) + " |" for row in rows)]
+    if report.baseline is not None:
+        lines += _baseline_lines(report, report.baseline)
     if report.outages:
         lines += [
             "",
@@ -99,29 +130,64 @@ def format_markdown(report: DropoutReport) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _gate_suite(report: DropoutReport) -> ET.Element:
-    name = xml_text(run_title(report.run_summary))
-    failures = sum(not verdict.passed for verdict in report.verdicts)
-    suite = _suite(name, tests=len(report.verdicts), failures=failures, errors=0)
-    for verdict in report.verdicts:
-        case = ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate.text))
-        if not verdict.passed:
-            failure = ET.SubElement(case, "failure", type="gate", message=xml_text(verdict.line()))
-            failure.text = xml_text(verdict.line())
+def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str]:
+    """Return the table against the baseline: number, difference and its 95 % interval."""
+    shown = shown_horizons(report)
+    changes = [f"- {escaped_markdown(change)}" for change in baseline.changes(report.run_summary)]
+    lines = [
+        "",
+        f"Against the baseline ({escaped_markdown(baseline.log)}, icrtool {escaped_markdown(baseline.tool_version)}):",
+        "",
+    ]
+    rows = [
+        ["difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown)],
+        ["---", *("---:" for _ in shown)],
+    ]
+    same = baseline.is_of(report.run_summary)
+    for result in report.results:
+        for label, metric, column in (
+            ("95 %", "p95", result.summary.p95),
+            ("expected", "expected", result.summary.expected),
+        ):
+            cells = []
+            for h in shown:
+                row = baseline.rows.get((result.name, float(report.horizons_m[h])))
+                before = row.values_m[metric] if row is not None else math.nan
+                difference = float(column[h]) - before
+                sums = result.block_sums[h] if result.block_sums else None
+                half = difference_half_width(
+                    sums, row.sums if row is not None else None, metric, 1.0, same_recording=same
+                )
+                interval = f" ± {metres_text(half)}" if math.isfinite(half) else ""
+                cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
+            rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
+    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), *([""] if changes else []), *changes]
+
+
+def _suite(one: Suite, command: str) -> ET.Element:
+    name = xml_text(one.log)
+    counts = {
+        "tests": len(one.cases) + bool(one.error),
+        "failures": sum(not case.passed for case in one.cases),
+        "errors": int(bool(one.error)),
+        "skipped": sum(bool(case.not_checked) for case in one.cases),
+    }
+    suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
+    for case in one.cases:
+        element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(case.gate))
+        if case.not_checked:
+            ET.SubElement(element, "skipped", message=xml_text(case.not_checked))
+        elif not case.passed:
+            failure = ET.SubElement(element, "failure", type="gate", message=xml_text(case.line))
+            failure.text = xml_text(case.line)
+        else:
+            ET.SubElement(element, "system-out").text = xml_text(case.line)
+    if one.error:
+        element = ET.SubElement(suite, "testcase", classname=name, name=command)
+        ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
     return suite
 
 
-def _error_suite(name: str, error: IcrToolError) -> ET.Element:
-    suite = _suite(xml_text(name), tests=1, failures=0, errors=1)
-    case = ET.SubElement(suite, "testcase", classname=xml_text(name), name="dropout-report")
-    ET.SubElement(case, "error", type=type(error).__name__, message=xml_text(str(error)))
-    return suite
-
-
-def _suite(name: str, *, tests: int, failures: int, errors: int) -> ET.Element:
-    return ET.Element("testsuite", name=name, tests=str(tests), failures=str(failures), errors=str(errors))
-
-
-def _escaped(text: str) -> str:
+def escaped_markdown(text: str) -> str:
     """Return text with what Markdown would take for markup escaped."""
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)

@@ -170,6 +170,8 @@ def _begin() -> None:
     """Leave an interrupt to the parent, and suppress what matplotlib prints about an unwritable home directory."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # That of the parent, which would take this process's signals for its own.
+    signal.set_wakeup_fd(-1)
     if hasattr(signal, "pthread_sigmask"):
         # Held by the parent while it forked.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})

@@ -83,7 +83,9 @@ def draw_histogram(title: str, report: DropoutReport, horizon_m: float) -> Figur
     """Draw the share of trials by error at one horizon, a panel a model, with the expected value and 95 % marked."""
     h = int(np.flatnonzero(report.horizons_m == horizon_m)[0])
     shown = (*PENS, *_constant_models(report))
-    results = [result for name in shown if (result := report.result(name)) is not None]
+    found = [result for name in shown if (result := report.result(name)) is not None]
+    # A model of constant parameters may have no trial of a length that others have.
+    results = [result for result in found if len(result.histograms[h].left)]
     figure = new_figure(
         title,
         f"Open-loop error after {horizon_m:g} m, {int(report.counts.trials[h]):,} trials",

@@ -16,7 +16,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
 from icrtool.output.atomic_file import check_place
-from icrtool.output.exports.acceptance import format_markdown, write_junit, write_markdown
+from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
 from icrtool.output.tables.dropout import (
     budget_lines,
     format_dropout,
@@ -140,7 +140,7 @@ def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_p
     strange = {**content.run_summary, "log": 'a <b> & "c" \x01', "config": {"robot": {"name": None}}}
     odd = replace(content, run_summary=strange, verdicts=content.verdicts[1:])
     error = RunError("runs/x", "edited", "fit <again> & again")
-    write_junit(tmp_path / "j.xml", [("barn", content), ("odd", odd), ("runs/x", error)])
+    write_junit(tmp_path / "j.xml", [suite_of(*one) for one in [("barn", content), ("odd", odd), ("runs/x", error)]])
     root = ET.parse(tmp_path / "j.xml").getroot()
     assert root.tag == "testsuites"
     assert {key: root.get(key) for key in ("tests", "failures", "errors")} == {
@@ -177,10 +177,10 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport, tm
 
 def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutReport, tmp_path: Path) -> None:
     (tmp_path / "j.xml").write_text("old", encoding="utf-8")
-    write_junit(tmp_path / "j.xml", [("barn", content)])
+    write_junit(tmp_path / "j.xml", [suite_of(*one) for one in [("barn", content)]])
     ET.parse(tmp_path / "j.xml")
     with pytest.raises(OutputError, match="cannot be written"):
-        write_junit(tmp_path / "missing" / "j.xml", [("barn", content)])
+        write_junit(tmp_path / "missing" / "j.xml", [suite_of(*one) for one in [("barn", content)]])
     with pytest.raises(OutputError, match="does not exist"):
         check_place(tmp_path / "missing" / "j.xml")
     with pytest.raises(OutputError, match="is a directory"):

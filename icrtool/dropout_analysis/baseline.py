@@ -1,0 +1,114 @@
+"""An earlier report to compare with: its numbers, and whether a difference is more than chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from icrtool import __version__
+from icrtool.errors import ConfigError
+from icrtool.kernels.block_sums import BlockSums, variance_of_sum
+from icrtool.records.dropout import Gate
+
+LEVEL = 0.95
+"""The interval of a difference holds the true one with this probability."""
+
+KEYS_SHOWN = 5
+
+
+class BaselineRow(NamedTuple):
+    """The numbers of one model and horizon by metric [m], and their block sums; None where the report has none."""
+
+    values_m: Mapping[str, float]
+    sums: BlockSums | None
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineReport:
+    """An earlier report.
+
+    Attributes
+    ----------
+    log : name of its log; path : of the report
+    sha256 : of the log's files
+    config : effective configuration
+    rows : by model and horizon [m]
+    """
+
+    log: str
+    path: str
+    sha256: tuple[str, ...]
+    tool_version: str
+    config: Mapping[str, Any]
+    rows: Mapping[tuple[str, float], BaselineRow]
+
+    def row(self, gate: Gate) -> BaselineRow:
+        """Return the row that a gate names.
+
+        Raises
+        ------
+        ConfigError
+            The report has no such model or horizon.
+        """
+        for (model, horizon_m), row in self.rows.items():
+            if model == gate.model and math.isclose(horizon_m, gate.horizon_m, rel_tol=1e-6):
+                return row
+        what = f"no {gate.model} over {gate.horizon_m:g} m"
+        raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
+
+    def changes(self, run_summary: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return what differs beside the numbers: log, configuration, version; a sentence each."""
+        found = []
+        if not self.is_of(run_summary):
+            found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
+        keys = sorted(_different_keys(self.config, run_summary["config"]))
+        if keys:
+            more = f" and {len(keys) - KEYS_SHOWN} more" if len(keys) > KEYS_SHOWN else ""
+            found.append(f"another configuration than in the baseline: {', '.join(keys[:KEYS_SHOWN])}{more}")
+        if self.tool_version != __version__:
+            found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
+        return tuple(found)
+
+    def is_of(self, run_summary: Mapping[str, Any]) -> bool:
+        """Return whether the report was made of the same recording as a run."""
+        return bool(self.sha256) and self.sha256 == tuple(file["sha256"] for file in run_summary["inputs"])
+
+
+def difference_half_width(
+    now: BlockSums | None, before: BlockSums | None, metric: str, factor: float, *, same_recording: bool
+) -> float:
+    """Return half the confidence interval [m] of ``number - factor * baseline``; NaN where there is none.
+
+    Parameters
+    ----------
+    same_recording : both were made of the same blocks of path, whose errors are then compared one by one
+
+    Notes
+    -----
+    Student's distribution. Of one recording: of the differences of the blocks' influences. Of two: both variances add
+    up, degrees of freedom of Welch (1947).
+    """
+    if now is None or before is None or metric == "max":
+        return math.nan
+    new, old = now.influence(metric), factor * before.influence(metric)
+    if same_recording and len(new) == len(old):
+        variance, freedom = variance_of_sum(new - old), float(len(new) - 1)
+    else:
+        parts = [(variance_of_sum(part), len(part) - 1) for part in (new, old)]
+        variance = sum(part for part, _ in parts)
+        weight = sum(part**2 / degrees for part, degrees in parts)
+        freedom = variance**2 / weight if weight > 0 else 1.0
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL)) * math.sqrt(variance)
+
+
+def _different_keys(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key in {*before, *now}:
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from _different_keys(old, new, f"{prefix}{key}.")
+        elif old != new:
+            yield f"{prefix}{key}"

@@ -1,0 +1,80 @@
+"""Acceptance limits of a batch for machines that watch pull requests: JUnit suites, and Markdown to paste."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from icrtool.fleet.row import Row
+from icrtool.output.exports.acceptance import Case, Suite, escaped_markdown
+
+SHOWN = "icr_p95_10m_m"
+"""The number of each log that is shown against the baseline."""
+
+
+def suites_of(rows: Sequence[Row]) -> list[Suite]:
+    """Return a suite per log."""
+    return [
+        Suite(row.log, [Case(one.gate, one.passed, one.line, one.not_checked) for one in row.verdicts],
+              row.reason if row.status == "failed" else "")
+        for row in rows
+    ]  # fmt: skip
+
+
+def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
+    """Return a batch as Markdown: counts, limits that were missed, every log against the baseline, what changed.
+
+    Parameters
+    ----------
+    missing : logs of the baseline that the batch does not have
+    """
+    counts = Counter(row.status for row in rows)
+    failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
+    lines = [f"## {len(rows)} logs", ""]
+    lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
+    if any(row.verdicts for row in rows):
+        lines += [f"**{len(failed_gates)} gates failed.**" if failed_gates else "All gates passed.", ""]
+    shown = [(row, one) for row in rows for one in row.verdicts]
+    if shown:
+        shown.sort(key=lambda pair: pair[1].passed)
+        lines += ["| log | gate | number | baseline | bound | margin | 95 % interval | verdict |",
+                  "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |"]  # fmt: skip
+        for row, one in shown:
+            interval = f"{one.margin_low_m:+.3f} to {one.margin_high_m:+.3f} m" if one.margin_low_m is not None and (
+                one.margin_high_m is not None) else "-"  # fmt: skip
+            verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
+            numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
+            cells = [escaped_markdown(row.log), escaped_markdown(one.gate), *numbers, interval, verdict]
+            lines.append(f"| {' | '.join(cells)} |")
+        lines.append("")
+    lines += ["| log | 95 % after 10 m, ICR | baseline | difference |", "| --- | ---: | ---: | ---: |"]
+    for row in rows:
+        if row.status == "failed":
+            lines.append(f"| {escaped_markdown(row.log)} | could not be used: {escaped_markdown(row.reason)} | | |")
+            continue
+        now, before = row.errors.get(SHOWN), row.baseline.get(SHOWN)
+        difference = f"{now - before:+.3f} m" if now is not None and before is not None else "-"
+        lines.append(f"| {escaped_markdown(row.log)} | {_metres(now)} | {_metres(before)} | {difference} |")
+    changes = changes_of(rows, missing)
+    return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
+
+
+def changes_of(rows: Sequence[Row], missing: Sequence[str]) -> list[str]:
+    """Return how the logs, their configuration and the version differ from those of the baseline, a sentence each."""
+    found = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
+    new = [row.log for row in rows if row.status != "failed" and not row.baseline]
+    if new and len(new) < len(rows):
+        found.append(f"not in the baseline: {', '.join(new)}")
+    by_change: dict[str, list[str]] = {}
+    for row in rows:
+        for change in row.changes:
+            by_change.setdefault(change, []).append(row.log)
+    found += [
+        f"{', '.join(logs) if len(logs) < len(rows) or len(rows) == 1 else 'all logs'}: {change}"
+        for change, logs in by_change.items()
+    ]
+    return found
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"

@@ -1,0 +1,171 @@
+"""Baselines on disk: a report.json, a run, a folder of runs, or the folder of a batch."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrtool.dropout_analysis.baseline import BaselineReport, BaselineRow
+from icrtool.errors import ConfigError
+from icrtool.kernels.block_sums import BlockSums
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
+
+FLEET_FILE = "fleet.json"
+
+METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
+
+ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The reports of a baseline, read when they are needed.
+
+    Attributes
+    ----------
+    path : as it was named
+    reports : report.json by name of the log
+    sha256 : of each log's files, where it is known without reading the report
+    digest : changes with the content
+    """
+
+    path: Path
+    reports: Mapping[str, Path]
+    sha256: Mapping[str, tuple[str, ...]]
+    digest: str
+
+    def missing(self, logs: Iterable[str]) -> list[str]:
+        """Return the logs of the baseline that are not among some others, by name."""
+        return sorted(set(self.reports) - set(logs))
+
+    def find(self, name: str, inputs: Sequence[Mapping[str, Any]]) -> BaselineReport | None:
+        """Return the report of a log: that of the same content, else of the same name; None where there is none.
+
+        A baseline that is one report file is that of any log.
+
+        Raises
+        ------
+        ConfigError
+            The report cannot be read.
+        """
+        content = {file["sha256"] for file in inputs}
+        found = next((log for log, files in self.sha256.items() if content and content <= set(files)), None)
+        if found is None and self.path.is_file():
+            found = next(iter(self.reports))
+        found = found if found is not None else name if name in self.reports else None
+        return read_report(self.reports[found], found) if found is not None else None
+
+
+def open_baseline(path: Path) -> Baseline:
+    """Find the reports of a baseline.
+
+    Raises
+    ------
+    ConfigError
+        There is none, or one cannot be read.
+    """
+    if path.is_file():
+        reports = {str(_document(path)["run"]["log"]): path}
+    elif (path / FLEET_FILE).is_file():
+        return _fleet_baseline(path)
+    else:
+        reports = {}
+        for file in _report_files(path):
+            log = str(_document(file)["run"]["log"])
+            if log in reports:
+                raise ConfigError(
+                    f"--baseline {path}", f"two reports of logs named {log}", f"{reports[log]} and {file}"
+                )
+            reports[log] = file
+    if not reports:
+        raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
+    files = {
+        log: tuple(str(one["sha256"]) for one in _document(file)["run"]["inputs"]) for log, file in reports.items()
+    }
+    digest = sha256(b"".join(file.read_bytes() for file in reports.values())).hexdigest()
+    return Baseline(path, reports, files, digest)
+
+
+def read_report(path: Path, log: str) -> BaselineReport:
+    """Read a report.json as a baseline.
+
+    Raises
+    ------
+    ConfigError
+        It is not a dropout report.
+    """
+    document = _document(path)
+    try:
+        run = document["run"]
+        rows = dict(_rows(document))
+        content = tuple(str(one["sha256"]) for one in run["inputs"])
+        return BaselineReport(log, str(path), content, str(document["tool_version"]), dict(run["config"]), rows)
+    except (LookupError, TypeError, ValueError, AttributeError) as err:
+        raise ConfigError(f"--baseline {path}", "not a whole dropout report", "make it again") from err
+
+
+def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:
+    """Yield the rows of a report; those of the model comparison first, which others of the same name replace."""
+    ladder = document.get("ladder") or {}
+    for model in ladder.get("models", ()):
+        for h, horizon_m in enumerate(ladder["horizons_m"]):
+            values = {metric: _number(model[column][h]) for metric, column in METRICS.items()}
+            yield (model["name"], float(horizon_m)), BaselineRow(values, None)
+    for model in document["models"]:
+        sums = {float(one["horizon_m"]): _sums(one) for one in model.get("blocks", ())}
+        for row in model["by_horizon"]:
+            values = {metric: _number(row[column]) for metric, column in METRICS.items()}
+            yield (model["name"], float(row["horizon_m"])), BaselineRow(values, sums.get(float(row["horizon_m"])))
+
+
+def _sums(one: Mapping[str, Any]) -> BlockSums:
+    trials, p50, p95 = (np.array(one[name], np.int64) for name in ("trials", "above_p50", "above_p95"))
+    errors = np.array(one["errors_m"], np.float64)
+    if not trials.shape == p50.shape == p95.shape == errors.shape or errors.ndim != 1 or len(errors) < 2:
+        raise ValueError("blocks of unequal number")
+    return BlockSums(trials, errors, p50, p95, float(one["p50_slope_m"]), float(one["p95_slope_m"]))
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _fleet_baseline(path: Path) -> Baseline:
+    """Return the baseline of a batch: its fleet.json names logs, content and runs."""
+    try:
+        content = (path / FLEET_FILE).read_bytes()
+        logs = [one for one in json.loads(content)["logs"] if one["status"] != "failed"]
+        reports = {str(one["log"]): path / one["run"] / DROPOUT_DIRECTORY / REPORT_FILE for one in logs}
+        files = {str(one["log"]): tuple(str(file["sha256"]) for file in one["inputs"]) for one in logs}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
+        raise ConfigError(f"--baseline {path}", f"its {FLEET_FILE} cannot be read", ADVICE) from err
+    present = {log: file for log, file in reports.items() if file.is_file()}
+    if not present:
+        raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
+    return Baseline(path, present, {log: files[log] for log in present}, sha256(content).hexdigest())
+
+
+def _report_files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        raise ConfigError(f"--baseline {path}", "no such file or directory", ADVICE)
+    if (path / REPORT_FILE).is_file():
+        return [path / REPORT_FILE]
+    return sorted(path.glob(f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"))
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+        schema = document["schema"]
+        if isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY) and document["run"]["log"]:
+            return dict(document)
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
+        raise ConfigError(f"--baseline {path}", "cannot be read", ADVICE) from err
+    raise ConfigError(f"--baseline {path}", "not a dropout report", ADVICE)

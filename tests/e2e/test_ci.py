@@ -1,0 +1,115 @@
+"""docs/ci.md: its commands are run as they stand there, and gates on a baseline decide the exit status."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from icrtool.cli import main
+from icrtool.fleet.one_log import decode_request, process
+from icrtool.fleet.row import Row
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^\s+(?:- )?(?:run: )?icrtool (.*)$", PAGE, re.MULTILINE)
+RATES = ("--duration", "40", "--wheel-rate", "20", "--gnss-rate", "5", "--heading-rate", "20", "--gnss", "0.002")
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["icrtool", *arguments])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return int(left.value.code or 0)
+
+
+def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> Row:
+    """Process a log of a batch without a process of its own, which would load all libraries again."""
+    return process(decode_request(request), lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with logs, in which the commands of the page were run one after the other."""
+    place = tmp_path_factory.mktemp("repository")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
+        Path("logs").mkdir()
+        for seed, name in enumerate(("field", "other")):
+            log = f"logs/{name}.mcap"
+            assert call(patch, "simulate", "-q", "--robot", "husky-a200", "-o", log, "--seed", str(seed), *RATES) == 0
+        assert len(COMMANDS) == 4
+        for number, command in enumerate(COMMANDS):
+            status = call(patch, *shlex.split(command), "-q", "--plots", "none")
+            assert status == 0, command
+            if number == 1:
+                Path("gates.xml").rename("github.xml")
+    return place
+
+
+def test_the_jobs_of_the_page_write_what_they_pass_on(place: Path) -> None:
+    for file in ("github.xml", "gates.xml"):
+        suites = ET.parse(place / file).getroot().findall("testsuite")
+        assert [suite.get("name") for suite in suites] == ["field.mcap", "other.mcap"]
+        assert all(case.find("failure") is None for suite in suites for case in suite)
+    text = (place / "summary.md").read_text(encoding="utf-8")
+    assert "All gates passed" in text
+    assert text.count("field.mcap") >= 2
+    row = json.loads((place / "results" / "fleet.json").read_bytes())["logs"][0]
+    assert row["verdicts"][0]["baseline_m"] == row["verdicts"][0]["value_m"]
+    assert row["baseline"]["icr_p95_5m_m"] == row["errors"]["icr_p95_5m_m"]
+
+
+def test_a_gate_beyond_the_interval_fails_and_says_where(place: Path, icrtool, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(place)
+    run = place / "icrtool-runs" / "field"
+    gate = "icr_final.p95@2m <= 0.01 * baseline"
+    status, out, err = icrtool(
+        "dropout-report", run, "--baseline", "baseline", "--gate", gate, "--plots", "none", "--junit",
+        tmp_path / "j.xml", "--markdown", tmp_path / "m.md", "--no-ladder",
+    )  # fmt: skip
+    assert status == 3, err
+    assert re.search(r"FAIL .*0\.01 \* baseline: .* m, bound .* margin -.* \(95 %: -.*\(log field\)", out)
+    assert ET.parse(tmp_path / "j.xml").getroot().get("failures") == "1"
+    text = (tmp_path / "m.md").read_text(encoding="utf-8")
+    assert "difference to the baseline" in text
+    report = json.loads((run / "dropout" / "report.json").read_bytes())
+    assert report["baseline"]["same_recording"] is True
+    assert report["gates"][0]["margin_high_m"] < 0
+
+
+def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place: Path, icrtool, monkeypatch) -> None:
+    monkeypatch.chdir(place)
+    monkeypatch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
+    baseline = place / "alone"
+    (baseline / "runs").mkdir(parents=True)
+    document = json.loads((place / "baseline" / "fleet.json").read_bytes())
+    for one in document["logs"]:
+        one["tool_version"] = "0.0"
+        if one["log"] == "field.mcap":
+            one["log"], one["inputs"] = "gone.mcap", []
+        (baseline / one["run"] / "dropout").mkdir(parents=True)
+        report = (place / "baseline" / one["run"] / "dropout" / "report.json").read_text(encoding="utf-8")
+        (baseline / one["run"] / "dropout" / "report.json").write_text(report, encoding="utf-8")
+    (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
+    command = ("batch", "logs", "-o", "results", "--robot", "husky-a200", "--plots", "none", "--baseline", "alone")
+    gate = ("--gate", "icr.p95@5m <= 2 * baseline")
+    status, out, err = icrtool(*command, *gate, "--set", "filter.process_icr_mps=0.011", "--json", "--junit", "j.xml")
+    assert status == 0, err
+    for part in ("gone.mcap", "field.mcap", "filter.process_icr_mps"):
+        assert part in err
+    rows = {row["log"]: row for row in json.loads(out)["logs"]}
+    assert rows["field.mcap"]["verdicts"][0]["not_checked"]
+    assert not rows["other.mcap"]["verdicts"][0]["not_checked"]
+    assert ET.parse(place / "j.xml").getroot().get("skipped") == "1"
+    for one in document["logs"]:
+        one["log"], one["inputs"] = f"x{one['log']}", []
+    (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
+    assert icrtool(*command, *gate)[0] == 1
+    assert icrtool("batch", "logs", "-o", "results", *gate)[0] == 1, "a gate on a baseline needs one"
+    assert icrtool("batch", "logs", "-o", "results", "--baseline", "results")[0] == 1

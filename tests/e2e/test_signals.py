@@ -1,0 +1,139 @@
+"""Ctrl-C and SIGTERM at any moment: a command ends within a second, and leaves no process and no partial file."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+
+LOG = Path(__file__).parents[2] / "sample_logs" / "wheeled_lawnmower.mcap"
+ROBOT = ("--robot", "segway-rmp400")
+COMMANDS = {
+    "fit": ("fit", "{log}", *ROBOT, "-o", "run"),
+    "fit again": ("fit", "{log}", *ROBOT, "-o", "{run}"),
+    "dropout-report": ("dropout-report", "{run}", "-o", "report"),
+    "calibrate": ("calibrate", "{run}", "-o", "calibration.json"),
+    "batch": ("batch", "{folder}", *ROBOT, "-o", "season", "-j", "2"),
+    "study": ("study", "consistency", "--runs", "400", "-o", "study"),
+    "simulate": ("simulate", "-o", "log.mcap", "--duration", "3000"),
+}
+LONGEST_S = 1.0
+BUSY = 3.0
+"""A machine that tests run on does other things too."""
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A log, a folder with two, and a run."""
+    folder = tmp_path_factory.mktemp("logs")
+    for name in ("one.mcap", "two.mcap"):
+        shutil.copy(LOG, folder / name)
+    run = tmp_path_factory.mktemp("run") / "run"
+    command = [sys.executable, "-P", "-m", "icrtool", "fit", str(LOG), *ROBOT, "-o", str(run), "--plots", "none", "-q"]
+    subprocess.run(command, check=True, timeout=120)
+    return {"log": LOG, "folder": folder, "run": run}
+
+
+def processes_with(mark: str) -> list[int]:
+    """Return the processes whose environment holds a mark."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            ended = (place / "stat").read_text().rsplit(")", 1)[1].split()[0] in "ZX"
+            if not ended and mark.encode() in (place / "environ").read_bytes():
+                found.append(int(place.name))
+        except OSError:
+            continue
+    return found
+
+
+def interrupt(
+    arguments: Sequence[str], places: dict[str, Path], folder: Path, number: int, after_s: float
+) -> tuple[float | None, list[str]]:
+    """Send a signal to a command after some time; return how long it took to end, and what is wrong.
+
+    None where the command had ended before.
+    """
+    mark = secrets.token_hex(8)
+    work, temporary = folder / mark, folder / f"{mark}-tmp"
+    work.mkdir(parents=True)
+    temporary.mkdir()
+    given = {name: str(path) for name, path in places.items()}
+    if arguments[-1] == "{run}":
+        # Its run is replaced: it must be there, the old one or the new one.
+        given["run"] = str(shutil.copytree(places["run"], work / "run"))
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "icrtool", *(each.format(**given) for each in arguments)],
+        cwd=work, env={**os.environ, "MARK_OF_TEST": mark, "TMPDIR": str(temporary)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(after_s)
+    begin = time.monotonic()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    took = time.monotonic() - begin
+    if process.returncode == 0:
+        return None, []
+    wrong = []
+    # A busy machine may still be starting the interpreter, which a signal then ends in its own manner.
+    starting = process.returncode == -number
+    if not starting and process.returncode != 128 + number:
+        wrong.append(f"exit status {process.returncode}: {errors}")
+    if "Traceback" in errors and not starting:
+        wrong.append(errors)
+    end = time.monotonic() + 2
+    while (left := processes_with(mark)) and time.monotonic() < end:
+        time.sleep(0.05)
+    wrong += [f"process {one} is left" for one in left]
+    wrong += [f"left: {path}" for path in temporary.iterdir()]
+    wrong += [f"left: {path}" for path in work.rglob("*") if path.suffix in (".partial", ".old")]
+    wrong += [f"left: {path}" for path in work.iterdir() if path.name.startswith(".")]
+    if arguments[-1] == "{run}" and not (work / "run" / "run.json").exists():
+        wrong.append("the run is gone")
+    shutil.rmtree(work)
+    shutil.rmtree(temporary)
+    return took, wrong
+
+
+def check(names: Sequence[str], places: dict[str, Path], folder: Path, count: int, longest_s: float) -> None:
+    """Interrupt commands at random moments, two at the same time."""
+    rng = np.random.default_rng(0)
+    jobs = [
+        (name, (signal.SIGINT, signal.SIGTERM)[i % 2], float(rng.uniform(0.3, longest_s)))
+        for i in range(count)
+        for name in names
+    ]
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(lambda job: interrupt(COMMANDS[job[0]], places, folder, job[1], job[2]), jobs))
+    wrong = [f"{job}: {each}" for job, (_, errors) in zip(jobs, done, strict=True) for each in errors]
+    took = {job: seconds for job, (seconds, _) in zip(jobs, done, strict=True) if seconds is not None}
+    slow = [f"{job}: {seconds:.1f} s" for job, seconds in took.items() if seconds > BUSY * LONGEST_S]
+    if took:
+        ordered = np.sort(list(took.values()))
+        print(f"{len(took)} of {len(jobs)} interrupted, median {np.median(ordered):.2f} s, longest {ordered[-5:]}")
+    assert not wrong + slow, "\n".join(wrong + slow)
+    assert took
+
+
+def test_each_command_ends_at_once(places: dict[str, Path], tmp_path: Path) -> None:
+    check(["fit again", "dropout-report", "batch", "study"], places, tmp_path, 1, 3.0)
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("name", COMMANDS)
+def test_at_many_moments(places: dict[str, Path], tmp_path: Path, name: str) -> None:
+    check([name], places, tmp_path, 40, 8.0)

@@ -1,0 +1,192 @@
+"""Limits on a baseline: the interval of a difference holds, and a limit fails only beyond it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
+from icrtool.dropout_analysis.baseline import difference_half_width
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.errors import ConfigError
+from icrtool.kernels.block_sums import BlockSums, block_sums
+from icrtool.kernels.error_statistics import cut_blocks, sort_trials, summarise
+from icrtool.output.baseline_file import open_baseline, read_report
+from icrtool.records.run import Run
+
+HORIZON = 100
+"""Starts per horizon of the made errors."""
+
+
+def moving_sums(rng: np.random.Generator, starts: int) -> np.ndarray:
+    """Errors of overlapping trials: each is the size of a sum of what happened over the horizon."""
+    white = rng.normal(0.0, 1.0, (2, starts + HORIZON))
+    sums = np.cumsum(white, axis=1)
+    return np.hypot(*(sums[:, HORIZON:] - sums[:, :-HORIZON])) / math.sqrt(HORIZON)
+
+
+def sums_of(errors: np.ndarray) -> tuple[BlockSums, dict[str, float]]:
+    blocks = cut_blocks(np.isfinite(errors), np.arange(len(errors), dtype=float), float(HORIZON))
+    summary = summarise(errors[:, np.newaxis])
+    found = block_sums(errors, blocks, sort_trials(errors), float(summary.p50[0]), float(summary.p95[0]))
+    assert found is not None
+    return found, {"expected": float(summary.expected[0]), "p50": float(summary.p50[0]), "p95": float(summary.p95[0])}
+
+
+def test_block_sums_are_sums() -> None:
+    errors = moving_sums(np.random.default_rng(1), 3000)
+    found, numbers = sums_of(errors)
+    assert found.trials.sum() == len(errors)
+    assert found.errors_m.sum() / len(errors) == pytest.approx(numbers["expected"])
+    assert found.above_p95.sum() == np.count_nonzero(errors > numbers["p95"])
+    for metric in numbers:
+        assert abs(found.influence(metric).sum()) < 1e-3
+    assert block_sums(errors[:200], None, errors, 1.0, 2.0) is None
+
+
+@pytest.mark.parametrize(("metric", "least"), [("expected", 0.90), ("p50", 0.90), ("p95", 0.88)])
+def test_the_interval_of_two_recordings_holds_no_difference(metric: str, least: float) -> None:
+    rng = np.random.default_rng(7)
+    held = 0
+    for _ in range(300):
+        (a, now), (b, before) = sums_of(moving_sums(rng, 3000)), sums_of(moving_sums(rng, 4500))
+        half = difference_half_width(a, b, metric, 1.0, same_recording=False)
+        held += abs(now[metric] - before[metric]) <= half
+    assert least <= held / 300 <= 0.99
+
+
+def test_one_recording_is_compared_block_by_block() -> None:
+    rng = np.random.default_rng(3)
+    errors = moving_sums(rng, 4000)
+    changed = 1.05 * errors + 0.02 * moving_sums(rng, 4000)
+    a, b = sums_of(changed)[0], sums_of(errors)[0]
+    for metric in ("expected", "p95"):
+        paired = difference_half_width(a, b, metric, 1.0, same_recording=True)
+        apart = difference_half_width(a, b, metric, 1.0, same_recording=False)
+        assert paired < 0.3 * apart
+    assert difference_half_width(b, b, "p95", 1.0, same_recording=True) == 0.0
+    assert math.isnan(difference_half_width(a, b, "max", 1.0, same_recording=True))
+    assert math.isnan(difference_half_width(None, b, "p95", 1.0, same_recording=True))
+
+
+@pytest.mark.parametrize(
+    ("text", "factor", "bound"),
+    [
+        ("icr.p95@10m <= 1.1 * baseline", 1.1, 0.0),
+        ("icr.p95@10m<=baseline+0.1m", 1.0, 0.1),
+        ("icr.p95@10m <= baseline + 0.1 m", 1.0, 0.1),
+        ("icr.p95@10m >= .9*baseline - 0.2", 0.9, -0.2),
+        ("icr.p95@10m <= baseline", 1.0, 0.0),
+        ("icr.p95@10m <= 0.4 m", 0.0, 0.4),
+    ],
+)
+def test_limits_on_a_baseline_are_read(text: str, factor: float, bound: float) -> None:
+    gate = parse_gate(text)
+    assert (gate.baseline_factor, gate.bound_m) == (factor, bound)
+
+
+@pytest.mark.parametrize(
+    "text", ["icr.p95@10m <= baseline * ", "icr.p95@10m <= baseline 0.1", "icr.p95@10m <= 2 baseline"]
+)
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="not of the form"):
+        parse_gate(text)
+
+
+@pytest.fixture(scope="module")
+def report(run: Run) -> DropoutReport:
+    return dropout_report(run, horizons_m=[1.0, 2.0, 5.0])
+
+
+@pytest.fixture
+def written(report: DropoutReport, tmp_path: Path) -> Path:
+    report.write(tmp_path / "dropout", plots=())
+    return tmp_path / "dropout" / "report.json"
+
+
+def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) -> None:
+    baseline = open_baseline(written).find("any", [])
+    assert baseline is not None
+    for model in ("icr", "recommended"):
+        verdict = check_gate(parse_gate(f"{model}.p95@2m <= baseline"), report, baseline)
+        assert verdict.passed
+        assert verdict.margin_m == 0.0
+        result = report.result(model)
+        assert result is not None
+        assert verdict.baseline_m == result.summary.p95[1]
+    held_out = next(one.name for one in report.comparison.rungs if report.result(one.name) is None)
+    assert check_gate(parse_gate(f"{held_out}.p95@5m <= baseline"), report, baseline).margin_m == 0.0
+    stored, made = baseline.rows["icr", 2.0].sums, report.result("icr").block_sums[1]
+    for name, column in made._asdict().items():
+        np.testing.assert_allclose(getattr(stored, name), column, rtol=1e-5)
+
+
+def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, written: Path) -> None:
+    baseline = read_report(written, "earlier")
+    gate = parse_gate("icr.p95@2m <= 0.97 * baseline")
+    verdict = check_gate(gate, report, replace(baseline, sha256=("other",)))
+    assert verdict.margin_m < 0 < verdict.interval_m[1]
+    assert verdict.passed
+    assert not check_gate(gate, report, baseline, strict=True).passed
+    far = check_gate(parse_gate("icr_final.p95@2m <= 0.1 * baseline"), report, baseline)
+    assert not far.passed
+    assert far.interval_m[1] < 0
+    for part in (
+        "0.1 * baseline",
+        f"{far.value_m:.4g} m",
+        f"{far.bound_m:.4g} m",
+        f"{far.margin_m:+.4g} m",
+        report.name,
+    ):
+        assert part in far.line()
+    unknown = check_gate(gate, report)
+    assert unknown.passed
+    assert unknown.not_checked
+    with pytest.raises(ConfigError, match="over 3 m"):
+        baseline.row(replace(gate, horizon_m=3.0))
+
+
+def test_what_changed_is_listed(run: Run, report: DropoutReport, written: Path) -> None:
+    baseline = read_report(written, "earlier")
+    config = json.loads(json.dumps(baseline.config))
+    config["filter"]["gate_probability"] = 0.5
+    changes = replace(baseline, tool_version="0.0", config=config, sha256=("x",)).changes(report.run_summary)
+    assert [
+        any(part in change for change in changes) for part in ("another recording", "filter.gate_probability", "0.0")
+    ]
+    assert all(
+        any(part in change for change in changes) for part in ("recording", "filter.gate_probability", "with 0.0")
+    )
+
+
+def test_a_baseline_is_found_by_content_then_by_name(run: Run, report: DropoutReport, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        report.write(tmp_path / "runs" / name / "dropout", plots=())
+        file = tmp_path / "runs" / name / "dropout" / "report.json"
+        document = json.loads(file.read_bytes())
+        document["run"]["log"], document["run"]["inputs"] = name, [{"path": name, "bytes": 1, "sha256": f"sum-{name}"}]
+        file.write_text(json.dumps(document), encoding="utf-8")
+    baseline = open_baseline(tmp_path / "runs")
+    found = baseline.find("b", [{"sha256": "sum-a"}])
+    assert found is not None
+    assert found.log == "a"
+    found = baseline.find("b", [{"sha256": "other"}])
+    assert found is not None
+    assert found.log == "b"
+    assert baseline.find("c", [{"sha256": "other"}]) is None
+    assert baseline.missing(["a"]) == ["b"]
+
+
+@pytest.mark.parametrize(("old", "new"), [("}", ""), ("by_horizon", "x"), ("icrtool/dropout/", "other/")])
+def test_what_is_no_report_is_refused(written: Path, old: str, new: str) -> None:
+    written.write_text(written.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match="baseline"):
+        read_report(written, "x")
+    with pytest.raises(ConfigError, match="baseline"):
+        open_baseline(written.parent / "nothing")
