@@ -59,9 +59,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
             if heading.is_estimated
             else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
         ),
-        heading_correlation_s=heading.applied_correlation_s
-        if heading.is_estimated
-        else max(config.filter.heading_correlation_s, heading.applied_correlation_s),
+        heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
         heading_is_estimated=heading.is_estimated,
         attitude=None if found.derived is None else found.derived.attitude,
         losses_ns=quality.losses_ns,

@@ -48,7 +48,7 @@ MOST_EVENTS = 2000
 """The likelihood looks at so many events."""
 
 NOISES = {
-    "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0]),
+    "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
     "bias": np.radians([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0]),
     "course": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
     "slip": np.array([0.003, 0.01, 0.02, 0.04, 0.08, 0.16]),

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.gnss_steps import unbroken
-from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
+from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, WHEELS_CORRELATION_S, DerivedHeading
 from icrtool.alignment.heading_offset_cause import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -24,9 +24,6 @@ OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over gro
 
 EXPLAINED = 0.8
 """Mean resultant length of heading minus course over ground above which they are one direction."""
-
-SPIN_RATIO = 3.0
-"""A window is a spin where the difference of the sides' distances exceeds their mean by this factor."""
 
 NEAR_RAD, NEAR_SHARE = math.radians(45.0), 0.6
 """A heading without agreement is refused where no offset brings this share of the windows this near to the course
@@ -48,7 +45,7 @@ class CourseAngles(NamedTuple):
     ----------
     angle : (w,) heading minus course over ground [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading of the other handedness
-    scattered : windows in which fixes and wheels moved on, but the wheels laid along the heading did not
+    scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
     noise_rad : standard deviation of `angle` by the noise of the fixes
     duration_s : median duration of a window
     """
@@ -78,10 +75,10 @@ class CourseAngles(NamedTuple):
 def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
-    v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
+    v = (drive.v_left + drive.v_right) / 2
     psi = np.interp(drive.wheel_t + drive.wheel_dt / 2, drive.heading_t, drive.heading)
 
-    def between(rate: Floats | Complexes) -> Complexes:
+    def between(rate: Complexes) -> Complexes:
         total = np.concatenate([[0.0], np.cumsum((rate * drive.wheel_dt)[:-1])])
         at = np.interp(drive.fix_t, drive.wheel_t, total)
         return np.asarray(at[end] - at[begin], np.complex128)
@@ -89,12 +86,11 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
     seen = drive.fix[end] - drive.fix[begin]
     laid, other = between(v * np.exp(1j * psi)), between(v * np.exp(-1j * psi))
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
-    spun = between(2.0 * np.abs(u)).real > SPIN_RATIO * between(np.abs(v)).real
     moved = went & led
     return CourseAngles(
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
-        int(np.count_nonzero(went & ~led & ~spun)),
+        int(np.count_nonzero(went & ~led)),
         drive.fix_std_m * math.sqrt(2.0) / windows.length_m,
         float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
     )
@@ -226,10 +222,11 @@ def align_estimated_heading(
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
     std = derived.estimate.median_std
+    correlation_s = WHEELS_CORRELATION_S if derived.source == "wheels_course" else 0.0
     own = HeadingAlignment(
         source=derived.source, parts=derived.why, windows=0, offset_rad=0.0, offset_std_rad=std, scatter_rad=math.nan,
         agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
-        applied_std_rad=0.0, applied_correlation_s=derived.correlation_s, std_rad=std, name=NO_NAME,
+        applied_std_rad=0.0, applied_correlation_s=correlation_s, std_rad=std, name=NO_NAME,
         warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
     )  # fmt: skip
     if stated is None or derived.attitude_offset is None:

@@ -24,12 +24,16 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
-LARGEST_RATE_HZ = 100.0
+LARGEST_RATE_HZ = 20.0
+RESPONSE_S = 0.1
+"""A robot answers its wheels by up to this much later or earlier: in turns the filter's wheels do not predict a heading
+better than that, and the ICRs must not learn it (`icrtool.alignment.estimator.RESPONSE_STD_S`)."""
+
 WHEELS_CORRELATION_S = 5.0
 """A heading estimated with the wheels errs alike for about this long: a few courses."""
 
 LEAST_OFFSET_SIGMAS = 4.0
-LARGEST_SPREAD = 3.0
+LARGEST_SPREAD = 2.0
 """Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
 
 LONGEST_HOLE_S = 1.0
@@ -63,22 +67,15 @@ class DerivedHeading:
     attitude_offset: tuple[float, float] | None
     why: str
 
-    @property
-    def correlation_s(self) -> float:
-        """How long the filter takes its errors to be correlated.
-
-        An estimate by a gyro is the best one at each moment; one by the wheels holds what the filter does with them.
-        """
-        return WHEELS_CORRELATION_S if self.source == "wheels_course" else 0.0
-
     def apply(self, log: RobotLog) -> RobotLog:
-        """Return the log with the causal heading, and the turn rate that agrees with it."""
-        rate = 1e9 / float(np.median(np.diff(self.causal.stamp_ns)))
-        stream = StreamChoice(
-            "heading", self.topic, "estimated", len(self.causal.stamp_ns), rate, "header", 0.0, self.why
-        )
+        """Return the log with the causal heading, for the filter, and the turn rate that agrees with it."""
+        heading = self.causal
+        rate = 1e9 / float(np.median(np.diff(heading.stamp_ns)))
+        stream = StreamChoice("heading", self.topic, "estimated", len(heading.stamp_ns), rate, "header", 0.0, self.why)
         streams = (*(one for one in log.streams if one.role != "heading"), stream)
-        return replace(log, heading=self.causal, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
+        turned = np.gradient(np.unwrap(heading.heading_rad), (heading.stamp_ns - heading.stamp_ns[0]) / 1e9)
+        heading = replace(heading, var_rad2=heading.var_rad2 + (RESPONSE_S * turned) ** 2)
+        return replace(log, heading=heading, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
 
 
 def stated_source(log: RobotLog) -> Source:
