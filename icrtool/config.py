@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import stat
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -15,11 +16,14 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from icrtool.errors import ConfigError
-from icrtool.records.text import LONGEST_NAME, shortened
+from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20
 MOST_LISTED = 1000
 """Horizons, or outages."""
+
+_BARE_POINT = re.compile(r"(?<![\w.])(?=\.\d)|(?<=\d\.)(?![\w.])|(?<=\d\.)(?=[eE])")
+"""Places in numbers where TOML, but no person, asks for a zero."""
 
 Horizon = Annotated[float, msgspec.Meta(ge=0.001, le=1e5)]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
@@ -201,13 +205,15 @@ def parse_config(document: Mapping[str, Any]) -> Config:
     sections, given = {}, []
     for name, values in document.items():
         if name not in SECTIONS:
-            raise ConfigError(name, "unknown configuration key", f"the sections are {', '.join(SECTIONS)}")
+            meant = did_you_mean(name, SECTIONS)
+            raise ConfigError(name, "unknown configuration key", f"{meant}the sections are {', '.join(SECTIONS)}")
         if not isinstance(values, Mapping):
             raise ConfigError(name, "this is a section of the configuration", _found(values))
         known = [key.name for key in fields(SECTIONS[name])]
         for key, value in values.items():
             if key not in known:
-                raise ConfigError(f"{name}.{key}", "unknown configuration key", f"[{name}] knows {', '.join(known)}")
+                listed = f"{did_you_mean(key, known)}[{name}] knows {', '.join(known)}"
+                raise ConfigError(f"{name}.{key}", "unknown configuration key", listed)
             if flaw := _flaw(value):
                 raise ConfigError(f"{name}.{key}", flaw, _found(value))
         sections[name] = _parse_section(name, values)
@@ -218,6 +224,11 @@ def parse_config(document: Mapping[str, Any]) -> Config:
 def builtin_robots() -> dict[str, dict[str, Any]]:
     """Return the robots known by name, with the source of their numbers."""
     return tomllib.loads(resources.files("icrtool").joinpath("robots.toml").read_text(encoding="utf-8"))
+
+
+def key_texts() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return by section and key what it means (``text``), and an ``example`` where it has no default."""
+    return tomllib.loads(resources.files("icrtool").joinpath("config_keys.toml").read_text(encoding="utf-8"))
 
 
 def load_config(path: str | Path | None = None, robot: str | None = None, sets: Iterable[str] = ()) -> Config:
@@ -256,7 +267,8 @@ def _builtin_robot(name: str) -> dict[str, Any]:
         raise ConfigError(
             f"robot {name!r}",
             "not a built-in robot",
-            f"one of {', '.join(robots)}, or --set robot.track_width_m=… robot.wheel_radius_m=…",
+            f"{did_you_mean(name, robots)}the robots are {', '.join(robots)}; of another one, give "
+            "--set robot.track_width_m=… and --set robot.wheel_radius_m=…",
         )
     return {"name": name, **{key: value for key, value in robots[name].items() if key != "source"}}
 
@@ -287,13 +299,19 @@ def _parse_set(text: str) -> dict[str, Any]:
         )
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except RecursionError as err:
-        raise ConfigError(key.strip(), "its value is nested too deeply") from err
-    except ValueError:
-        parsed = value.strip()
-    return {section: {name: parsed}}
+    return {section: {name: _parse_value(value, key.strip())}}
+
+
+def _parse_value(value: str, key: str) -> Any:  # noqa: ANN401 - whatever TOML holds
+    """Return a value as TOML reads it, with numbers as people type them (``.08``, ``1.``); else it is a text."""
+    for text in (value, _BARE_POINT.sub("0", value)):
+        try:
+            return tomllib.loads(f"value = {text}")["value"]
+        except RecursionError as err:
+            raise ConfigError(key, "its value is nested too deeply") from err
+        except ValueError:
+            continue
+    return value.strip()
 
 
 def _found(value: object) -> str:
@@ -334,8 +352,24 @@ def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
             key, _, message = str(err).partition(": ")
             why, _, advice = message.partition("; ")
             raise ConfigError(f"{name}.{key}", why, advice) from err
-        expected = _described(get_type_hints(SECTIONS[name], include_extras=True)[key])
-        raise ConfigError(f"{name}.{key}", f"expected {expected}", _found(values[key])) from err
+        raise ConfigError(f"{name}.{key}", f"expected {describe_key(name, key)}", _found(values[key])) from err
+
+
+def describe_key(section: str, key: str) -> str:
+    """Return the type of a key and its bounds, as in ``a number > 0 and ≤ 20``."""
+    return _described(get_type_hints(SECTIONS[section], include_extras=True)[key])
+
+
+def words_of_key(section: str, key: str) -> tuple[str, ...]:
+    """Return the words that a key takes, as ``auto``; empty where it is no key, or takes none."""
+    if section not in SECTIONS:
+        return ()
+    return _literals(get_type_hints(SECTIONS[section]).get(key))
+
+
+def _literals(kind: Any) -> tuple[str, ...]:  # noqa: ANN401 - a type, as annotations have it
+    parts = get_args(kind)
+    return parts if get_origin(kind) is Literal else tuple(word for part in parts for word in _literals(part))
 
 
 def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it

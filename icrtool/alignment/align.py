@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.findings import alignment_findings, start_icrs
+from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
 from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
@@ -65,14 +65,14 @@ def align(log: RobotLog, config: Config) -> Measurements:
         losses_ns=quality.losses_ns,
         icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
     )
-    # preset paper believes its wheels
+    # preset paper takes its wheels as they are
     if config.filter.preset == "field":
         sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
     return Measurements(
         sensors=sensors,
         findings=alignment_findings(found, aligned.antenna_m),
         sections={
-            "wheels": wheels.summary(),
+            "wheels": wheels.summary() | window_summary(found.fit),
             "heading": heading.summary() | delays.heading_summary(),
             "gnss": delays.gnss_summary(),
         },

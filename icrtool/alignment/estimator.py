@@ -80,13 +80,29 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
+class WindowResiduals(NamedTuple):
+    """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
+
+    Attributes
+    ----------
+    before, after : (2, w) along and across the heading [m], prediction minus measurement
+    turn_before, turn_after : (u,) of the heading changes [rad]; turn_rad : (u,) as measured
+    """
+
+    before: Floats
+    after: Floats
+    turn_before: Floats
+    turn_after: Floats
+    turn_rad: Floats
+
+
 class AlignmentFit(NamedTuple):
     """The parameters in the order of `NAMES`, with covariance.
 
     Attributes
     ----------
     fit : the robust fit; width_m : b that w was formed with
-    windows : DriveWindows it was made of
+    windows : DriveWindows it was made of, cut from drive
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
@@ -94,6 +110,7 @@ class AlignmentFit(NamedTuple):
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
+    drive: DriveArrays
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -129,6 +146,19 @@ class AlignmentFit(NamedTuple):
         # at one speed, positions that lag look like an antenna further back
         covariance[2, 2] += (self.turning_speed_mps * RESPONSE_STD_S) ** 2
         return Geometry(values, covariance)
+
+
+def window_residuals(found: AlignmentFit) -> WindowResiduals:
+    """Return the residuals of all windows before and after the estimate."""
+    model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
+    neutral = PRIOR_MEAN.copy()
+    neutral[K] = found.fit.x[K]
+    parts = []
+    for x in (neutral, found.fit.x):
+        residual, _ = model.evaluate(x)
+        parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
+    (before, turn_before), (after, turn_after) = parts
+    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
 
 
 def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
@@ -179,7 +209,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
     weight = drive.wheel_dt * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed)
+    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive)
 
 
 class _Model:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from icrtool.alignment.corrections import AlignedStreams
-from icrtool.alignment.estimator import Geometry
+from icrtool.alignment.estimator import AlignmentFit, Geometry
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, IcrStart
 from icrtool.records.run import half_width_m
@@ -68,6 +68,15 @@ def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> di
         "y_icr_left_m": Finding(left + right_m, std[1], 0.0, START),
         "x_icr_m": Finding(x + forward_m, std[2], 0.0, START),
     }
+
+
+def window_summary(fit: AlignmentFit | None) -> dict[str, float | int | None]:
+    """Return how many windows wheels and positions were compared in, of how many stretches, and their scatter [m]."""
+    if fit is None:
+        return {"windows": 0, "stretches": 0, "residual_m": None}
+    count = len(fit.windows.begin)
+    along, across = fit.fit.scale[[0, count]].tolist()
+    return {"windows": count, "stretches": fit.fit.groups, "residual_m": math.hypot(along, across)}
 
 
 def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:

@@ -151,6 +151,19 @@ def _metres_per_unit(
             f"needed to read {topic}, which is in {unit}",
             f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
         )
-    how = f", 1 unit = {scale.value:.5g} ± {scale.std:.2g} m (found from the position reference; {unit})"
+    how = f"{_SCALE_WORDS.get(unit, 'travel of a unit of the wheels')} {_with_std(scale)} m"
+    how += " (estimated from the position reference)"
     why = "no unit that the robot's keys know fits" if radius and counts else f"{lacking} is not given"
-    return scale.value, how, [f"{why}{how}"]
+    return scale.value, f", {how}", [f"{why}: {how}"]
+
+
+_SCALE_WORDS: dict[WheelUnit, str] = {"rad": "wheel radius", "counts": "travel of a count"}
+
+
+def _with_std(scale: Scale) -> str:
+    """Return a scale with its standard deviation, of which one digit is shown, two if the first is a 1."""
+    if not 0.0 < scale.std < math.inf:
+        return f"{scale.value:.4g}"
+    digits = -math.floor(math.log10(scale.std)) + (scale.std < 2 * 10 ** math.floor(math.log10(scale.std)))
+    digits = max(digits, 0)
+    return f"{scale.value:.{digits}f} ± {scale.std:.{digits}f}"

@@ -42,6 +42,10 @@ def _run() -> int:
         from icrtool.cli.commands import icrtool
         from icrtool.errors import IcrToolError
 
+        if "_ICRTOOL_COMPLETE" in os.environ:
+            from icrtool.cli.completion import register
+
+            register()
         try:
             status = icrtool.main(standalone_mode=False)
         except IcrToolError as err:

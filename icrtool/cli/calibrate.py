@@ -10,11 +10,9 @@ import click
 from icrtool.cli import options
 
 if TYPE_CHECKING:
-    from icrtool.calibration.findings import Calibration as Findings
-    from icrtool.calibration.pooled import CalibrationResult
+    from icrtool.calibration.one_log import LogCalibration
     from icrtool.config import Config
     from icrtool.records.run import Run
-    from icrtool.records.tables import RobotLog
 
 
 @click.command("calibrate")
@@ -52,9 +50,10 @@ def command(
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
       icrtool calibrate icrtool-runs/* -o calibration.json
     """  # noqa: D301 - click reads the escape
+    from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import IcrToolError
     from icrtool.output.calibration_file import calibration_file, write_calibration
-    from icrtool.output.figures.calibration_picture import check_picture, write_picture
+    from icrtool.output.figures.calibration_picture import check_picture
     from icrtool.output.tables.calibration import format_calibration
     from icrtool.output.tables.held_out import format_result
 
@@ -65,31 +64,31 @@ def command(
         calibration_file(output)
     if plot is not None:
         check_picture(plot)
-    findings = _findings(sources[0], config, x_icr, quiet=quiet, verbose=verbose) if len(sources) == 1 else None
+    runs = _runs(sources, config, quiet=quiet)
+    sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
     try:
-        result = _pooled(sources, config, quiet=quiet)
+        result = calibrate_runs(runs)
     except IcrToolError as err:
-        if findings is None:
+        if sensors is None:
             raise
         options.warn([f"no motion model: {err}"], quiet=quiet)
     texts = [format_result(result)] if result is not None else []
     document = result.calibration.summary() if result is not None else {}
-    if findings is not None:
-        texts.append(format_calibration(findings))
-        document = findings.summary() | document | {"alignment": findings.summary()["parameters"]}
+    if sensors is not None:
+        texts.append(format_calibration(sensors))
+        document = sensors.summary() | document | {"alignment": sensors.summary()["parameters"]}
     if output is not None:
         texts.append(f"written to {write_calibration(document, output)}")
-    if plot is not None and findings is not None:
-        write_picture(findings, plot)
+    if plot is not None:
+        _draw(sources[0], runs[0], plot)
         texts.append(f"drawn to {plot}")
     if not quiet:
         click.echo("\n\n".join(texts))
 
 
-def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> CalibrationResult:
-    """Fit and test the motion models on all sources."""
-    from icrtool.calibration.from_runs import calibrate_runs
+def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:
+    """Read runs, and fit logs."""
     from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
@@ -103,7 +102,7 @@ def _pooled(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> Calibr
             found.append(_run(source, config))
             if progress is not None:
                 progress((i + 1) / len(sources))
-    return calibrate_runs(found)
+    return found
 
 
 def _run(source: Path, config: Config) -> Run:
@@ -120,35 +119,27 @@ def _run(source: Path, config: Config) -> Run:
     return fit(read_log(source, config), config)
 
 
-def _findings(source: Path, config: Config, x_icr: float | None, *, quiet: bool, verbose: bool) -> Findings:
-    """Estimate antenna, offsets, delays and scales of one log."""
-    from icrtool.calibration.findings import calibrate
+def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> LogCalibration:
+    """Return what one log shows of antenna, offsets, delays and scales."""
+    from icrtool.calibration.one_log import calibrate_log
 
-    log, config = _read(source, config, quiet=quiet)
-    found = calibrate(log, config, x_icr_m=x_icr)
-    options.warn(log.warnings, quiet=quiet)
+    options.warn(run.warnings, quiet=quiet)
     if verbose:
-        for stream in log.streams:
-            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
-    return found
+        for stream in run.summary["streams"]:
+            click.echo(f"{stream['role']}: {stream['topic']}: {stream['why']}", err=True)
+    return calibrate_log(run, x_icr_m=x_icr)
 
 
-def _read(source: Path, config: Config, *, quiet: bool) -> tuple[RobotLog, Config]:
-    """Read a log, or the log of a run with the run's configuration."""
+def _draw(source: Path, run: Run, plot: Path) -> None:
+    """Draw the residuals of one log's alignment."""
+    from icrtool.alignment.corrections import align_streams
+    from icrtool.alignment.estimator import window_residuals
+    from icrtool.alignment.wheel_units import with_wheel_speeds
     from icrtool.logs import read_log
-    from icrtool.output.run_directory import is_run_directory
+    from icrtool.output.figures.calibration_picture import write_picture
+    from icrtool.output.stored_run import log_of
 
-    path = source
-    if is_run_directory(source):
-        from icrtool.errors import ConfigError
-        from icrtool.output.stored_run import log_of, open_run
-
-        if config.given_sections:
-            section = min(config.given_sections)
-            raise ConfigError(
-                f"[{section}]", "a finished run keeps the configuration it was made with", "name its log instead"
-            )
-        run = open_run(source)
-        path, config = log_of(run), run.config
-    with options.progress_bar(f"reading {path.name}", quiet=quiet) as progress:
-        return read_log(path, config, progress), config
+    log = read_log(source if run.directory is None else log_of(run), run.config)
+    fit = align_streams(with_wheel_speeds(log, run.config), run.config).fit
+    if fit is not None:
+        write_picture(run.name, window_residuals(fit), plot)

@@ -7,15 +7,19 @@ import importlib
 import click
 
 from icrtool import __version__
+from icrtool.records.text import did_you_mean
 
 _COMMANDS = {
     "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
     "calibrate": "Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.",
     "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
-    "export": "Print the calibration of a run or of a file for a robot's controller or filter.",
+    "completion": "Print what bash, zsh or fish needs to complete commands, robots, keys and topics.",
+    "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
+    "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
+    "robots": "List the built-in robots, with their numbers and sources.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
@@ -33,6 +37,16 @@ class _Commands(click.Group):
         module = importlib.import_module(f"icrtool.cli.{cmd_name.replace('-', '_')}")
         command: click.Command = module.command
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as err:
+            if args[0] not in _COMMANDS and (meant := did_you_mean(args[0], _COMMANDS)):
+                raise click.UsageError(f"No such command {args[0]!r}: {meant.strip()}", ctx) from err
+            raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

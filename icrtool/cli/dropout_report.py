@@ -13,6 +13,8 @@ import click
 from icrtool.cli import options
 from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
 from icrtool.cli.options import POSITIVE
+from icrtool.cli.stages import Stages
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -269,21 +271,25 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     from icrtool.output.run_directory import check_target, replaced_log, write_run
 
     check_target(directory, log, overwrite=request.overwrite)
-    with options.progress_bar(f"reading {log.name}", quiet=request.quiet) as progress:
+    notes: list[str] = []
+    with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
         from icrtool.logs import read_log
 
-        measured = read_log(log, request.config, progress)
-    from icrtool.estimation.fit import fit
+        stages.begin("reading")
+        measured = read_log(log, request.config, stages.share)
+        from icrtool.estimation.fit import fit
 
-    run = fit(measured, request.config, smooth=request.smoothed)
-    notes: list[str] = []
-    if (before := replaced_log(directory, run)) is not None:
-        notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
-    write_run(run, directory, drawer=drawer, note=notes.append)
+        run = fit(measured, request.config, smooth=request.smoothed, watch=stages.begin)
+        if (before := replaced_log(directory, run)) is not None:
+            notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
+        stages.begin("writing, pictures" if request.formats else "writing")
+        write_run(run, directory, drawer=drawer, note=notes.append)
     options.warn((*run.warnings, *notes), quiet=request.quiet)
     if request.verbose:
+        from icrtool.records.samples import ROLE_WORDS
+
         for stream in measured.streams:
-            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
     return run
 
 
@@ -300,7 +306,11 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
     stamps = run.table.stamp_ns if request.trials else None
     inputs = run.summary["inputs"]
     baseline = request.baseline.find(run.name, inputs) if request.baseline is not None else None
-    with report_writer(directory / DROPOUT_DIRECTORY, drawer, stamps) as writer:
+    with (
+        Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages,
+        report_writer(directory / DROPOUT_DIRECTORY, drawer, stamps) as writer,
+    ):
+        stages.begin("dropout analysis")
         report = dropout_report(
             run,
             horizons_m=horizons,
@@ -318,6 +328,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             sink=writer.sink,
             watch=writer.watch,
         )
+        stages.begin("dropout report, pictures" if request.formats else "dropout report")
         writer.finish(report)
     if baseline is not None:
         options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)

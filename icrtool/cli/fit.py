@@ -10,6 +10,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.stages import Stages
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -187,31 +188,36 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
 
     check_target(directory, log, overwrite=request.overwrite)
     start = _warm_start(request.warm_start) if request.warm_start is not None else None
-    with options.progress_bar(f"reading {LogText(log.name)}", quiet=request.quiet) as progress:
+    notes: list[str] = []
+    with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
         from icrtool.logs import read_log
 
+        stages.begin("reading")
         options.load_ahead("pymap3d", "icrtool.estimation.fit")
-        measured = read_log(log, request.config, progress, start=request.start, end=request.end)
-    from icrtool.estimation.fit import fit
+        measured = read_log(log, request.config, stages.share, start=request.start, end=request.end)
+        from icrtool.estimation.fit import fit
 
-    run = fit(
-        measured,
-        request.config,
-        warm_start=start,
-        changes_s=request.changes_s,
-        smooth=request.smooths,
-    )
-    notes: list[str] = []
-    if (before := replaced_log(directory, run)) is not None:
-        notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
-    write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
+        run = fit(
+            measured,
+            request.config,
+            warm_start=start,
+            changes_s=request.changes_s,
+            smooth=request.smooths,
+            watch=stages.begin,
+        )
+        if (before := replaced_log(directory, run)) is not None:
+            notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
+        stages.begin("writing, pictures" if request.formats else "writing")
+        write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
     options.warn((*run.warnings, *_other_robot(request, start), *notes), quiet=request.quiet)
     if not request.prints_nothing:
         from icrtool.output.tables.run import format_run
 
         click.echo(format_run(run))
         click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
+    from icrtool.records.samples import ROLE_WORDS
+
     for stream in measured.streams:
         if request.verbose or ("chosen over" in stream.why and not request.quiet):
-            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
     return run

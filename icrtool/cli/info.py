@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import click
 from icrtool.cli import options
 from icrtool.cli.fit import logs_of
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.stages import Stages
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -47,11 +49,12 @@ def command(
     for log in logs:
         found = Found(log)
         try:
-            _examine(found, config, (start, end), quiet=quiet)
+            with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
+                _examine(found, config, (start, end), stages)
         except IcrToolError as err:
             found.problem = err
         if not (quiet or as_json):
-            _print(found, everything=verbose)
+            _print(found, config, _options(config_file, robot, sets, start, end), everything=verbose)
         options.warn(found.warnings, quiet=quiet)
         if found.problem is not None:
             failed.append(log)
@@ -82,7 +85,7 @@ class Found:
         return self.survey.problems if self.survey is not None else ()
 
 
-def _examine(found: Found, config: Config, part: tuple[str | None, str | None], *, quiet: bool) -> None:
+def _examine(found: Found, config: Config, part: tuple[str | None, str | None], stages: Stages) -> None:
     """Read and fit a log: only the filter shows which ICRs the drive determines, and which sensors disagree.
 
     Raises
@@ -95,30 +98,40 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
     from icrtool.logs.table_file import is_table
 
     start, end = part
+    stages.begin("reading")
     if is_table(found.log):
         found.measured = read_log(found.log, config, start=start, end=end)
     else:
-        with options.progress_bar(f"reading {LogText(found.log.name)}", quiet=quiet) as progress:
-            found.survey = survey_log(found.log, config, progress, start=start, end=end)
+        found.survey = survey_log(found.log, config, stages.share, start=start, end=end)
         found.measured = assemble(found.survey, config)
     found.measured = with_wheel_speeds(found.measured, config)
     from icrtool.estimation.fit import fit
 
-    found.run = fit(found.measured, config)
+    found.run = fit(found.measured, config, watch=stages.begin)
 
 
-def _print(found: Found, *, everything: bool) -> None:
-    """Print what a log holds."""
+def _print(found: Found, config: Config, given: Sequence[str], *, everything: bool) -> None:
+    """Print what a log holds, whether it can be fitted, and the command to run next."""
     from icrtool.logs.describe import describe_log, describe_survey
+    from icrtool.output.tables.overview import next_line, overview_lines, verdict_lines
 
     if found.survey is not None:
         click.echo(describe_survey(found.survey, found.measured, everything=everything))
     elif found.measured is not None:
         click.echo(describe_log(found.measured))
-    if found.run is not None:
-        from icrtool.output.tables.run import excitation_lines
+    lines = overview_lines(found.measured, found.run) if found.measured is not None else []
+    lines += verdict_lines(found.run, found.problem, config)
+    command = next_line(escaped(str(found.log)), given, found.run)
+    click.echo("\n".join(["", *lines, *([command] if command is not None else [])]))
 
-        click.echo("\n".join(excitation_lines(found.run)))
+
+def _options(
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], start: str | None, end: str | None
+) -> list[str]:
+    """Return the options of this call that the next command takes too."""
+    pairs = [("--config", config_file), ("--robot", robot), *(("--set", one) for one in sets)]
+    pairs += [("--from", start), ("--to", end)]
+    return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]
 
 
 def _document(found: Found) -> dict[str, Any]:

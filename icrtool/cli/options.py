@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -12,9 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from icrtool.cli.stages import Stages
 from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
     from icrtool.output.baseline_file import Baseline
@@ -38,14 +40,26 @@ def configuration(command: Command) -> Command:
         click.option(
             "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."
         ),
-        click.option("--robot", metavar="NAME", help="Built-in robot, for example husky-a200, jackal, warthog."),
-        click.option(
-            "--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, help="Set a configuration key; repeatable."
-        ),
-    )
+        click.option("--robot", metavar="NAME", shell_complete=_robots,
+                     help="Built-in robot, for example husky-a200; icrtool robots lists them."),
+        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
+                     help="Set a configuration key; icrtool config lists them; repeatable."),
+    )  # fmt: skip
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _robots(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_robot
+
+    return complete_robot(ctx, param, incomplete)
+
+
+def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from icrtool.cli.completion import complete_setting
+
+    return complete_setting(ctx, param, incomplete)
 
 
 def place(command: Command) -> Command:
@@ -165,16 +179,10 @@ def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
 
 @contextmanager
 def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that moves a bar on a terminal; None where there is no terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
-
-        def move(share: float) -> None:
-            bar.update(int(1000 * min(share, 1.0)) - bar.pos)
-
-        yield move
+    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+    with Stages(label, quiet=quiet) as stages:
+        stages.begin("")
+        yield stages.share if stages.on_terminal else None
 
 
 def load_ahead(*modules: str) -> None:

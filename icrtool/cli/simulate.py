@@ -215,13 +215,13 @@ def command(
     config = simulated_robot(config_file, robot, sets)
     plan, sensors = _plan(config, given), _sensors(config, given)
     writing = _write_options(log, config, sensors, given)
-    from icrtool.logs.writing.log import SensorColumns, write_log
+    from icrtool.logs.writing.log import write_log
     from icrtool.output.truth_file import log_and_truth, truth_path, write_truth
     from icrtool.simulation.record import simulate
 
     with log_and_truth(log, force=given["force"]) as (fresh_log, fresh_truth):
         recorded, truth = simulate(plan, sensors, given["seed"])
-        write_log(fresh_log, SensorColumns(**recorded.columns()), writing)
+        write_log(fresh_log, recorded, writing)
         write_truth(truth, fresh_truth)
     if not quiet:
         click.echo(_summary(config, plan, truth, given))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from icrtool.alignment.align import align
 from icrtool.config import Config
 from icrtool.estimation import smooth as smoother
@@ -18,6 +20,7 @@ def fit(
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
     smooth: bool = False,
+    watch: Callable[[str], None] | None = None,
 ) -> Run:
     """Learn a robot's track ICRs from a log.
 
@@ -28,6 +31,7 @@ def fit(
     warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
     changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
     smooth : also make the states of the RTS smoother
+    watch : called with the name of each stage when it begins
 
     Returns
     -------
@@ -47,8 +51,13 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
+    begin = watch if watch is not None else _ignore
+    begin("aligning")
     measurements = align(log, config)
+    begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
+    smoothed = smoother.smooth(filtered, config) if smooth else None
+    begin("summary")
     return Run(
         name=log.name,
         config=config,
@@ -58,6 +67,10 @@ def fit(
         sensors=filtered.sensors,
         gnss=filtered.gnss,
         heading=filtered.heading,
-        smoothed=smoother.smooth(filtered, config) if smooth else None,
+        smoothed=smoothed,
         summary=summarise(log, measurements, filtered, config),
     )
+
+
+def _ignore(stage: str) -> None:
+    """Take no notice of a stage."""

@@ -101,7 +101,7 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
     Notes
     -----
     The drive cannot tell an antenna off the centre line from sides that slip unequally: only the difference shows
-    (`icrtool.calibration.calibrate`). So nothing is moved.
+    (`icrtool.calibration.one_log`). So nothing is moved.
     """
     if not _turns(table):
         return []

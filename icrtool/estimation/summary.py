@@ -106,6 +106,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "heading_from_position": sensors.heading_from_position,
                 "heading_is_estimated": sensors.heading_is_estimated,
                 "antenna_m": sensors.antenna_m,
+                "antenna_is_known": measurements.antenna_is_known,
                 "states": len(table),
                 "warm_start": warm_start_summary(filtered.began_with),
                 "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),

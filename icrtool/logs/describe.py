@@ -10,7 +10,10 @@ from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
 from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
-from icrtool.records.tables import Ints, RobotLog, rate_and_jitter
+from icrtool.records.samples import ROLE_WORDS
+from icrtool.records.tables import Ints, RobotLog, Role, rate_and_jitter
+
+Sources = Sequence[WheelMotion | PositionSource | HeadingSource]
 
 GAP_IN_INTERVALS = 5.0
 
@@ -28,12 +31,13 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
     lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
     lines += _topics(survey, everything=everything)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
-    for role, sources in (
+    candidates: tuple[tuple[Role, Sources], ...] = (
         ("wheels", survey.candidates.wheels),
         ("gnss", survey.candidates.gnss),
         ("heading", survey.candidates.heading),
-    ):
-        lines.append(f"\n{role} (* chosen):")
+    )
+    for role, sources in candidates:
+        lines.append(f"\n{ROLE_WORDS[role]} (key topics.{role}; * chosen):")
         lines += _candidates(sources, chosen[role].topic if role in chosen else None)
         if role in chosen:
             stream = chosen[role]
@@ -57,7 +61,7 @@ def describe_log(log: RobotLog) -> str:
     lines = [f"{log.name}: table"]
     for stream in log.streams:
         samples = f"{stream.count} samples at {stream.rate_hz:.4g} Hz, jitter {stream.jitter_ms:.3g} ms"
-        lines.append(f"  {stream.role}: {stream.topic}: {samples}; {stream.why}")
+        lines.append(f"  {ROLE_WORDS[stream.role]}: {stream.topic}: {samples}; {stream.why}")
     return "\n".join(lines)
 
 
@@ -105,7 +109,7 @@ def _count(number: int, word: str) -> str:
     return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
-def _candidates(sources: Sequence[WheelMotion | PositionSource | HeadingSource], chosen: str | None) -> list[str]:
+def _candidates(sources: Sources, chosen: str | None) -> list[str]:
     if not sources:
         return ["  no candidate"]
     lines = []

@@ -15,6 +15,9 @@ Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 Role = Literal["wheels", "gnss", "heading"]
 
+ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}
+"""What a role is called in messages: a position may come from a lidar."""
+
 
 NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
 """How a message states that its position was solved: not stated, without carrier phase (or unknown), RTK float, RTK

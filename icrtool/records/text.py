@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Self
 
 LONGEST_NAME = 80
@@ -9,6 +10,10 @@ LONGEST_NAME = 80
 
 LONGEST_MESSAGE = 4000
 """Characters of an error or a warning that are printed."""
+
+
+LEAST_LIKENESS, LEAST_LETTERS = 0.6, 3
+"""A word is proposed from this similarity on (`difflib`), or where it contains what was given, of so many letters."""
 
 
 class LogText(str):
@@ -68,3 +73,14 @@ def shortened(text: str, longest: int) -> str:
         return text
     head = (longest - 1) // 2
     return f"{text[:head]}…{text[head + 1 - longest :]}"
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ``did you mean X? `` for the known word that is most like `word`, for a message; empty where none is."""
+    from difflib import get_close_matches
+
+    choices = {str(choice).lower(): str(choice) for choice in known}
+    given = word.lower()
+    near = get_close_matches(given, choices, n=1, cutoff=LEAST_LIKENESS)
+    near = near or [choice for choice in choices if len(given) >= LEAST_LETTERS and given in choice][:1]
+    return f"did you mean {choices[near[0]]}? " if near else ""

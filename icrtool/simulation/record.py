@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
+from icrtool.records.sensor_columns import SensorColumns
 from icrtool.records.tables import Floats, Ints
 from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sense
 
@@ -18,38 +18,6 @@ HEIGHT_STD_RATIO = 2.0
 LARGEST_RTK_STD_M = 0.05
 LARGEST_SBAS_STD_M = 0.6
 """NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorRecord:
-    """Readings as a robot records them; the fields are those of `icrtool.logs.writing.records.SensorColumns`.
-
-    Attributes
-    ----------
-    wheel_stamp_ns, gnss_stamp_ns, heading_stamp_ns : int64, of the wheels' clock
-    latitude_deg, longitude_deg, height_m : (m,) WGS 84
-    gnss_std_m : (m,); gnss_status : int64 (m,) of NavSatStatus
-    heading_rad : (h,) clockwise from north, in (-pi, pi]
-    """
-
-    wheel_stamp_ns: Ints
-    wheel_position_left_m: Floats
-    wheel_position_right_m: Floats
-    wheel_v_left_mps: Floats
-    wheel_v_right_mps: Floats
-    gnss_stamp_ns: Ints
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    gnss_std_m: Floats
-    gnss_status: Ints
-    heading_stamp_ns: Ints
-    heading_rad: Floats
-    yaw_rate_radps: Floats
-
-    def columns(self) -> dict[str, Any]:
-        """Return the columns by name."""
-        return {column.name: getattr(self, column.name) for column in fields(self)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +47,7 @@ class TruthTable:
         return {column.name: getattr(self, column.name) for column in fields(self)}
 
 
-def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorRecord, TruthTable]:
+def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumns, TruthTable]:
     """Return the measurements and the truth of a simulated drive.
 
     Parameters
@@ -98,7 +66,7 @@ def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorRecord
     return record(readings, sensors, height_rng), truth_table(truth, readings.wheel_t)
 
 
-def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorRecord:
+def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorColumns:
     """Stamp readings from `START_NS` on, delays included, and put the fixes on the globe about `DATUM`."""
     from pymap3d import ned2geodetic
 
@@ -106,7 +74,7 @@ def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> Se
     down = rng.normal(0.0, HEIGHT_STD_RATIO * sensors.gnss_std_m, fixes)
     latitude, longitude, height = ned2geodetic(*readings.gnss_m.T, down, *DATUM)
     status = 2 if sensors.gnss_std_m <= LARGEST_RTK_STD_M else 1 if sensors.gnss_std_m <= LARGEST_SBAS_STD_M else 0
-    return SensorRecord(
+    return SensorColumns(
         wheel_stamp_ns=stamps(readings.wheel_t),
         wheel_position_left_m=readings.travel_left_m,
         wheel_position_right_m=readings.travel_right_m,

@@ -32,7 +32,7 @@ def test_a_body_twist_is_undone_with_the_width_it_was_made_with(icrtool, tmp_pat
 
 def test_a_wheel_radius_that_had_to_be_estimated_is_said(icrtool, tmp_path: Path) -> None:
     _, _, said = icrtool("fit", MOWER, *QUIET, "-o", tmp_path / "run")
-    assert "robot.wheel_radius_m is not given, 1 unit = 0.27" in said
+    assert "robot.wheel_radius_m is not given: wheel radius 0.27" in said
 
 
 @pytest.mark.parametrize("setting", ["wheel_radius_m=27", "track_width_m=61"])

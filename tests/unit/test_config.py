@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -110,3 +111,40 @@ def test_what_is_wrong_is_said_of_a_key_in_the_words_of_toml(sets: list[str], me
 def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text("[robot]\ntrack_width_m = 0.5\n", encoding="utf-8-sig")
     assert load_config(tmp_path / "robot.toml").robot.track_width_m == 0.5
+
+
+@pytest.mark.parametrize(
+    ("typed", "number"), [(".08", 0.08), ("8e-2", 0.08), ("+.5", 0.5), ("1.", 1.0), ("2.e-1", 0.2), ("1", 1.0)]
+)
+def test_numbers_are_read_as_people_type_them(typed: str, number: float) -> None:
+    assert load_config(sets=[f"robot.wheel_radius_m={typed}"]).robot.wheel_radius_m == number
+
+
+def test_numbers_in_a_list_are_read_as_people_type_them() -> None:
+    assert load_config(sets=["dropout.horizons_m=[.5, 1., 2]"]).dropout.horizons_m == (0.5, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("text", ["/gps.5/fix", "v.1", "1.2.3"])
+def test_a_text_with_points_stays_as_it_is(text: str) -> None:
+    assert load_config(sets=[f"topics.gnss={text}"]).topics.gnss == text
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ({"robot": "husky"}, "husky-a200"),
+        ({"robot": "Jackel"}, "jackal"),
+        ({"sets": ["robot.trackwidth_m=1"]}, "track_width_m"),
+        ({"sets": ["robots.name=x"]}, "robot"),
+    ],
+)
+def test_the_error_about_a_misspelled_name_proposes_the_right_one(given: dict[str, Any], meant: str) -> None:
+    with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
+        load_config(**given)
+
+
+def test_a_name_unlike_all_others_gets_no_proposal() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(robot="turtle")
+    assert "did you mean" not in str(caught.value)
+    assert "jackal" in str(caught.value)

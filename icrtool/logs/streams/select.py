@@ -17,7 +17,9 @@ from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource
 from icrtool.logs.streams.wheel_names import right_twin
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_motion
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, no_motion
+from icrtool.records.samples import ROLE_WORDS
 from icrtool.records.tables import Role
+from icrtool.records.text import did_you_mean
 
 Source = TypeVar("Source", WheelMotion, PositionSource, HeadingSource)
 
@@ -26,7 +28,6 @@ NEEDS: dict[Role, str] = {
     "gnss": "a GNSS fix, or a pose of a reference (total station, lidar, motion capture)",
     "heading": "an orientation (AHRS), a compass or a dual antenna heading",
 }
-ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}
 
 SAME_NAMESPACE = 8.0
 """Added to the score of a candidate in the namespace of the wheels: it belongs to the same robot."""
@@ -263,7 +264,8 @@ def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Se
             continue
         key, needed = f"topics.wheel_{side}", f"a side's topic is one of {', '.join(sorted(PAIR_TYPES))}"
         if topic not in types:
-            raise ConfigError(key, f"{topic} is not in {log}", f"it holds {', '.join(_listing(channels, {}))}")
+            listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, {}))}"
+            raise ConfigError(key, f"{topic} is not in {log}", listed)
         if types[topic] not in PAIR_TYPES:
             raise ConfigError(key, f"{topic}: {types[topic]} is not the number of one side", needed)
         if topic in found.unread:
@@ -288,7 +290,8 @@ def _check_configured(
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
     if configured not in types:
-        raise ConfigError(key, f"{configured} is not in {log}", f"it holds {', '.join(_listing(channels, unread))}")
+        listed = f"{did_you_mean(configured, types)}it holds {', '.join(_listing(channels, unread))}"
+        raise ConfigError(key, f"{configured} is not in {log}", listed)
     if not sources:
         if role == "wheels" and types[configured] in PAIR_TYPES:
             needed = "name both sides in topics.wheel_left and topics.wheel_right"

@@ -10,7 +10,8 @@ from pathlib import Path
 from icrtool.errors import OutputError
 from icrtool.logs.writing.containers import write_bag, write_db3, write_mcap
 from icrtool.logs.writing.messages import load_typestore, serialise_topics
-from icrtool.logs.writing.records import Compression, Container, SensorColumns, WheelMessages, WriteOptions
+from icrtool.logs.writing.records import Compression, Container, WheelMessages, WriteOptions
+from icrtool.records.sensor_columns import SensorColumns
 from icrtool.records.unfinished import unfinished
 
 __all__ = ["Compression", "Container", "SensorColumns", "WheelMessages", "WriteOptions", "write_log"]

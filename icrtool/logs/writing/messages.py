@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rosbags.typesys.store import Typestore
 
-    from icrtool.logs.writing.records import SensorColumns, WriteOptions
+    from icrtool.logs.writing.records import WriteOptions
+    from icrtool.records.sensor_columns import SensorColumns
     from icrtool.records.tables import Ints
 
 GRAVITY_MPS2 = 9.81

@@ -1,4 +1,4 @@
-"""What a calibration takes away: misses of the windows of way before and after."""
+"""What a calibration corrects: residuals of the windows of driven distance, before and after."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from icrtool.calibration.findings import Calibration
+from icrtool.alignment.estimator import WindowResiduals
 from icrtool.output.figures.style import ICR, inches, new_figure
 from icrtool.records.tables import Floats
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 WIDTH_IN, HEIGHT_IN = 7.2, 4.2
 SHOWN_PERCENT = 97.0
-"""The axes reach as far as this share of the misses; a few strays would leave the rest a dot."""
+"""The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
 BEFORE: dict[str, Any] = {
     "marker": "s",
@@ -35,31 +35,31 @@ AFTER: dict[str, Any] = {
 }
 
 
-def draw_calibration(calibration: Calibration) -> Figure:
-    """Draw where windows of way miss the fixes, and how much their turns miss the heading, before and after."""
-    misses = calibration.residuals
+def draw_calibration(name: str, residuals: WindowResiduals) -> Figure:
+    """Draw residuals of displacements and of heading changes over windows, before and after."""
     figure = new_figure(
-        calibration.name,
-        f"{calibration.windows} windows of way, predicted by wheels and heading: what is left",
+        name,
+        f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals",
         width_in=WIDTH_IN,
         height_in=HEIGHT_IN,
     )
     place, turn = figure.subplots(1, 2)
     figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.7, bottom=1.0), wspace=0.32)
-    for part, look in ((misses.before, BEFORE), (misses.after, AFTER)):
+    turns = (residuals.turn_before, residuals.turn_after)
+    for part, turned, look in zip((residuals.before, residuals.after), turns, (BEFORE, AFTER), strict=True):
         place.plot(part[1], part[0], **look)
-        turn.plot(np.degrees(misses.turn_rad), np.degrees(part[2]), **look)
-    reach = _reach(np.hypot(*np.concatenate([misses.before[:2], misses.after[:2]], axis=1)))
+        turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
+    reach = _reach(np.hypot(*np.concatenate([residuals.before, residuals.after], axis=1)))
     place.set_xlim(-reach, reach)
     place.set_ylim(-reach, reach)
-    place.set_xlabel("Miss to the right [m]")
-    place.set_ylabel("Miss ahead [m]")
-    turned = np.degrees(np.concatenate([misses.before[2], misses.after[2]]))
+    place.set_xlabel("Residual to the right [m]")
+    place.set_ylabel("Residual ahead [m]")
+    turned = np.degrees(np.concatenate(turns))
     turn.set_ylim(-_reach(turned), _reach(turned))
-    turn.set_xlabel("Turn measured, clockwise [°]")
-    turn.set_ylabel("Miss of the turn [°]")
-    _say(place, misses.before[:2], misses.after[:2], 1.0, "m")
-    _say(turn, misses.before[2:], misses.after[2:], float(np.degrees(1.0)), "°")
+    turn.set_xlabel("Heading change measured, clockwise [°]")
+    turn.set_ylabel("Residual of the heading change [°]")
+    _label(place, residuals.before, residuals.after, 1.0, "m")
+    _label(turn, residuals.turn_before[None], residuals.turn_after[None], float(np.degrees(1.0)), "°")
     keys = [
         Line2D([], [], label="as configured, with the W found", **BEFORE | {"markersize": 6}),
         Line2D([], [], label="calibrated", **AFTER | {"markersize": 6}),
@@ -68,12 +68,12 @@ def draw_calibration(calibration: Calibration) -> Figure:
     return figure
 
 
-def _reach(misses: Floats) -> float:
-    return 1.2 * max(float(np.percentile(np.abs(misses), SHOWN_PERCENT)), 1e-3)
+def _reach(residuals: Floats) -> float:
+    return 1.2 * max(float(np.percentile(np.abs(residuals), SHOWN_PERCENT)), 1e-3)
 
 
-def _say(axes: Axes, before: Floats, after: Floats, factor: float, unit: str) -> None:
-    """Say the median length of the misses above a panel."""
+def _label(axes: Axes, before: Floats, after: Floats, factor: float, unit: str) -> None:
+    """Write the median size of the residuals above a panel."""
     first, last = (
         factor * float(np.median(np.hypot(*part) if len(part) > 1 else np.abs(part))) for part in (before, after)
     )

@@ -1,10 +1,10 @@
-"""The picture of a calibration as a file that appears whole or not at all."""
+"""The picture of a calibration as an atomic file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from icrtool.calibration.findings import Calibration
+from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
 from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.figures.drawing_process import matplotlib_unsaid
@@ -24,8 +24,8 @@ def check_picture(file: Path) -> None:
     check_place(file)
 
 
-def write_picture(calibration: Calibration, file: Path) -> None:
-    """Draw a calibration; the suffix says in which format.
+def write_picture(name: str, residuals: WindowResiduals, file: Path) -> None:
+    """Draw the residuals of a calibration; the suffix gives the format.
 
     Raises
     ------
@@ -38,4 +38,4 @@ def write_picture(calibration: Calibration, file: Path) -> None:
         from icrtool.output.figures.style import save, style
 
         with style():
-            save(draw_calibration(calibration), partial.with_suffix(""), (form,))
+            save(draw_calibration(name, residuals), partial.with_suffix(""), (form,))

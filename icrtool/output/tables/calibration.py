@@ -1,15 +1,15 @@
-"""The alignment findings of one log as text."""
+"""What the alignment of one log shows of its sensors, as text."""
 
 from __future__ import annotations
 
 import math
 
-from icrtool.calibration.findings import Calibration, Parameter
+from icrtool.calibration.one_log import LogCalibration, Parameter
 
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
 
-def format_calibration(calibration: Calibration) -> str:
+def format_calibration(calibration: LogCalibration) -> str:
     """Return the table of a calibration, no line end."""
     facts = calibration.facts
     right, left = math.degrees(facts.turned_right_rad), math.degrees(facts.turned_left_rad)
@@ -22,27 +22,27 @@ def format_calibration(calibration: Calibration) -> str:
         "",
         f"{'parameter':<36}{'value ± std':<24}verdict",
     ]
-    for finding in calibration.findings:
-        note = f": {finding.note}" if finding.note else ""
-        lines.append(f"{finding.label:<36}{value_text(finding):<24}{finding.verdict}{note}")
+    for one in calibration.parameters:
+        note = f": {one.note}" if one.note else ""
+        lines.append(f"{one.label:<36}{value_text(one):<24}{one.verdict}{note}")
     lines += ["", *_setting_lines(calibration)]
     return "\n".join(lines)
 
 
-def value_text(finding: Parameter) -> str:
+def value_text(one: Parameter) -> str:
     """Return value and standard deviation with their unit; a dash where there is none."""
-    if not math.isfinite(finding.value):
+    if not math.isfinite(one.value):
         return "–"
-    digits, unit = next(form for ending, form in DIGITS.items() if finding.key.endswith(ending))
-    number = f"{finding.value:+.{digits}f}" if not finding.key.endswith("scale") else f"{finding.value:.{digits}f}"
-    spread = f" ± {finding.std:.{digits}f}" if finding.verdict != "given" else ""
+    digits, unit = next(form for ending, form in DIGITS.items() if one.key.endswith(ending))
+    number = f"{one.value:+.{digits}f}" if not one.key.endswith("scale") else f"{one.value:.{digits}f}"
+    spread = f" ± {one.std:.{digits}f}" if one.verdict != "given" else ""
     return f"{number}{spread} {unit}".rstrip()
 
 
-def _setting_lines(calibration: Calibration) -> list[str]:
+def _setting_lines(calibration: LogCalibration) -> list[str]:
     if not calibration.settings:
-        if any(finding.verdict == "shown" for finding in calibration.findings):
-            return ["nothing to configure: what the drive showed is what the configuration already says"]
+        if any(one.verdict == "shown" for one in calibration.parameters):
+            return ["nothing to configure: the drive confirms the configuration"]
         return ["nothing to configure: the drive showed nothing well enough"]
     lines = ["to configure, as options:"]
     lines.append("  " + " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings))

@@ -17,6 +17,7 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.run import ICR_COLUMNS, Run, icr_text
+from icrtool.records.samples import ROLE_WORDS
 
 LABEL = 12
 """Columns of the left margin: what a line is about."""
@@ -81,7 +82,8 @@ def _stream_lines(run: Run) -> list[str]:
         kind = stream["message_type"].replace("/msg/", "/")
         hz = stream["rate_hz"]
         rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
-        rows.append((stream["role"], stream["topic"], kind, rate, count, stream["clock"]))
+        role = ROLE_WORDS[stream["role"]] if run.summary["gnss"]["datum"] is None else stream["role"]
+        rows.append((role, stream["topic"], kind, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
     widths[0] = LABEL - 2
     # Long names give way: the topic keeps its end, the type its begin.

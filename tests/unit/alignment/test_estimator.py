@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from icrtool.alignment.drive_windows import cut_windows, drive_arrays
-from icrtool.alignment.estimator import AlignmentFit, estimate_alignment
+from icrtool.alignment.estimator import AlignmentFit, _Model, estimate_alignment
 from support.exact_drives import ICRS, simulate
 
 WIDTH_M, OFFSET_DEG, SCALES = 0.6, 5.0, (1.03, 0.98)
@@ -81,3 +82,32 @@ def test_a_damaged_speed_makes_no_more_windows_than_there_are_fixes() -> None:
     travel = np.concatenate([[0.0], np.cumsum((drive.wheel_dt * (np.abs(left) + np.abs(drive.v_right)) / 2)[:-1])])
     windows = cut_windows(drive._replace(v_left=left, travel=travel))
     assert len(windows.begin) <= len(drive.fix_t)
+
+
+def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
+    log = simulate(1, lever=(0.0, 0.0), scales=SCALES, seconds=160.0)
+    rng = np.random.default_rng(0)
+    north = log.gnss.north_m.copy()
+    north[rng.choice(len(north), len(north) // 100, replace=False)] += 5.0
+    drive = drive_arrays(replace(log, gnss=replace(log.gnss, north_m=north)))
+    found = estimate_alignment(drive, cut_windows(drive), WIDTH_M)
+    assert found is not None
+    assert np.abs(found.geometry().values[:2] - ICRS[:2]).max() < 0.02
+    assert np.abs(found.geometry().values[3:5] - SCALES).max() < 0.02
+
+
+def test_the_jacobian_equals_differences() -> None:
+    found = estimate(2)
+    model = _Model(found.drive, found.windows, WIDTH_M)
+    # with x_icr, the share of the asymmetry in its sideways motion is left out of the slopes
+    x = np.array([1.01, 0.02, 0.0, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02])
+    residuals, slopes = model.evaluate(x)
+    for column, step in enumerate([1e-6] * 8 + [0.02, 0.02]):
+        sides = []
+        for sign in (1, -1):
+            moved = x.copy()
+            moved[column] += sign * step
+            sides.append(model.evaluate(moved)[0])
+        # the frame of a residual turns with the offset; delays are differentiated over a step, the same one here
+        tolerance = {7: 1.1 * np.abs(residuals).max(), 8: 0.02, 9: 0.02}.get(column, 1e-6)
+        assert np.allclose((sides[0] - sides[1]) / (2 * step), slopes[:, column], atol=tolerance), column

@@ -15,7 +15,7 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED
 from icrtool.logs import read_log
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.writing.log import WriteOptions, write_log
 from icrtool.records.run import Run
 from icrtool.records.tables import (
     FIXED_FIX,
@@ -174,11 +174,10 @@ def test_preset_paper_counts_classes_and_changes_no_noise() -> None:
 
 def test_what_a_log_file_says_of_its_fixes_reaches_the_filter(tmp_path: Path) -> None:
     recorded, _ = simulate(DrivePlan(duration_s=60.0), Sensors(), seed=1)
-    columns = recorded.columns()
-    plain = (columns["gnss_stamp_ns"] - columns["gnss_stamp_ns"][0]) / 1e9 > 50.0
-    columns["gnss_status"] = np.where(plain, 0, 2)
+    plain = (recorded.gnss_stamp_ns - recorded.gnss_stamp_ns[0]) / 1e9 > 50.0
+    columns = replace(recorded, gnss_status=np.where(plain, 0, 2))
     options = WriteOptions(wheel_radius_m=0.08, track_width_m=0.52)
-    path = write_log(tmp_path / "drive.mcap", SensorColumns(**columns), options)
+    path = write_log(tmp_path / "drive.mcap", columns, options)
     config = load_config(robot="pentzer-tracked")
     run = fit(read_log(path, config), config)
     assert run.summary["gnss"]["classes"]["other"]["down_weighted"] == int(np.count_nonzero(plain))

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.findings import calibrate
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.filter_setup import chi2_gate
@@ -266,19 +265,17 @@ def test_values_that_are_no_measurement_are_refused(
     preset: str, stream: str, column: str, value: float, why: str
 ) -> None:
     config = load_config(sets=[f"filter.preset={preset}"])
-    for use in (fit, calibrate):
-        with pytest.raises(DataError, match=why):
-            use(spoilt(make_log(), stream, column, value), config)
+    with pytest.raises(DataError, match=why):
+        fit(spoilt(make_log(), stream, column, value), config)
 
 
 def test_an_empty_stream_is_refused() -> None:
     log = make_log()
     none = WheelSamples(log.wheels.stamp_ns[:0], log.wheels.v_left_mps[:0], log.wheels.v_right_mps[:0])
-    for use in (fit, calibrate):
-        with pytest.raises(DataError, match="no orientation"):
-            use(cut(log, slice(0, 0)), load_config(sets=["filter.preset=paper"]))
-        with pytest.raises(DataError, match="0 usable wheel samples"):
-            use(replace(log, wheels=none))
+    with pytest.raises(DataError, match="no orientation"):
+        fit(cut(log, slice(0, 0)), load_config(sets=["filter.preset=paper"]))
+    with pytest.raises(DataError, match="0 usable wheel samples"):
+        fit(replace(log, wheels=none))
 
 
 @pytest.mark.parametrize(("degrees", "quantile"), [(1, 15.1367), (2, 18.4207)])

@@ -1,0 +1,301 @@
+"""What the alignment of one log shows of its sensors: verdict, reason and setting for each of its findings.
+
+The numbers are those of the run (``alignment`` in run.json), so that `fit` and `calibrate` cannot disagree. Positions
+show only antenna forward - x ICR and antenna right - middle of the ICRs: an antenna further ahead has the same effect
+as ICRs further back. One of both has to be known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from icrtool.errors import DataError
+from icrtool.records.run import Run
+
+CALIBRATION_SCHEMA = "icrtool/calibration/1"
+
+Verdict = Literal["shown", "weak", "not shown", "not separable", "given"]
+
+
+class _Kind(NamedTuple):
+    """A parameter: its key in files, its name in run.json, words for it, and a useful standard deviation."""
+
+    key: str
+    finding: str
+    label: str
+    useful: float
+
+
+AHEAD = _Kind("antenna_forward_minus_x_icr_m", "antenna_forward_minus_x_icr_m", "antenna forward − x ICR", 0.03)
+ASIDE = _Kind(
+    "antenna_right_minus_icr_middle_m", "antenna_right_minus_icr_middle_m", "antenna right − middle of the ICRs", 0.03
+)
+SEPARATION = _Kind("icr_separation_m", "icr_separation_m", "ICR separation y right − y left", 0.05)
+KINDS = (
+    AHEAD,
+    ASIDE,
+    _Kind("heading_offset_deg", "heading_offset_deg", "heading offset", 1.0),
+    _Kind("gnss_delay_s", "position_delay_s", "position lags the wheels by", 0.05),
+    _Kind("heading_delay_s", "heading_delay_s", "heading lags the wheels by", 0.05),
+    _Kind("gnss_delay_against_heading_s", "position_delay_against_heading_s", "position lags the heading by", 0.03),
+    _Kind("left_scale", "left_scale", "left wheel scale", 0.01),
+    _Kind("right_scale", "right_scale", "right wheel scale", 0.01),
+    SEPARATION,
+)
+WEAK = 3.0
+"""A standard deviation up to so many times the useful one is weak; above it, the drive does not show the parameter."""
+
+TURNS_NEEDED_RAD = math.pi
+ONE_SIDED = 0.15
+"""Turns are one-sided where those in the other direction sum to less than this share."""
+
+STEADY = 0.15
+"""A speed is steady where its standard deviation is less than this share of its mean."""
+
+MOVING_MPS = 0.05
+RESPONSE_S = 0.1
+"""A robot's own response to its wheels looks like a delay of up to this [s]."""
+
+SETTING_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One estimated parameter and its verdict.
+
+    Attributes
+    ----------
+    key : name with unit, as in calibration.json
+    value, std : in the unit of the key; NaN where not determined
+    verdict : ``shown``, ``weak``, ``not shown`` by this drive, ``not separable`` by any, ``given`` by the user
+    note : why, or under which assumption
+    """
+
+    key: str
+    label: str
+    value: float
+    std: float
+    verdict: Verdict
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A line for a configuration: ``--set key=value``."""
+
+    key: str
+    value: float
+    why: str
+
+
+class DriveFacts(NamedTuple):
+    """Turns, speeds and distance of a drive; speeds are those while moving."""
+
+    turned_right_rad: float
+    turned_left_rad: float
+    turn_rate_radps: float
+    speed_mps: float
+    speed_std_mps: float
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class LogCalibration:
+    """The calibration of one log's sensors.
+
+    Attributes
+    ----------
+    parameters : the estimates, then those derived from them
+    settings : configuration lines that are worth setting, in order
+    windows, stretches : windows of driven distance, and how many count as independent
+    residual_m : robust standard deviation of their displacements
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    settings: tuple[Setting, ...]
+    windows: int
+    stretches: int
+    residual_m: float
+    facts: DriveFacts
+    inputs: tuple[dict[str, Any], ...]
+
+    def parameter(self, key: str) -> Parameter:
+        """Return a parameter by its key."""
+        return next(one for one in self.parameters if one.key == key)
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain data for calibration.json."""
+        facts = self.facts
+        return {
+            "schema": CALIBRATION_SCHEMA,
+            "log": self.name,
+            "inputs": list(self.inputs),
+            "windows": self.windows,
+            "independent_stretches": self.stretches,
+            "window_miss_m": self.residual_m,
+            "drive": {
+                "way_m": facts.distance_m,
+                "turned_right_deg": math.degrees(facts.turned_right_rad),
+                "turned_left_deg": math.degrees(facts.turned_left_rad),
+                "turn_rate_p95_degps": math.degrees(facts.turn_rate_radps),
+                "speed_mean_mps": facts.speed_mps,
+                "speed_std_mps": facts.speed_std_mps,
+            },
+            "parameters": {
+                one.key: {"value": one.value, "std": one.std, "verdict": one.verdict, "note": one.note}
+                for one in self.parameters
+            },
+            "settings": {setting.key: setting.value for setting in self.settings},
+        }
+
+
+def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> LogCalibration:
+    """Return the findings of a run's alignment with their verdicts, and the settings to configure.
+
+    Parameters
+    ----------
+    x_icr_m : known forward position of the ICRs; resolves the antenna's position
+
+    Raises
+    ------
+    DataError
+        The drive is too short for an estimate.
+    """
+    wheels, drive = run.summary["wheels"], run.summary["drive"]
+    if SEPARATION.finding not in run.summary["alignment"]:
+        why = f"{drive['distance_m']:.0f} m of driven distance are too few windows, or an older version made the run"
+        raise DataError(run.name, why, "drive longer, or fit the log again")
+    facts = _drive_facts(run)
+    direct = tuple(_parameter(run, kind, facts) for kind in KINDS)
+    parameters = (*direct, *_derive(run, direct, x_icr_m))
+    return LogCalibration(
+        name=run.name, parameters=parameters, settings=_settings(parameters, run), windows=wheels.get("windows", 0),
+        stretches=wheels.get("stretches", 0), residual_m=wheels.get("residual_m", math.nan), facts=facts,
+        inputs=tuple({key: one[key] for key in ("path", "bytes", "sha256")} for one in run.summary["inputs"]),
+    )  # fmt: skip
+
+
+def _drive_facts(run: Run) -> DriveFacts:
+    table, excitation = run.table, run.summary["excitation"]
+    left, right = (
+        speed / scale for speed, scale in zip((table.v_left_mps, table.v_right_mps), run.wheel_scales, strict=True)
+    )
+    moving = np.abs(left) + np.abs(right) > MOVING_MPS
+    speed = (left + right)[moving] / 2
+    rate = np.abs(left - right)[moving] / max(run.summary["alignment"][SEPARATION.finding]["value"], 1e-3)
+    turning = rate[rate > math.radians(2.0)]
+    return DriveFacts(
+        math.radians(excitation["turned_right_deg"]),
+        math.radians(excitation["turned_left_deg"]),
+        float(np.percentile(turning, 95)) if len(turning) else 0.0,
+        float(np.abs(speed).mean()) if len(speed) else 0.0,
+        float(speed.std()) if len(speed) else 0.0,
+        run.summary["drive"]["distance_m"],
+    )
+
+
+def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
+    """Return one estimate with a verdict by its standard deviation, and the reason if it is not "shown"."""
+    found = run.summary["alignment"][kind.finding]
+    value, std = (math.nan if found[key] is None else float(found[key]) for key in ("value", "std"))
+    verdict: Verdict = "not shown"
+    if std <= kind.useful:
+        verdict = "shown"
+    elif std <= WEAK * kind.useful:
+        verdict = "weak"
+    note = "" if verdict == "shown" else _reason(kind, facts)
+    if kind.key in {"gnss_delay_s", "heading_delay_s"} and verdict == "shown":
+        note = f"the robot's own response is in it: up to ± {RESPONSE_S:g} s where the clocks agree"
+    return Parameter(kind.key, kind.label, value, std, verdict, note)
+
+
+def _reason(kind: _Kind, facts: DriveFacts) -> str:
+    """Return why the drive does not determine a parameter well, and what to drive."""
+    right, left = facts.turned_right_rad, facts.turned_left_rad
+    total = right + left
+    if kind.key not in {"left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg"} and total < TURNS_NEEDED_RAD:
+        return (
+            f"hardly any turns ({math.degrees(total):.0f}° in all, {math.degrees(facts.turn_rate_radps):.0f} deg/s):"
+            " add two spins or tight circles in each direction"
+        )
+    if kind.key.startswith("gnss_delay") and facts.speed_std_mps < STEADY * facts.speed_mps:
+        return f"speed hardly changes ({facts.speed_mps:.2f} ± {facts.speed_std_mps:.2f} m/s): add stops and starts"
+    if total >= TURNS_NEEDED_RAD and min(right, left) < ONE_SIDED * max(right, left):
+        side = "left" if right > left else "right"
+        return f"turns in one direction only: add as many turns to the {side}"
+    return f"too short a drive for this noise: {facts.distance_m:.0f} m"
+
+
+def _derive(run: Run, direct: tuple[Parameter, ...], x_icr_m: float | None) -> tuple[Parameter, ...]:
+    """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
+    by_key = {one.key: one for one in direct}
+    ahead, aside, separation = (by_key[kind.key] for kind in (AHEAD, ASIDE, SEPARATION))
+    forward, right = _known_antenna(run)
+    fix = "position determines only antenna forward − x ICR: give frames.antenna_forward_m, or --x-icr"
+    found = []
+    if forward is not None:
+        found.append(Parameter("antenna_forward_m", "antenna forward", forward, 0.0, "given", ""))
+        x = Parameter("x_icr_m", "x ICR", forward - ahead.value, ahead.std, ahead.verdict, "with the antenna as given")
+    elif x_icr_m is not None:
+        note = f"with x ICR at {x_icr_m:+.3f} m, as given"
+        place = ahead.value + x_icr_m
+        found.append(Parameter("antenna_forward_m", "antenna forward", place, ahead.std, ahead.verdict, note))
+        x = Parameter("x_icr_m", "x ICR", x_icr_m, 0.0, "given", "")
+    else:
+        found.append(Parameter("antenna_forward_m", "antenna forward", math.nan, math.nan, "not separable", fix))
+        x = Parameter("x_icr_m", "x ICR", math.nan, math.nan, "not separable", fix)
+    if right is not None:
+        found.append(Parameter("antenna_right_m", "antenna right", right, 0.0, "given", ""))
+        middle, note = right - aside.value, "with the antenna as given"
+        icrs = [run.summary["alignment"][name] for name in ("y_icr_right_m", "y_icr_left_m")]
+        stds = [one["std"] for one in icrs]
+        verdict = max((separation.verdict, aside.verdict), key=("given", "shown", "weak", "not shown").index)
+    else:
+        middle, note = 0.0, "if the ICRs lie evenly about the body's middle"
+        found.append(Parameter("antenna_right_m", "antenna right", aside.value, aside.std, aside.verdict, note))
+        stds, verdict = [separation.std / 2] * 2, separation.verdict
+    half = separation.value / 2
+    return (
+        *found,
+        Parameter("y_icr_right_m", "y ICR right", middle + half, stds[0], verdict, note),
+        Parameter("y_icr_left_m", "y ICR left", middle - half, stds[1], verdict, note),
+        x,
+    )
+
+
+def _known_antenna(run: Run) -> tuple[float | None, float | None]:
+    """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
+    used, given = run.sensors.antenna_m, run.config.frames
+    in_log = run.summary["filter"].get("antenna_is_known", False) and given.antenna_right_m == "auto"
+    return (
+        used[0] if in_log or given.antenna_forward_m != "auto" else None,
+        used[1] if in_log or given.antenna_right_m != "auto" else None,
+    )
+
+
+def _settings(parameters: tuple[Parameter, ...], run: Run) -> tuple[Setting, ...]:
+    """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
+    by_key = {one.key: one for one in parameters}
+    settings = []
+
+    def add(key: str, one: Parameter, *, neutral: float, least: float, times: float = 1.0, why: str = "") -> None:
+        if one.verdict == "shown" and abs(one.value - neutral) > max(SETTING_SIGMAS * one.std, least):
+            settings.append(Setting(key, round(times * one.value, 4), why or one.note))
+
+    add("frames.heading_offset_deg", by_key["heading_offset_deg"], neutral=0.0, least=0.3)
+    for key, name in (("frames.reference_delay_s", "gnss_delay_s"), ("frames.heading_delay_s", "heading_delay_s")):
+        # a stream that seems to lead shows a robot that follows its wheels with a delay
+        if by_key[name].value > 0.0:
+            add(key, by_key[name], neutral=0.0, least=RESPONSE_S, why=by_key[name].label)
+    add("frames.antenna_forward_m", by_key["antenna_forward_m"], neutral=0.0, least=0.02)
+    add("frames.antenna_right_m", by_key["antenna_right_m"], neutral=0.0, least=0.02)
+    wheels = run.config.wheels
+    for side, given in (("left", wheels.left_scale), ("right", wheels.right_scale)):
+        times = 1.0 if given == "auto" else given
+        add(f"wheels.{side}_scale", by_key[f"{side}_scale"], neutral=1.0, least=0.005, times=times)
+    return tuple(settings)

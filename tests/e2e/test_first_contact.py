@@ -1,0 +1,154 @@
+"""What a new user meets: robots, configuration, proposals, the verdict on a log, completion, stages."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from icrtool.cli.stages import Stages
+from icrtool.config import builtin_robots, load_config
+
+ROOT = Path(__file__).resolve().parents[2]
+TRACKED = ROOT / "sample_logs" / "tracked_curved.bag"
+MOWER = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
+
+
+def test_robots_lists_every_robot_with_its_numbers(icrtool) -> None:
+    status, out, err = icrtool("robots")
+    assert (status, err) == (0, "")
+    for name, robot in builtin_robots().items():
+        (line,) = (line for line in out.splitlines() if line.startswith(f"{name} "))
+        assert f"{robot['track_width_m']:.3f} m" in line
+    document = json.loads(icrtool("robots", "--json")[1])
+    assert document["schema"] == "icrtool/robots/1"
+    assert [robot["name"] for robot in document["robots"]] == list(builtin_robots())
+
+
+def test_the_configuration_that_is_written_can_be_used(icrtool, tmp_path: Path) -> None:
+    assert icrtool("config", "--robot", "jackal", "--set", "filter.gnss_std_m=.02", "-o", "mine.toml") == (0, "", "")
+    config = load_config(tmp_path / "mine.toml")
+    assert (config.robot.name, config.filter.gnss_std_m) == ("jackal", 0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("fitt", "log.mcap"), "fit"),
+        (("fit", TRACKED, "--robot", "husky"), "husky-a200"),
+        (("fit", TRACKED, "--set", "topics.gnss=/gps/fixx"), "/gps/fix"),
+        (("fit", TRACKED, "--set", "topics.wheel_left=/left_drive", "--set", "topics.wheel_right=/r"),
+         "/left_drive/velocity"),
+    ],
+)  # fmt: skip
+def test_a_misspelled_name_is_proposed_right(icrtool, arguments: tuple[object, ...], meant: str) -> None:
+    status, _, err = icrtool(*arguments)
+    assert status in (1, 2)
+    assert f"did you mean {meant}?" in err
+
+
+def test_info_gives_date_extent_verdict_and_a_next_command_that_works(icrtool) -> None:
+    status, out, _ = icrtool("info", MOWER, "--robot", "segway-rmp400")
+    assert status == 0
+    lines = {line.partition(" ")[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
+    assert lines["recorded"].startswith("2025-10-09 08:53:20 UTC, 3:20 min")
+    assert lines["driven"].startswith("12")
+    assert "m north-south about 40.79" in lines["area"]
+    assert lines["verdict"] == "can be fitted, all ICRs are shown"
+    assert "missing" not in lines
+    name, *arguments = shlex.split(lines["next"])
+    assert (name, arguments[0]) == ("icrtool", "dropout-report")
+    status, out, _ = icrtool(*arguments, "--plots", "none", "--no-ladder")
+    assert status == 0
+
+
+def test_info_without_a_track_width_names_it_as_missing(icrtool) -> None:
+    status, out, _ = icrtool("info", TRACKED)
+    assert status == 0
+    assert "\nverdict     can be fitted" in out
+    assert "\nmissing     robot.track_width_m" in out
+
+
+def test_info_of_a_log_that_cannot_be_fitted_states_why(icrtool, tmp_path: Path) -> None:
+    table = tmp_path / "wheels.csv"
+    rows = "".join(f"{k / 10},0,0,0,0,0\n" for k in range(100))
+    table.write_text(f"t_s,v_left_mps,v_right_mps,north_m,east_m,heading_rad\n{rows}", encoding="utf-8")
+    status, out, err = icrtool("info", table)
+    assert "\nrecorded    at an unknown date" in out
+    if status:
+        assert "verdict     cannot be fitted: " in out
+        assert err.startswith("Error: ")
+
+
+def test_stages_are_lines_with_v_and_nothing_without(icrtool) -> None:
+    _, _, err = icrtool("fit", TRACKED, "-v", "--plots", "none")
+    stages = [line.partition(": ")[2] for line in err.splitlines() if line.startswith("tracked_curved.bag: ")]
+    assert stages == ["reading", "aligning", "filter", "summary", "writing"]
+    _, _, err = icrtool("dropout-report", "--plots", "none", "--no-ladder")
+    assert "dropout analysis" not in err
+
+
+def test_on_a_terminal_the_stage_is_rewritten_and_cleared(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr("icrtool.cli.stages.REFRESH_S", 0.0)
+    with Stages("log") as stages:
+        stages.begin("reading")
+        stages.share(0.964)
+        stages.share(1.0)
+        stages.begin("filter")
+    shown = capsys.readouterr().err.split("\r\x1b[K")
+    assert shown == ["", "log: reading …", "log: reading 96 %", "log: reading …", "log: filter …", ""]
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A command named icrtool that runs this checkout."""
+    script = tmp_path_factory.mktemp("bin") / "icrtool"
+    script.write_text(
+        f"#!{sys.executable} -P\nimport sys\nsys.path.insert(0, {str(ROOT)!r})\nfrom icrtool.cli import main\nmain()\n",
+        encoding="utf-8",
+    )
+    script.chmod(0o755)
+    return script
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["fit", "--robot", "hu"], {"husky-a200"}),
+        (["fit", "--robot", "=", "ja"], {"jackal"}),
+        (["info", "--set", "filter.gnss"], {"filter.gnss_std_m=", "filter.gnss_std_floor_m="}),
+        (["fit", "--set", "frames.heading", "=", "e"], {"enu"}),
+        (["fit", str(TRACKED), "--set", "topics.gnss", "=", "/g"], {"/gps/fix"}),
+        (["dropout-report", str(TRACKED), "--set", "topics.heading", "="],
+         {"/gps/fix", "/imu/data", "/left_drive/velocity", "/right_drive/velocity"}),
+        (["ro"], {"robots"}),
+    ],
+)  # fmt: skip
+def test_bash_completes_names_keys_and_topics(command: Path, words: list[str], completed: set[str]) -> None:
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("bash is not installed")
+    script = f"""
+        eval "$({shlex.quote(str(command))} completion bash)"
+        COMP_WORDS=(icrtool {shlex.join(words)}); COMP_CWORD={len(words)}
+        _icrtool_completion {shlex.quote(str(command))}
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run([bash, "-c", script], capture_output=True, text=True, check=False, env=dict(os.environ))
+    assert set(done.stdout.split()) == completed
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_shell_has_its_completion(icrtool, shell: str) -> None:
+    status, out, _ = icrtool("completion", shell)
+    assert status == 0
+    assert f"_ICRTOOL_COMPLETE={shell}_complete" in out
