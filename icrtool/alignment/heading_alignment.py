@@ -224,7 +224,8 @@ def align_estimated_heading(
     std = derived.estimate.median_std
     correlation_s = WHEELS_CORRELATION_S if derived.source == "wheels_course" else 0.0
     own = HeadingAlignment(
-        source=derived.source, parts=derived.why, windows=0, offset_rad=0.0, offset_std_rad=std, scatter_rad=math.nan,
+        source=derived.source, parts=derived.why, windows=0, offset_rad=math.nan, offset_std_rad=math.nan,
+        scatter_rad=math.nan,
         agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
         applied_std_rad=0.0, applied_correlation_s=correlation_s, std_rad=std, name=NO_NAME,
         warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
