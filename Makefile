@@ -15,7 +15,11 @@ READY := $(VENV)/.ready
 PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo format format-check lint words types test stress fuzz bench unseen docs samples wheel-check check constraints clean
+AXE           = $(VENV)/axe-core/axe.min.js
+AXE_VERSION   = 4.14.1
+AXE_SHA256    = 29348999450cdf2849a8e70b7912fc2da85a849da39c0d0d5394f51d4a9ed95c
+
+.PHONY: axe help setup demo format format-check lint words types test stress fuzz bench unseen docs samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -63,6 +67,14 @@ stress: $(READY)  ## the long and large tests alone
 
 fuzz: $(READY)  ## read, fit and report damaged logs; FUZZ="--logs 100000 --fitted 20" sets how many
 	$(BIN)/python scripts/fuzz.py $(FUZZ)
+
+axe: $(AXE)  ## fetch the checker of accessibility that the tests of pages use (npm; MPL 2.0, not part of icrtool)
+
+$(AXE): | $(READY)
+	@mkdir -p $(@D)
+	@cd $(@D) && npm pack --silent axe-core@$(AXE_VERSION) >/dev/null && tar -xzf axe-core-$(AXE_VERSION).tgz
+	@echo "$(AXE_SHA256)  $(@D)/package/axe.min.js" | sha256sum --check --quiet
+	@mv $(@D)/package/axe.min.js $@
 
 bench: $(READY)  ## speed and memory, as ratios to other tools
 	$(BIN)/python $(BENCH)

@@ -44,7 +44,7 @@ cd "$scratch"
 "$UV_TOOL_BIN_DIR/icrtool" fit "$demo_log" ${demo_options[@]+"${demo_options[@]}"} -o run
 "$UV_TOOL_BIN_DIR/icrtool" dropout-report run
 for result in run/run.json run/states.csv run/plots/trajectory.png run/plots/icr_estimates.png \
-    run/dropout/summary.csv run/dropout/plots/summary.png; do
+    run/dropout/summary.csv run/dropout/plots/summary.png run/report.html; do
     [[ -s $result ]] || { echo "check-wheel: $result is missing" >&2; exit 1; }
 done
 echo "check-wheel: the wheel works"

@@ -13,6 +13,7 @@ from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
+from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements, SensorData
@@ -65,9 +66,13 @@ def align(log: RobotLog, config: Config) -> Measurements:
         losses_ns=quality.losses_ns,
         icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
     )
+    notes: tuple[str, ...] = ()
     # preset paper takes its wheels as they are
     if config.filter.preset == "field":
         sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
+        filled, note = bridged(sensors.wheels, config.filter.wheel_gap_s)
+        sensors = replace(sensors, wheels=filled)
+        notes = (f"{log.name}: {note}",) if note else ()
     return Measurements(
         sensors=sensors,
         findings=alignment_findings(found, aligned.antenna_m),
@@ -80,8 +85,9 @@ def align(log: RobotLog, config: Config) -> Measurements:
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-        warnings=tuple(
-            warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings
+        warnings=(
+            *(warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings),
+            *notes,
         ),
     )
 

@@ -263,3 +263,14 @@ def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
         return 0
     correlation = float(np.corrcoef(by_gyro, by_heading)[0, 1])
     return int(np.sign(correlation)) if abs(correlation) > 0.5 else 0
+
+
+def apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
+    """Return the drive with sides, heading and position as the convention has them."""
+    left, right = convention.sign_left * drive.v_left, convention.sign_right * drive.v_right
+    return drive._replace(
+        v_left=right if convention.swapped else left,
+        v_right=left if convention.swapped else right,
+        heading=convention.heading * drive.heading,
+        fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
+    )

@@ -16,6 +16,7 @@ from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,
     Decision,
+    apply_to_drive,
     convention_notes,
     decide_conventions,
     gyro_sense,
@@ -102,7 +103,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:  # noqa: PLR
     decision = _decide(log, config, drive, windows, derived)
     if corrects:
         log = _apply(log, decision.convention)
-    drive = _apply_to_drive(drive, decision.convention)
+    drive = apply_to_drive(drive, decision.convention)
     notes += convention_notes(decision, corrects=corrects)
     mirrored = decision.convention.heading < 0
     if derived is None and config.frames.heading != "auto":
@@ -172,16 +173,6 @@ def _apply(log: RobotLog, convention: Convention) -> RobotLog:
         cov = -gnss.cov_north_east_m2
         gnss = replace(gnss, east_m=-gnss.east_m, cov_north_east_m2=cov)
     return replace(log, wheels=replace(wheels, left=left, right=right), gnss=gnss)
-
-
-def _apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
-    left, right = convention.sign_left * drive.v_left, convention.sign_right * drive.v_right
-    return drive._replace(
-        v_left=right if convention.swapped else left,
-        v_right=left if convention.swapped else right,
-        heading=convention.heading * drive.heading,
-        fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
-    )
 
 
 def _turned_over(log: RobotLog) -> RobotLog:

@@ -136,13 +136,16 @@ def fix_std_m(gnss: PositionFixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
-def cut_windows(drive: DriveArrays) -> DriveWindows:
+def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
+
+    `length_m` is the length of a window; default: as the noise of the fixes asks for.
 
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
     """
     noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
     length = max(WINDOW_M, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
+    length = length if length_m is None else length_m
     at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
     cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
     begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)

@@ -34,6 +34,9 @@ FACTOR_TWO_TOLERANCE = 0.04
 STANDS_SHARE, STILL = 0.8, 0.2
 """The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
 
+LONGEST_BRIDGE_S = 5.0
+"""In a longer gap the robot may have stopped and turned: what the counts show at its ends is no path."""
+
 FUSED_CORRELATION = 0.9995
 """A turn rate of the wheels that follows the gyro this closely was made of it."""
 
@@ -88,6 +91,36 @@ def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
         return log
     wheels = log.wheels
     return replace(log, wheels=replace(wheels, left=left * wheels.v_left_mps, right=right * wheels.v_right_mps))
+
+
+def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, str]:
+    """Return wheels that report positions with samples in their gaps, and what to report.
+
+    Parameters
+    ----------
+    gap_s : a longer interval between samples is a gap
+
+    Notes
+    -----
+    The positions before and after a gap give the distance of each side in it. It is driven at constant speed, in steps
+    as long as the usual interval.
+    """
+    interval = np.diff(wheels.stamp_ns) / 1e9
+    usual = float(np.median(interval)) if len(interval) else math.inf
+    steps = np.ones(len(wheels.stamp_ns), np.int64)
+    filled = (interval > gap_s) & (interval <= LONGEST_BRIDGE_S) & (interval >= 2.0 * usual)
+    if not (wheels.from_position and filled.any()):
+        return wheels, ""
+    steps[:-1][filled] = np.round(interval[filled] / usual).astype(np.int64)
+    row = np.repeat(np.arange(len(steps)), steps)
+    within = np.arange(len(row)) - np.repeat(np.cumsum(steps) - steps, steps)
+    length = np.append(np.diff(wheels.stamp_ns), 0)
+    stamps = wheels.stamp_ns[row] + length[row] * within // steps[row]
+    note = (
+        f"{np.count_nonzero(filled)} gaps in the wheel data, {interval[filled].sum():.1f} s in all, are bridged "
+        "with the distance that the wheel positions show"
+    )
+    return replace(wheels, stamp_ns=stamps, left=wheels.left[row], right=wheels.right[row]), note
 
 
 def dead_or_copied(log: RobotLog) -> list[str]:

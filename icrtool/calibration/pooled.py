@@ -215,6 +215,15 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
     -----
     Delay of the wheels and bias of the gyro are the recording's own, found with the parameters held.
     """
+    rates, wheels_delay_s = recorded_rates(calibration, recording, with_gyro=with_gyro)
+    return lambda trials: trial_errors(recording, trials, rates, wheels_delay_s)
+
+
+def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> tuple[Floats, float]:
+    """Return the body twist (3, n) of each wheel sample by a calibration, and the delay of the wheels [s].
+
+    Parameters, errors and notes are those of `predictor`.
+    """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
@@ -225,8 +234,7 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
     wheels = (calibration.fitted.model, calibration.fitted.parameters) if GYRO_TERMS[0] in fitted.model.terms else None
     pool = Pool(windows, [recording.width_m], fitted.model, wheels)
     own = pool.own_constants(0, fitted.parameters)
-    rates = twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2]))
-    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
+    return twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2])), float(own[1])
 
 
 def fixed_predictor(recording: Recording, fit: PooledFit) -> ErrorsOf:

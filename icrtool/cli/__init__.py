@@ -49,7 +49,9 @@ def _run() -> int:
         try:
             status = icrtool.main(standalone_mode=False)
         except IcrToolError as err:
-            sys.stderr.write(f"Error: {err}\n")
+            from icrtool.cli.stages import signal_word
+
+            sys.stderr.write(f"{signal_word('Error:', 'red')} {err}\n")
             return 1
         except click.ClickException as err:
             err.show()

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.page
 @options.baseline
 @click.option(
     "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
@@ -55,7 +56,8 @@ if TYPE_CHECKING:
 def command(
     places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
     redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
-    plots: str, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None, as_json: bool,
+    plots: str, page: bool, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None,
+    as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -73,13 +75,13 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.fleet.acceptance import changes_of, format_fleet_markdown, suites_of
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
-    from icrtool.fleet.fleet_files import fleet_document, write_fleet
+    from icrtool.fleet.fleet_files import PLOTS, calibrations_text, fleet_document, write_fleet
+    from icrtool.fleet.roll_up import pooled_calibrations
     from icrtool.output.atomic_file import atomic_file, check_place
-    from icrtool.output.exports.acceptance import write_junit
 
     asked = BatchOptions(
         config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
-        strict,
+        strict, page,
     )  # fmt: skip
     for file in (junit, markdown):
         if file is not None:
@@ -99,19 +101,29 @@ def command(
             view.row(row)
     order = {request.row.log: number for number, request in enumerate(requests)}
     rows.sort(key=lambda row: order[row.log])
-    write_fleet(rows, output)
+    calibrations = [] if not asked.ladder else list(pooled_calibrations(rows, output))
+    drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
+    write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     if junit is not None:
+        from icrtool.output.exports.acceptance import write_junit
+
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
         with atomic_file(markdown) as file:
             file.write_bytes(format_fleet_markdown(rows, missing).encode("utf-8", errors="backslashreplace"))
     if compared is not None:
         options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
+    if page:
+        from icrtool.output.page.fleet_page import write_fleet_page
+
+        write_fleet_page(fleet_document(rows), output)
     if as_json:
-        print_json("batch", fleet_document(rows) | {"output": escaped(str(output))})
+        print_json("batch", fleet_document(rows, calibrations) | {"output": escaped(str(output))})
     elif not quiet:
         click.echo(summary_of(rows, output))
+        if calibrations:
+            click.echo(f"\n{shown(calibrations_text(calibrations), keep=chr(10))}", nl=False)
     options.check_compared([(one.relative, bool(one.not_checked)) for row in rows for one in row.verdicts])
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):
@@ -228,9 +240,10 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"{failed_gates} gates failed"] if failed_gates else []
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: fleet.csv, failures.csv, runs/"
+    files = "fleet.csv, failures.csv, calibrations/, plots/, runs/"
+    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {files}"
 
 
-def shown(text: str) -> str:
-    """Return a text of a log's or a library's as a terminal can show it."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+def shown(text: str, keep: str = "") -> str:
+    """Return a text of a log's or a library's as a terminal can show it, with the letters to `keep`."""
+    return "".join(letter if letter.isprintable() or letter in keep else "?" for letter in text)

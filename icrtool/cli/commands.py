@@ -19,6 +19,7 @@ _COMMANDS = {
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
+    "report": "Write a run, a fleet or a comparison as one HTML file.",
     "robots": "List the built-in robots, with their numbers and sources.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",

@@ -49,10 +49,12 @@ class Request:
     baseline: Baseline | None
     strict: bool
     starts: Literal["moving", "all"]
+    without_events: bool
     trials: bool
     seed: int
     formats: tuple[str, ...]
     ladder: bool
+    page: bool
     smoothed: bool
     overwrite: bool
     quiet: bool
@@ -79,6 +81,9 @@ class Request:
               help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+@click.option(
+    "--without-events", is_flag=True, help="Leave out trials that cross a slip event, and report what they cost."
+)
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
               help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
@@ -87,6 +92,7 @@ class Request:
 )
 @click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
+@options.page
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
 @options.configuration
 @options.verbosity
@@ -95,8 +101,8 @@ def command(
     budgets: tuple[float, ...], horizons: str | None,
     gates: tuple[str, ...], baseline: Path | None, strict: bool,
     calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, starts: Literal["moving", "all"], trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, seed: int | None,
+    ladder: bool, reference: str, starts: Literal["moving", "all"], without_events: bool, trials: bool,
+    junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
@@ -122,8 +128,8 @@ def command(
         config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
         calibrations=tuple(open_calibration(file) for file in calibrations),
         gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
-        starts=starts, trials=trials,
-        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder,
+        starts=starts, without_events=without_events, trials=trials,
+        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder, page=page,
         smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
@@ -230,14 +236,21 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
 
 def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
+    from icrtool.output.run_directory import PAGE_FILE
+
     run = _read(source) if place is None else _fit(source, place, request, drawer)
     directory = source if place is None else place
     report = _analyse(run, directory, request, drawer)
+    if request.page:
+        from icrtool.output.page.run_page import write_page
+
+        write_page(run, report, directory / PAGE_FILE, plots=directory)
     if not request.quiet:
         from icrtool.output.tables.dropout import format_dropout
 
         click.echo(format_dropout(report))
-        click.echo(f"\nwritten to {directory / 'dropout'}")
+        page = f"; page: {directory / PAGE_FILE}" if request.page else ""
+        click.echo(f"\nwritten to {directory / 'dropout'}{page}")
     else:
         for verdict in report.verdicts:
             if not verdict.passed:
@@ -322,6 +335,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             outage_s=outages,
             outage_at_s=request.outage_at_s,
             starts=request.starts,
+            without_events=request.without_events,
             comparison=request.ladder,
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from icrtool.cli.stages import Stages
+from icrtool.cli.stages import Stages, signal_word
 from icrtool.records.text import LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
@@ -114,6 +114,12 @@ def cut(command: Command) -> Command:
     return click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}.")(command)
 
 
+def page(command: Command) -> Command:
+    """Add --page."""
+    what = "Also write report.html: pictures, tables and an interactive map in one file."
+    return click.option("--page/--no-page", default=True, show_default=True, help=what)(command)
+
+
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
     command = click.option("-v", "--verbose", is_flag=True, help="Print more details.")(command)
@@ -131,14 +137,15 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
     """Print warnings on standard error."""
     if not quiet:
         for warning in warnings:
-            click.echo(f"Warning: {warning}", err=True)
+            click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
 
 def error_line(err: IcrToolError, source: Path | str) -> str:
     """Return the line about an error, which names the log or run that it occurred in."""
     name = shortened(escaped(str(source)), LONGEST_NAME)
     named = any(part in str(err) for part in (name, escaped(Path(source).name), escaped(Path(source).stem)))
-    return f"Error: {err}" if named else f"Error: {name}: {err}"
+    word = signal_word("Error:", "red")
+    return f"{word} {err}" if named else f"{word} {name}: {err}"
 
 
 def report_error(err: IcrToolError, source: Path | str) -> None:
@@ -159,7 +166,8 @@ def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = F
         listed = ", ".join(names[:NAMES_SHOWN]) + (
             f" and {len(names) - NAMES_SHOWN} more" if names[NAMES_SHOWN:] else ""
         )
-        click.echo(f"Error: {len(failed)} of {of} {what} could not be used: {listed}", err=True)
+        word = signal_word("Error:", "red")
+        click.echo(f"{word} {len(failed)} of {of} {what} could not be used: {listed}", err=True)
     if gate_failed or failed:
         raise SystemExit(3 if gate_failed else 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from types import TracebackType
@@ -10,6 +11,14 @@ from typing import Self
 CLEAR = "\r\x1b[K"
 REFRESH_S = 0.1
 """The share done is rewritten at most this often."""
+
+
+def signal_word(word: str, color: str) -> str:
+    """Return the word that begins a line on standard error, coloured on a terminal; NO_COLOR is respected."""
+    from click import style
+
+    wanted = sys.stderr.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    return style(word, fg=color, bold=True) if wanted else word
 
 
 class Stages:

@@ -16,6 +16,7 @@ from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.slip_events import leave_out_events, with_event_cost
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
@@ -35,6 +36,7 @@ def dropout_report(
     outage_s: Sequence[float] | None = None,
     outage_at_s: Sequence[float] = (),
     starts: Starts = "moving",
+    without_events: bool = False,
     calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
@@ -55,6 +57,7 @@ def dropout_report(
     outage_s : lengths of outages to force on the filter; default those of the run's configuration
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
+    without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds what they cost
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several
     comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
@@ -74,6 +77,8 @@ def dropout_report(
     RunError
         `reference` is ``smoothed`` and the run has no smoothed states.
     """
+    whole = run
+    run = leave_out_events(run) if without_events else run
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
@@ -98,6 +103,8 @@ def dropout_report(
 
     horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
     report = with_single(dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink, watch=grown))
+    if without_events:
+        report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
     report = replace(report, comparison=found.table if found is not None else None, calibrations=used)
     return replace(
         report,

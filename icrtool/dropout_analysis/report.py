@@ -17,6 +17,7 @@ import numpy as np
 from icrtool.kernels.trials import TrialCounts
 from icrtool.records.dropout import (
     BudgetDistance,
+    EventCost,
     ExampleTrial,
     LearnedSplit,
     ModelResult,
@@ -67,6 +68,7 @@ class DropoutReport:
     comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     calibrations : those with a row of their own
     baseline : an earlier report that this one is compared with
+    event_cost : what slip events cost, where trials that cross one were left out; None where they count
     expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
 
@@ -96,6 +98,7 @@ class DropoutReport:
     calibrations: tuple[UsedCalibration, ...] = ()
     expected: tuple[str, ...] = ()
     baseline: BaselineReport | None = None
+    event_cost: EventCost | None = None
 
     @property
     def calibration(self) -> Calibration | None:

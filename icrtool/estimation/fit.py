@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from icrtool.alignment.align import align
+from icrtool.alignment.reference_choice import choose_reference
 from icrtool.config import Config
 from icrtool.estimation import smooth as smoother
 from icrtool.estimation.run_filter import run_filter
@@ -53,6 +54,7 @@ def fit(
     config = config if config is not None else Config()
     begin = watch if watch is not None else _ignore
     begin("aligning")
+    log = choose_reference(log, config)
     measurements = align(log, config)
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)

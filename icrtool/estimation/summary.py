@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
@@ -17,6 +16,7 @@ from icrtool.estimation.observability import Excitation, find_excitation, nomina
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
+from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import EVENT_COLUMNS, SlipEvent
@@ -267,17 +267,11 @@ def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
 
     The last chord may be shorter than a step; it counts for nothing then.
     """
-    north, east, last = table.north_m.tolist(), table.east_m.tolist(), len(table) - 1
-    rows, chords = [0], []
-    for k in range(1, last + 1):
-        chord = math.hypot(north[k] - north[rows[-1]], east[k] - east[rows[-1]])
-        if chord >= step_m:
-            rows.append(k)
-            chords.append(chord)
+    rows, last = chord_rows(table.north_m, table.east_m, step_m), len(table) - 1
+    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
     if rows[-1] != last:
-        rows.append(last)
-        chords.append(0.0)
-    return np.array(rows, np.int64), np.array(chords, np.float64)
+        rows, chords = np.append(rows, last), np.append(chords, 0.0)
+    return rows, chords
 
 
 def icr_summary(

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from icrtool.fleet.row import Row
-from icrtool.output.exports.acceptance import Case, Suite, escaped_markdown
+
+if TYPE_CHECKING:
+    from icrtool.output.exports.acceptance import Suite
 
 SHOWN = "icr_p95_10m_m"
 """The number of each log that is shown against the baseline."""
@@ -14,6 +17,9 @@ SHOWN = "icr_p95_10m_m"
 
 def suites_of(rows: Sequence[Row]) -> list[Suite]:
     """Return a suite per log."""
+    # Not at import: it loads the analysis, which a batch that is finished does not need.
+    from icrtool.output.exports.acceptance import Case, Suite
+
     return [
         Suite(row.log, [Case(one.gate, one.passed, one.line, one.not_checked) for one in row.verdicts],
               row.reason if row.status == "failed" else "")
@@ -28,6 +34,8 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     ----------
     missing : logs of the baseline that the batch does not have
     """
+    from icrtool.output.exports.acceptance import escaped_markdown
+
     counts = Counter(row.status for row in rows)
     failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
     lines = [f"## {len(rows)} logs", ""]

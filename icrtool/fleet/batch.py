@@ -19,6 +19,7 @@ from icrtool.fleet.one_log import Request, files_of, path_of
 from icrtool.fleet.recordings import Recording, find_recordings
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
+from icrtool.logs.containers.split_files import files_of_log
 
 RUNS, ROWS = "runs", ".rows"
 
@@ -57,6 +58,7 @@ class BatchOptions:
     overwrite: bool = False
     baseline: Path | None = None
     strict: bool = False
+    page: bool = True
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -98,6 +100,8 @@ def finished(request: Request) -> Row | None:
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
     """
+    from icrtool.output.run_directory import PAGE_FILE
+
     try:
         row = msgspec.json.decode(path_of(request.row_file).read_bytes(), type=Row)
     except (OSError, msgspec.MsgspecError, ValueError):
@@ -109,6 +113,7 @@ def finished(request: Request) -> Row | None:
     if (
         not Path(path_of(request.directory), "run.json").is_file()
         or not Path(path_of(request.directory), "dropout").is_dir()
+        or (request.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
     ):
         return None
     why = "done before: same input, configuration and version"
@@ -196,7 +201,7 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions, 
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
         budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
-        strict=options.strict,
+        strict=options.strict, page=options.page,
     )  # fmt: skip
 
 
@@ -213,7 +218,7 @@ def _config(one: Recording, known: About, options: BatchOptions) -> Config:
 def _same_files(stored: Sequence[File], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
     try:
-        files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+        files = files_of_log(path)
         if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
             return False
         for file, before in zip(files, stored, strict=True):
@@ -228,8 +233,7 @@ def _same_files(stored: Sequence[File], path: Path) -> bool:
 
 
 def _size(path: Path) -> int:
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return sum(file.stat().st_size for file in files_of_log(path) if file.is_file())
 
 
 def _free_bytes() -> int | None:

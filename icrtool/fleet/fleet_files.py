@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
+from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
 from icrtool.fleet.row import Row, columns_of
 from icrtool.output.atomic_file import atomic_file
 from icrtool.output.run_directory import json_bytes
@@ -21,20 +22,32 @@ FLEET_SCHEMA = "icrtool/fleet/1"
 FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 
-def fleet_document(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return what fleet.json holds: how many logs came to what, and all of each."""
+PLOTS = "plots"
+
+SHOWN_ERROR = "icr_p95_10m_m"
+
+
+def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
+    """Return what fleet.json holds: how many logs came to what, all of each, and the pooled calibrations."""
     counts = Counter(row.status for row in rows)
     return {
         "schema": FLEET_SCHEMA,
         "tool_version": __version__,
         "counts": {status: counts[status] for status in ("done", "failed", "skipped")},
         "gates_failed": sum(row.gates_failed for row in rows),
+        "calibrations": calibration_documents(calibrations),
         "logs": [msgspec.to_builtins(row) for row in rows],
     }
 
 
-def write_fleet(rows: Sequence[Row], directory: Path) -> None:
-    """Write the tables of a batch; those of an earlier one are replaced.
+def write_fleet(
+    rows: Sequence[Row], directory: Path, calibrations: Sequence[PooledCalibration] = (), plots: Sequence[str] = ()
+) -> None:
+    """Write the tables and figures of a batch; those of an earlier one are replaced.
+
+    Parameters
+    ----------
+    plots : formats of the figures
 
     Raises
     ------
@@ -48,8 +61,54 @@ def write_fleet(rows: Sequence[Row], directory: Path) -> None:
     _write(directory / "failures.csv", _csv(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
     with atomic_file(directory / "fleet.parquet") as file:
         _write_parquet(columns, cells, file)
+    if calibrations:
+        _write(directory / "calibrations.txt", calibrations_text(calibrations).encode("utf-8", "backslashreplace"))
+    if plots:
+        write_figures(rows, directory / PLOTS, tuple(plots))
     # Last: where it is, the others are of the same batch.
-    _write(directory / "fleet.json", json_bytes(fleet_document(rows)))
+    _write(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
+
+
+def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
+    """Return the pooled calibrations with their leave-one-log-out tables, no line end."""
+    parts = []
+    for one in calibrations:
+        name = ", ".join(part for part in (one.robot, one.group) if part) or "all logs"
+        head = f"{name}: {len(one.logs)} {'log' if len(one.logs) == 1 else 'logs'}"
+        if one.left_out:
+            head += f", {len(one.left_out)} not usable or copies"
+        if one.reason:
+            parts.append(f"{head}: no calibration: {one.reason}")
+            continue
+        multiplier = f"multiplier {one.multiplier:.3f} ± {one.multiplier_std:.3f}"
+        parts.append(f"{head}: recommended {one.recommended}, {multiplier}, in {one.file}\n{one.table}")
+    return "\n\n".join(parts) + "\n"
+
+
+def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:
+    """Draw the ICRs by robot and date, the error by group and the failures by reason, those that have anything."""
+    from icrtool.output.figures.fleet import IcrPoint, draw_fleet
+
+    points: list[IcrPoint] = []
+    errors: dict[str, list[float]] = {}
+    reasons: Counter[str] = Counter()
+    for row in sorted(rows, key=lambda row: row.start_utc):
+        right, left = row.icr.get("y_icr_right_m"), row.icr.get("y_icr_left_m")
+        std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
+        if right is not None and left is not None and row.start_utc:
+            points.append(IcrPoint(row.robot, row.start_utc, right, left, *std))
+        if (error := row.errors.get(SHOWN_ERROR)) is not None:
+            name = ", ".join(part for part in (row.robot, row.group) if part) or "all logs"
+            errors.setdefault(name, []).append(error)
+        if row.status == "failed":
+            reasons[reason_of(row)] += 1
+    draw_fleet(directory, formats, f"{len(rows)} logs", points, errors, dict(reasons.most_common()))
+
+
+def reason_of(row: Row) -> str:
+    """Return why a log failed without what is particular to it: the second part of ``what: why; advice``."""
+    parts = row.reason.split(": ", 1)
+    return parts[-1].split(";")[0].split(" (tried")[0]
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -16,6 +16,7 @@ from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text, multiplier_of
+from icrtool.logs.containers.split_files import files_of_log
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
@@ -49,6 +50,7 @@ class Request:
     overwrite: bool = False
     baseline: bytes = b""
     strict: bool = False
+    page: bool = True
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -105,9 +107,8 @@ def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File,
     """Return the files of a log with their sha256; those in `hashes`, by path, are not read again."""
     import hashlib
 
-    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
     found = []
-    for file in files:
+    for file in files_of_log(path):
         digest = (hashes or {}).get(str(file))
         if digest is None:
             with file.open("rb") as stream:
@@ -123,7 +124,7 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
     from icrtool.output.baseline_file import open_baseline
-    from icrtool.output.run_directory import check_target
+    from icrtool.output.run_directory import PAGE_FILE, check_target
 
     directory = path_of(request.directory)
     check_target(directory, path_of(request.path), overwrite=request.overwrite)
@@ -142,6 +143,11 @@ def _results(request: Request, stage: Stage) -> Row:
     )  # fmt: skip
     stage("writing the report")
     report.write(directory / "dropout", plots=request.plots)
+    if request.page:
+        from icrtool.output.page.run_page import write_page
+
+        stage("writing the page")
+        write_page(run, report, directory / PAGE_FILE, plots=directory)
     return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
 
 
@@ -160,6 +166,7 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
         multiplier=multiplier,
         multiplier_std=multiplier_std,
         errors=_errors(report),
+        events=len(summary["events"]),
         outages=len(report.outages),
         warnings=len(summary["warnings"]),
         verdicts=tuple(_verdict(replace(one, log=request.row.log)) for one in report.verdicts),

@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.fleet.row import as_text
 from icrtool.logs.containers.mcap_file import is_mcap
-from icrtool.logs.containers.one_recording import STORAGE, storage_files
+from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, storage_files
+from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.ros1_bag import is_ros1_bag
+from icrtool.logs.containers.split_files import NumberedFile, numbered_file, split_files, split_path
 from icrtool.logs.containers.sqlite_bag import is_sqlite
 from icrtool.logs.read_log import log_name
 
@@ -25,6 +28,9 @@ RUN_FILE = "run.json"
 
 OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
 """A folder that holds one of these is a result, not a place of recordings."""
+
+LONGEST_RESTART_S = 60.0
+"""A recorder that was restarted begins again within this time; two drives are further apart."""
 
 FIRST_BYTES = 65536
 """The tables of an SQLite file are named on its first page, which is at most this long."""
@@ -56,15 +62,82 @@ def find_recordings(places: Sequence[Path]) -> list[Recording]:
     """
     found: dict[str, Path] = {}
     for place in places:
-        if not place.exists():
+        if not place.exists() and not split_files(place):
             raise LogError(place, "no such file or directory")
         for path in _search(place) if place.is_dir() else [place]:
             found.setdefault(os.path.realpath(path), path)
+    found = joined(found)
     if not found:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
     root = common_parent(places)
     return _named(sorted(found.values(), key=_natural), root)
+
+
+def joined(found: Mapping[str, Path]) -> dict[str, Path]:
+    """Return recordings with the files of a split one, or of a recorder that was restarted, as one.
+
+    They are files of one folder whose names differ only in a count or a date, that have the same topics, and of which
+    each begins at most `LONGEST_RESTART_S` after the end of the one before it. A file without index has no known end.
+
+    Parameters
+    ----------
+    found : paths by real path; a file of a range that is there too is left out
+    """
+    of_ranges = {os.path.realpath(file) for path in found.values() for file in split_files(path)}
+    single = {real: path for real, path in found.items() if real not in of_ranges}
+    series: dict[tuple[Path, str, str], list[NumberedFile]] = {}
+    for path in single.values():
+        if path.suffix in LOG_SUFFIXES and path.is_file() and (one := numbered_file(path)) is not None:
+            series.setdefault(one.series, []).append(one)
+    replaced: dict[Path, Path] = {}
+    for files in series.values():
+        for group in _consecutive(sorted(files, key=lambda one: one.order)) if len(files) > 1 else ():
+            replaced |= dict.fromkeys(group, split_path(group))
+    paths = dict.fromkeys(replaced.get(path, path) for path in single.values())
+    return {os.path.realpath(path): path for path in paths}
+
+
+def _consecutive(files: Sequence[NumberedFile]) -> list[list[Path]]:
+    """Return the groups of two and more files that follow one another in time."""
+    extents = [_extent(one.path) for one in files]
+    groups: list[list[Path]] = [[files[0].path]]
+    for (one, before), (other, after) in pairwise(zip(files, extents, strict=True)):
+        counted = not one.is_count or other.order[0] == one.order[0] + 1
+        if counted and before is not None and after is not None and before.goes_on_in(after):
+            groups[-1].append(other.path)
+        else:
+            groups.append([other.path])
+    return [group for group in groups if len(group) > 1]
+
+
+class Extent(NamedTuple):
+    """When a file was recorded [ns], and its topics with their types."""
+
+    begin_ns: int
+    end_ns: int
+    topics: frozenset[tuple[str, str]]
+
+    def goes_on_in(self, other: Extent) -> bool:
+        """Return whether another file goes on where this one ends, with at least half of the topics in common."""
+        pause_s = (other.begin_ns - self.end_ns) / 1e9
+        fewer = min(len(self.topics), len(other.topics))
+        in_common = 2 * len(self.topics & other.topics) >= fewer > 0
+        return -LEAST_OVERLAP_S < pause_s <= LONGEST_RESTART_S and in_common
+
+
+def _extent(path: Path) -> Extent | None:
+    """Return when a file was recorded, by its index; None where it has none or cannot be read."""
+    try:
+        container = open_log(path)
+    except LogError:
+        return None
+    try:
+        begin_ns, end_ns = container.begin_ns(), container.end_ns()
+        topics = frozenset((channel.topic, channel.message_type) for channel in container.channels)
+    finally:
+        container.close()
+    return Extent(begin_ns, end_ns, topics) if begin_ns is not None and end_ns is not None else None
 
 
 def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -77,9 +150,9 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     found: dict[str, Path] = {}
     for place in places:
         searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
-        below = sorted(_search(place), key=_natural) if searched else []
-        for path in below or [place]:
-            found.setdefault(os.path.realpath(path), path)
+        below = {os.path.realpath(path): path for path in sorted(_search(place), key=_natural)} if searched else {}
+        for real, path in (joined(below) or {os.path.realpath(place): place}).items():
+            found.setdefault(real, path)
     logs = list(found.values())
     recordings = [path for path in logs if path.is_dir() or is_recording(path)]
     stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}

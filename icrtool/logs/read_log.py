@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Literal
@@ -17,6 +18,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -24,7 +26,15 @@ from icrtool.logs.streams.gyro import find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
-from icrtool.logs.streams.select import Candidates, choose_streams, common_clock, fields_to_take, find_candidates
+from icrtool.logs.streams.select import (
+    Candidates,
+    Choice,
+    choose_streams,
+    common_clock,
+    fields_to_take,
+    find_candidates,
+    other_references,
+)
 from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
@@ -126,7 +136,8 @@ def read_log(
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; or a ``.csv`` of `icrtool.records.frames`
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; ``drive_{0..3}.bag`` for the files of a split
+        recording; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -150,19 +161,31 @@ def read_log(
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: that of the file without its suffix, or of the directory; ``log`` where that is only dots.
+    """Return a log's name: that of its (first) file without suffix, or of the directory; ``log`` where it is only dots.
 
     Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
     """
-    named = Path(os.path.normpath(path.absolute()))
+    files = split_files(path)
+    named = Path(os.path.normpath((files[0] if files else path).absolute()))
     name = named.name if named.is_dir() else named.stem
     return name if name.strip(".") else "log"
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
     """Return the log with its streams chosen and converted; errors as `read_log`."""
+    choice = choose_streams(survey.candidates, config, survey.path, survey.channels)
+    log = _assemble(survey, config, choice)
+    others = []
+    for other in other_references(survey.candidates, choice, config):
+        # one that cannot be used is no alternative
+        with contextlib.suppress(DataError):
+            others.append(_assemble(survey, config, other))
+    return replace(log, other_references=tuple(others)) if others else log
+
+
+def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
+    """Return the log with the streams of a choice, converted."""
     found, name = survey.candidates, survey.name
-    choice = choose_streams(found, config, survey.path, survey.channels)
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     delays = [
         s.stamps.delay_ns / 1e9 if s.stamps.header_ns is not None else None

@@ -11,7 +11,7 @@ from icrtool.kernels.open_loop import trial_ends
 from icrtool.motion.fit import Turning
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import MOVING_MPS, Recording, samples_a_step
-from icrtool.records.tables import Floats, Ints
+from icrtool.records.tables import Complexes, Floats, Ints
 
 
 class Trials(NamedTuple):
@@ -60,17 +60,11 @@ def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_del
 
     Notes
     -----
-    Euler steps as in `icrtool.kernels.open_loop`. The parameters are constants, so the path from any start is the same
-    path, turned and shifted: one pass serves all.
+    The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
-    drive, held, t = recording.drive, recording.held_s, recording.t_s
+    drive = recording.drive
     errors: Floats = np.full(trials.ends.shape, np.nan)
-    v_x, v_y, omega = rates
-    heading = np.concatenate([[0.0], np.cumsum(held * omega)])[:-1]
-    place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * heading))])[:-1]
-    if wheels_delay_s:
-        later = t + wheels_delay_s
-        heading, place = np.interp(later, t, heading), np.interp(later, t, place)
+    place, heading = wheels_path(recording, rates, wheels_delay_s)
     reference = drive.north + 1j * drive.east
     turn = np.exp(1j * (drive.heading - heading))
     for h in range(trials.ends.shape[-1]):
@@ -78,6 +72,31 @@ def trial_errors(recording: Recording, trials: Trials, rates: Floats, wheels_del
         s, e = trials.starts[some], trials.ends[some, h]
         errors[some, h] = np.abs(turn[s] * (place[e] - place[s]) - (reference[e] - reference[s]))
     return errors
+
+
+def wheels_path(recording: Recording, rates: Floats, wheels_delay_s: float = 0.0) -> tuple[Complexes, Floats]:
+    """Return the path that a twist makes from the origin, at every state.
+
+    Parameters
+    ----------
+    rates, wheels_delay_s : as in `trial_errors`
+
+    Returns
+    -------
+    complex (n,), forward + j right of the first heading [m]; float64 (n,), clockwise turn since the first state [rad].
+
+    Notes
+    -----
+    Euler steps as in `icrtool.kernels.open_loop`; nothing moves through a gap in the wheel data.
+    """
+    held, t = recording.held_s, recording.t_s
+    v_x, v_y, omega = rates
+    heading = np.concatenate([[0.0], np.cumsum(held * omega)])[:-1]
+    place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * heading))])[:-1]
+    if wheels_delay_s:
+        later = t + wheels_delay_s
+        heading, place = np.interp(later, t, heading), np.interp(later, t, place)
+    return place, heading
 
 
 def twist_rates(

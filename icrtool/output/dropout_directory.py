@@ -137,9 +137,11 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "usable": run["usable"],
         "unusable_because": run["unusable_because"],
         "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
+        "smoothed": report.smoothed,
         "starts": report.states,
         "starts_counted": report.starts,
         "starts_standing": report.standing,
+        "without_events": _event_document(report),
         "tolerance_m": TOLERANCE_M,
         "bootstrap": {
             "method": "moving blocks of path",
@@ -257,11 +259,25 @@ def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
                 "across_wheel_gap": int(counts.gap[h]),
                 "ends_in_gnss_outage": int(counts.outage[h]),
                 "from_standstill": int(counts.standing[h]),
+                "across_slip_event": 0 if report.event_cost is None else int(report.event_cost.trials[h]),
             },
             "why_none": why_no_trial(report, h),
         }
         for h, horizon in enumerate(report.horizons_m)
     ]
+
+
+def _event_document(report: DropoutReport) -> dict[str, Any] | None:
+    """Return what slip events cost, None where they count."""
+    cost = report.event_cost
+    if cost is None:
+        return None
+    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
+    with_events = {
+        model: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
+        for model, summary in cost.with_events.items()
+    }
+    return {"events": cost.events, "with_events": with_events}
 
 
 def _reference_documents(report: DropoutReport) -> list[dict[str, Any]]:

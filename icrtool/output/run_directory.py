@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from icrtool.errors import OutputError
+from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
@@ -22,6 +23,7 @@ from icrtool.records.run import Run
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
+PAGE_FILE = "report.html"
 CHECKSUM_FILE = "B2SUMS"
 """Sums of all files but the pictures, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
 
@@ -33,7 +35,7 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
 
-LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, "events.csv", "report.html",
+LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, EVENTS_FILE, PAGE_FILE,
                "plots", "dropout")  # fmt: skip
 """What a run directory may hold that is icrtool's, though the list of its files does not name it."""
 
@@ -60,7 +62,7 @@ def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = 
 
 def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
-    files = [file for file in log.iterdir() if file.is_file()] if log.is_dir() else [log]
+    files = [file for file in files_of_log(log) if file.is_file()]
     inputs = _inputs_of(directory)
     # A run of an older version does not list the places; its paths may be relative to another directory.
     places = made_from(directory) or {path for one in inputs if Path(path := str(one.get("path"))).is_absolute()}

@@ -12,6 +12,7 @@ import numpy as np
 
 from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, RunError
+from icrtool.logs.containers.split_files import numbered_file, split_path
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, FilterInputs, read_measurements
 from icrtool.output.run_directory import (
     CHECKSUM_FILE,
@@ -108,6 +109,11 @@ def log_of(run: Run) -> Path:
             run.directory or run.name, f"the log it was made from is gone ({what})", "put it back, or name it"
         )
     folder = files[0].parent
+    series = [numbered_file(file) for file in files]
+    if len(files) > 1 and len({one.series for one in series if one is not None}) == 1 and None not in series:
+        beside = {file for file in folder.iterdir() if file.suffix == files[0].suffix}
+        if files[0].suffix == ".bag" or (beside != set(files) and not (folder / "metadata.yaml").is_file()):
+            return split_path(files)
     packed = files[0].suffix in {".zstd", ".zst"}
     return folder if len(files) > 1 or packed or (folder / "metadata.yaml").is_file() else files[0]
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
-from icrtool.records.tables import Floats
+from icrtool.records.tables import Floats, Ints
 
 OutageKind = Literal["forced", "real"]
 
@@ -111,6 +111,21 @@ class ReferenceErrors(NamedTuple):
     std: Floats
     expected: Floats
     p95: Floats
+
+
+class EventCost(NamedTuple):
+    """What slip events cost: trials that cross one were left out, and the errors are those with them.
+
+    Attributes
+    ----------
+    events : number of slip events
+    trials : (h,) left out
+    with_events : by model of the filter, the errors of all trials
+    """
+
+    events: int
+    trials: Ints
+    with_events: dict[str, Summary]
 
 
 class LearnedSplit(NamedTuple):

@@ -78,6 +78,7 @@ class RobotLog:
     heading : without a row where no topic states one
     gyros : all inertial units with turn rates, all axes
     other_receivers : further GNSS receivers
+    other_references : the same log with another position reference and its heading, where it holds one
     """
 
     name: str
@@ -93,6 +94,7 @@ class RobotLog:
     gyro: GyroSamples | None = None
     gyros: tuple[GyroAxes, ...] = ()
     other_receivers: tuple[OtherReceiver, ...] = ()
+    other_references: tuple[RobotLog, ...] = ()
 
     @classmethod
     def from_frames(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.cli.stages import Stages
+from icrtool.cli.stages import Stages, signal_word
 from icrtool.config import builtin_robots, load_config
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -106,6 +106,16 @@ def test_on_a_terminal_the_stage_is_rewritten_and_cleared(
         stages.begin("filter")
     shown = capsys.readouterr().err.split("\r\x1b[K")
     assert shown == ["", "log: reading …", "log: reading 96 %", "log: reading …", "log: filter …", ""]
+
+
+def test_colours_are_for_terminals_without_no_color(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert signal_word("Error:", "red") == "Error:"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert signal_word("Error:", "red") == "\x1b[31m\x1b[1mError:\x1b[0m"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert signal_word("Error:", "red") == "Error:"
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cu
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
+from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.records import unfinished
 from icrtool.records.tables import Ints
@@ -32,7 +33,11 @@ class _Metadata:
 
 
 class BagDirectory:
-    """A directory of storage files, read as one log.
+    """A directory of storage files, or several files of one split recording, read as one log.
+
+    Parameters
+    ----------
+    files : of a recording that is not a directory
 
     Raises
     ------
@@ -40,16 +45,16 @@ class BagDirectory:
         No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
         self._path = path
         self._problems = Problems(path.name)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._parts: list[Container] = []
         self._by_name = False
         self.files: list[Path] = []
-        metadata = self._read_metadata()
+        metadata = self._read_metadata() if not files else _Metadata()
         try:
-            for file in self._find_files(metadata.files):
+            for file in files or self._find_files(metadata.files):
                 self._open_part(file, metadata.message_compression)
             if not self._parts:
                 raise LogError(path, "no storage file in it can be read", "; ".join(self._problems))
@@ -81,6 +86,12 @@ class BagDirectory:
         begins = [part.begin_ns() for part in self._parts]
         known = [begin for begin in begins if begin is not None]
         return min(known) if known and len(known) == len(begins) else None
+
+    def end_ns(self) -> int | None:
+        """Return the log time of the last message of all files, None where one of them has no index."""
+        ends = [part.end_ns() for part in self._parts]
+        known = [end for end in ends if end is not None]
+        return max(known) if known and len(known) == len(ends) else None
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file.
@@ -138,8 +149,7 @@ class BagDirectory:
     def _open_part(self, file: Path, message_compression: str) -> None:
         try:
             storage = self._unpacked(file) if file.suffix in (".zstd", ".zst") else file
-            kind = McapFile if storage.suffix == ".mcap" else SqliteBag
-            self._parts.append(kind(storage, message_compression))
+            self._parts.append(_part(storage, message_compression))
             self.files.append(file)
         except LogError as err:
             self._problems.add(f"{file.name}: {err.why}; {err.advice}")
@@ -195,6 +205,12 @@ class BagDirectory:
             own = np.array(sorted(numbers), np.int64)
             self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
         return list(merged.values())
+
+
+def _part(storage: Path, message_compression: str) -> Container:
+    if storage.suffix == ".bag":
+        return Ros1Bag(storage)
+    return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
 
 
 def _metadata(text: str) -> _Metadata:

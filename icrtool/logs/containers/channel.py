@@ -131,6 +131,10 @@ class Container(Protocol):
         """Return the log time of the first message, None where only reading the log shows it."""
         ...
 
+    def end_ns(self) -> int | None:
+        """Return the log time of the last message, None where only reading the log shows it."""
+        ...
+
     def share_read(self) -> float:
         """Return the share of the log that has been read, 0 to 1."""
         ...

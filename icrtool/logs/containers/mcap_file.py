@@ -113,6 +113,10 @@ class McapFile:
         begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
         return min(begins, default=None)
 
+    def end_ns(self) -> int | None:
+        """Return the log time of the last message by the index, None without one."""
+        return max((chunk.end_ns for chunk in self._chunks or () if chunk.end_ns), default=None)
+
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, chunk by chunk."""
         if not wanted:

@@ -10,6 +10,7 @@ from icrtool.logs.containers.bag_directory import BagDirectory
 from icrtool.logs.containers.channel import Container
 from icrtool.logs.containers.mcap_file import McapFile, is_mcap
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
+from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
 
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
@@ -36,6 +37,8 @@ def open_log(path: Path) -> Container:
 
 
 def _open(path: Path) -> Container:
+    if files := split_files(path):
+        return BagDirectory(path, files)
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
         return BagDirectory(path)

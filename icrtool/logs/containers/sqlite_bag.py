@@ -95,6 +95,14 @@ class SqliteBag:
             return None
         return begin if isinstance(begin, int) else None
 
+    def end_ns(self) -> int | None:
+        """Return the time of the last message, None where it cannot be read."""
+        try:
+            end = self._query("SELECT max(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
+        except _DAMAGE:
+            return None
+        return end if isinstance(end, int) else None
+
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
         if not wanted:

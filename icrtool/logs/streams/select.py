@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
@@ -42,6 +43,10 @@ SAME_MESSAGE = 100.0
 """Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
 
 MOST_LISTED = 40
+MOST_REFERENCES = 3
+
+FUSED_WORDS = re.compile(r"ekf|ukf|fused|filtered|localization|global", re.IGNORECASE)
+"""Names of poses that another filter made, usually of the wheels too: that they agree with the wheels shows nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +254,30 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
             "heading": "" if heading is None else _reason(heading, found.heading, topics.heading),
         },
     )
+
+
+def other_references(found: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
+    """Return the choice with each other position reference that may be better than the chosen one.
+
+    A pose brings its own heading; GNSS receivers beside the chosen one are no other reference. A configured topic of
+    position or heading has precedence: then there is none.
+    """
+    if config.topics.gnss is not None or config.topics.heading is not None:
+        return ()
+    poses = {source.topic for source in found.gnss if source.metric is not None}
+    home, others = _namespace(choice.wheels.topic), _other_robots(found.wheels)
+    choices = []
+    for source in found.gnss:
+        foreign = _namespace(source.topic) in others - {home} or bool(FUSED_WORDS.search(source.topic))
+        same_kind = source.metric is None and choice.gnss.metric is None
+        if source is choice.gnss or source.problem or foreign or same_kind:
+            continue
+        wanted = {source.topic} if source.metric is not None else {one.topic for one in found.heading} - poses
+        heading = next((one for one in found.heading if one.topic in wanted and not one.problem), None)
+        if heading is not None:
+            why = choice.why | {"gnss": source.why, "heading": heading.why}
+            choices.append(Choice(choice.wheels, source, heading, why))
+    return tuple(choices[:MOST_REFERENCES])
 
 
 def _pair_name(topics: TopicsConfig) -> str | None:

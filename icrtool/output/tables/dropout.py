@@ -90,13 +90,13 @@ def headline(report: DropoutReport) -> list[str]:
         return []
     count, numbers = len(calibration.fitted.parameters), calibration.controller_numbers()
     interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
-    without = f"; without slip model: {_reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     radii = f"left/right wheel radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
     parameters = "one parameter" if count == 1 else f"{count} parameters"
     model = f"{calibration.fitted.model.label} ({parameters}, model {calibration.recommended})"
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {_reach_text(best)}{interval}{without}.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
         f"Controller: wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}, {radii}.",
     ]
 
@@ -116,8 +116,8 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
-        more = "".join(f"; {one.label}: {_reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {_reach_text(first)} ({first.label}){more}")
+        more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
+        lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
     return lines
 
 
@@ -138,7 +138,8 @@ def ratio_text(numerator: float, denominator: float) -> str:
     return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
 
 
-def _reach_text(one: BudgetDistance) -> str:
+def reach_text(one: BudgetDistance) -> str:
+    """Return how far a model stays within a budget."""
     if one.beyond:
         return f"more than {one.distance_m:g} m"
     low, high = one.between_m
@@ -190,8 +191,10 @@ def _turning_line(split: TurningSplit) -> str:
 def _count_lines(report: DropoutReport) -> list[str]:
     shown, counts = shown_horizons(report), report.counts
     lines = [_row("trials", [f"{int(counts.trials[h]):,}" for h in shown])]
+    cost = report.event_cost
     for label, column in (
         ("not counted: log ends", counts.short),
+        ("  across a slip event", cost.trials if cost is not None else np.zeros_like(counts.short)),
         ("  across a wheel gap", counts.gap),
         ("  ends in GNSS outage", counts.outage),
         ("  from standstill", counts.standing),
@@ -202,7 +205,30 @@ def _count_lines(report: DropoutReport) -> list[str]:
         share = 100 * report.standing / report.states
         counted = "each standstill is one start" if report.starts == "moving" else "each is a start (--starts all)"
         lines.append(f"the robot stood at {share:.0f} % of the states: {counted}")
-    return lines + _empty_lines(report)
+    return [*lines, *_event_lines(report), *_empty_lines(report)]
+
+
+def _event_lines(report: DropoutReport) -> list[str]:
+    """Return what slip events cost, at the longest horizon with trials on both sides."""
+    cost, icr = report.event_cost, report.result("icr")
+    if cost is None or icr is None:
+        return []
+    if not cost.events:
+        return ["slip events: none in this log; --without-events changes nothing"]
+    both = np.flatnonzero((icr.summary.trials > 0) & (cost.with_events["icr"].trials > 0))
+    number = "1 slip event" if cost.events == 1 else f"{cost.events} slip events"
+    if not len(both):
+        return [f"{number}: no trial is left without them"]
+    h = int(both[-1])
+    before, after = cost.with_events["icr"], icr.summary
+    errors = [
+        f"{name} {metres_text(float(after_m[h]))} instead of {metres_text(float(before_m[h]))}"
+        for name, after_m, before_m in (
+            ("95 %", after.p95, before.p95), ("expected", after.expected, before.expected),
+        )
+    ]  # fmt: skip
+    text = f"{number} left out: ICR after {report.horizons_m[h]:g} m {', '.join(errors)}"
+    return wrap(f"{text} ({int(cost.trials[h]):,} trials cross one)", TABLE_WIDTH, subsequent_indent="  ")
 
 
 def why_no_trial(report: DropoutReport, h: int) -> str | None:
@@ -214,6 +240,7 @@ def why_no_trial(report: DropoutReport, h: int) -> str | None:
     reasons = (
         (counts.short[h], f"less than that is left of the {driven} driven"),
         (counts.gap[h], "the path crosses a gap in the wheel data"),
+        (0 if report.event_cost is None else report.event_cost.trials[h], "the path crosses a slip event"),
         (counts.outage[h], "it ends in a GNSS outage"),
         (counts.standing[h], "the robot stands"),
     )

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.wheel_alignment import bridged
 from icrtool.config import load_config
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.tables import GyroSamples, HeadingSamples, PositionFixes, RobotLog, WheelSamples
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
@@ -128,3 +131,81 @@ def test_a_configured_scale_is_not_touched() -> None:
     check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"])).wheels
     assert check.applied == (1.0, 1.0)
     assert any("check wheel radius" in warning for warning in check.warnings)
+
+
+def with_gaps(log: RobotLog, *, every_s: float, gap_s: float, from_position: bool) -> RobotLog:
+    """Leave out wheel samples; what remains holds the mean speed to the next sample, as counts give it."""
+    t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
+    kept = np.flatnonzero(np.mod(t + gap_s, every_s) >= gap_s)
+    sides = []
+    for speed in (log.wheels.v_left_mps, log.wheels.v_right_mps):
+        travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(t))])
+        sides.append(np.append(np.diff(travelled[kept]) / np.diff(t[kept]), speed[-1]))
+    return replace(log, wheels=WheelSamples(log.wheels.stamp_ns[kept], *sides, from_position=from_position))
+
+
+def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
+    log = make_log(seconds=180.0)
+    whole = fit(log, CONFIG)
+    runs = [fit(with_gaps(log, every_s=8.0, gap_s=2.0, from_position=kind), CONFIG) for kind in (True, False)]
+    counted, open_ = runs
+    assert not counted.in_gap.any()
+    assert np.count_nonzero(open_.in_gap) == len(open_.summary["wheel_gaps_ns"]) > 20
+    assert any("are bridged" in warning for warning in counted.warnings)
+    assert not any("are bridged" in warning for warning in open_.warnings)
+    distance = whole.summary["drive"]["distance_m"]
+    assert counted.summary["drive"]["distance_m"] == pytest.approx(distance, rel=0.01)
+    assert counted.table.distance_m[-1] == pytest.approx(whole.table.distance_m[-1], rel=0.01)
+    final = counted.summary["icr"]["final"]
+    assert (final["y_icr_right_m"], final["y_icr_left_m"]) == pytest.approx(ICRS[:2], abs=ICR_TOLERANCE_M)
+    trials, missing, full = (dropout_report(run).summary for run in (counted, open_, whole))
+
+    def count(summary):  # type: ignore[no-untyped-def]
+        return int(summary.set_index(["model", "horizon_m"]).loc[("icr", 20.0), "trials"])
+
+    assert count(missing) == 0 or count(missing) < 0.2 * count(full)
+    assert count(trials) > 0.9 * count(full)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_wheel_samples_have_nothing_to_bridge(count: int) -> None:
+    stamps = np.arange(count, dtype=np.int64) * 100_000_000
+    wheels = WheelSamples(stamps, np.ones(count), np.ones(count), from_position=True)
+    assert bridged(wheels, 0.5) == (wheels, "")
+
+
+def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
+    stamps = np.concatenate([np.arange(50), np.arange(200, 250)]).astype(np.int64) * 100_000_000
+    wheels = WheelSamples(stamps, np.ones(100), np.ones(100), from_position=True)
+    assert bridged(wheels, 0.5)[0] is wheels
+    short = replace(wheels, stamp_ns=np.where(stamps > 10**10, stamps - 12 * 10**9, stamps))
+    filled, note = bridged(short, 0.5)
+    assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
+    assert note.startswith("1 gaps")
+
+
+def test_a_robot_on_a_stand_is_refused() -> None:
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    count = len(log.gnss.north_m)
+    gnss = replace(log.gnss, north_m=rng.normal(3.0, 0.01, count), east_m=rng.normal(-2.0, 0.01, count))
+    heading = replace(log.heading, heading_rad=rng.normal(0.4, 0.01, len(log.heading.heading_rad)))
+    with pytest.raises(DataError, match="the robot does not move"):
+        fit(replace(log, gnss=gnss, heading=heading), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("message_type", "share", "warned"),
+    [("nav_msgs/Odometry", 1.0, True), ("nav_msgs/Odometry", 0.9, False), ("sensor_msgs/JointState", 1.0, False)],
+)
+def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: float, warned: bool) -> None:
+    """A turn rate of the wheels that is the gyro's was not measured by wheels."""
+    log, rng = make_log(seconds=120.0), np.random.default_rng(0)
+    speed = (log.wheels.v_left_mps + log.wheels.v_right_mps) / 2
+    rate = np.gradient(np.unwrap(log.heading.heading_rad), 0.02)
+    rate = np.convolve(rate, np.ones(50) / 50, "same") + rng.normal(0.0, 0.002, len(rate))
+    turn = share * rate + (1.0 - share) * rng.normal(0.0, 0.3, len(rate))
+    streams = tuple(replace(stream, message_type=message_type) for stream in log.streams)
+    gyro = GyroSamples("/imu", log.wheels.stamp_ns, rate)
+    fused = replace(with_wheels(log, speed + 0.4 * turn, speed - 0.4 * turn), streams=streams, gyro=gyro)
+    warnings = align_streams(fused, CONFIG).warnings
+    assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned

@@ -49,6 +49,8 @@ def results(request, stage):
     directory = one_log.path_of(request.directory)
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
+    if request.page:
+        (directory / "report.html").touch()
     return replace(request.row, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
 
@@ -137,6 +139,14 @@ def test_a_row_file_that_is_damaged_is_not_trusted(season: Path) -> None:
     for content in (b"", b"{}", b"[", file.read_bytes()[:-20]):
         file.write_bytes(content)
         assert run(season)["a"].status == "done"
+
+
+def test_a_finished_log_without_a_page_is_processed_again_where_one_is_asked_for(season: Path) -> None:
+    add(season, "a")
+    assert run(season, page=False)["a"].status == "done"
+    assert run(season, page=False)["a"].status == "skipped"
+    assert run(season)["a"].status == "done"
+    assert run(season)["a"].status == "skipped"
 
 
 def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) -> None:

@@ -12,6 +12,7 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, MissingStreamError
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.read_log import Survey, assemble
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.select import (
     Candidates,
@@ -20,7 +21,9 @@ from icrtool.logs.streams.select import (
     common_clock,
     fields_to_take,
     find_candidates,
+    other_references,
 )
+from icrtool.records.text import LogText
 
 COUNT = 50
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
@@ -330,7 +333,7 @@ def test_a_topic_whose_messages_are_all_damaged_says_so() -> None:
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ("topics.gnss=/other/fix", r"topics\.gnss: /other/fix is not in drive\.bag; it holds /joint_states \("),
+        ("topics.gnss=/other/fix", r"topics\.gnss: /other/fix is not in drive\.bag; did you mean /empty/fix\?"),
         ("topics.gnss=/imu/data", r"topics\.gnss: /imu/data: sensor_msgs/Imu cannot feed it; it needs a GNSS fix"),
         ("topics.heading=/joint_states", r"topics\.heading: /joint_states: sensor_msgs/JointState cannot feed it"),
         (
@@ -431,3 +434,30 @@ def test_an_odometry_is_read_for_all_its_roles_at_once() -> None:
 )
 def test_streams_that_are_used_together_go_by_one_clock(delays: list[float | None], clock: str) -> None:
     assert common_clock(delays) == clock
+
+
+def test_a_lidar_pose_is_another_reference_beside_gnss_and_brings_its_heading() -> None:
+    tables = [joints(), fix(), imu(), odometry("/lidar/odom", "map"), odometry("/odometry/filtered", "map")]
+    config = load_config()
+    found = find_candidates(tables, config, {})
+    choice = choose_streams(found, config, "log", [])
+    assert choice.gnss.topic == "/gps/fix"
+    (other,) = other_references(found, choice, config)
+    assert (other.gnss.topic, other.heading.topic if other.heading else "") == ("/lidar/odom", "/lidar/odom")
+    assert other.wheels is choice.wheels
+    configured = load_config(sets=["topics.gnss=/gps/fix"])
+    assert other_references(found, choice, configured) == ()
+
+
+def test_a_log_holds_its_other_references_with_their_own_frame() -> None:
+    tables = [joints(), fix(), imu(), odometry("/lidar/odom", "map")]
+    config = load_config(sets=["robot.wheel_radius_m=0.2"])
+    name = LogText("drive")
+    log = assemble(Survey(name, name, (), tuple(tables), find_candidates(tables, config, {}), (), ()), config)
+    (other,) = log.other_references
+    assert {stream.role: stream.topic for stream in log.streams}["gnss"] == "/gps/fix"
+    assert {stream.role: stream.topic for stream in other.streams}["gnss"] == "/lidar/odom"
+    assert log.datum is not None
+    assert other.datum is None
+    assert np.array_equal(other.wheels.left, log.wheels.left)
+    assert np.ptp(other.gnss.north_m) == pytest.approx(np.ptp(WAVE))

@@ -1,0 +1,105 @@
+"""``icrtool report``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from icrtool.cli.fit import RUNS
+
+
+@click.command("report")
+@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
+              help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
+@click.option("--no-coordinates", is_flag=True, help="Leave out where on the globe a run was: to pass the page on.")
+@click.option("-q", "--quiet", is_flag=True, help="Print no results.")
+def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
+    """Write a run, a fleet or a comparison as one HTML file that needs no network.
+
+    RUN is a directory that `icrtool fit` wrote, with or without its dropout report; FLEET the folder of `icrtool
+    batch`; COMPARISON what `icrtool compare -o` wrote. Without an argument: the newest run below icrtool-runs/.
+
+    \b
+    Example:
+      icrtool report
+      icrtool report icrtool-runs/field -o field.html --no-coordinates
+      icrtool report results/
+    """  # noqa: D301 - click reads the escape
+    from icrtool.errors import ConfigError
+    from icrtool.output.atomic_file import check_place
+    from icrtool.output.stored_run import newest_run
+
+    sources = sources or (newest_run(RUNS),)
+    if output is not None and len(sources) > 1:
+        raise ConfigError("-o", "names one file for several pages", "leave it out: each page goes to its own directory")
+    for source in sources:
+        place = output if output is not None else _default_place(source)
+        check_place(place)
+        _write(source, place, coordinates=not no_coordinates)
+        if not quiet:
+            click.echo(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
+
+
+def _default_place(source: Path) -> Path:
+    from icrtool.output.run_directory import PAGE_FILE
+
+    return source / PAGE_FILE if source.is_dir() else source.with_suffix(".html")
+
+
+def _write(source: Path, place: Path, *, coordinates: bool) -> None:
+    """Write the page of one source, whatever it is."""
+    import json
+
+    from icrtool.errors import RunError
+    from icrtool.output.page.comparison_page import comparison_in, comparison_page, schema_of
+    from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
+    from icrtool.output.page.render import write_html
+    from icrtool.output.run_directory import is_run_directory
+
+    if is_run_directory(source):
+        page = _page_of_run(source, coordinates=coordinates)
+    elif (schema_of(source / FLEET_FILE) or "").startswith(FLEET_FAMILY):
+        with _as_written(source / FLEET_FILE, "run icrtool batch again"):
+            page = fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source)
+    elif (file := comparison_in(source)) is not None:
+        with _as_written(file, "run icrtool compare again"):
+            page = comparison_page(json.loads(file.read_bytes()), file.stem)
+    else:
+        what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
+        raise RunError(source, what, "icrtool fit, batch and compare make one")
+    write_html(page, place)
+
+
+def _page_of_run(directory: Path, *, coordinates: bool) -> str:
+    """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
+    from icrtool.output.dropout_directory import report_document
+    from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page
+    from icrtool.output.stored_run import open_run
+
+    run, report, pictures = open_run(directory), read_report(directory), pictures_of_run(directory)
+    if "trajectory" not in pictures:
+        pictures = draw_pictures(run) | pictures
+    if report is None:
+        from icrtool.dropout_analysis.dropout_report import dropout_report
+
+        return run_page(run, report_document(dropout_report(run)), pictures, coordinates=coordinates)
+    with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
+        return run_page(run, report, pictures, coordinates=coordinates)
+
+
+@contextmanager
+def _as_written(place: Path, advice: str) -> Iterator[None]:
+    """Refuse a document that was edited, or that another version wrote."""
+    from jinja2 import TemplateError
+
+    from icrtool.errors import RunError
+    from icrtool.output.page.render import DOCUMENT_ERRORS
+
+    try:
+        yield
+    except (*DOCUMENT_ERRORS, TemplateError) as err:
+        raise RunError(place, "is not as this version of icrtool writes it", advice) from err

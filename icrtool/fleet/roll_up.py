@@ -1,0 +1,173 @@
+"""What a batch has in common: one calibration per robot and group, tested on each log left out, and the groups."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from icrtool import __version__
+from icrtool.errors import ConfigError, IcrToolError, LogError
+from icrtool.fleet.row import Row
+from icrtool.output.atomic_file import atomic_file
+from icrtool.output.run_directory import json_bytes
+
+CALIBRATIONS = "calibrations"
+"""Folder of the calibration files below that of the batch."""
+
+FLEET_FILE = "fleet.json"
+
+
+@dataclass(frozen=True, slots=True)
+class PooledCalibration:
+    """The calibration of all logs of one robot in one group.
+
+    Attributes
+    ----------
+    logs : that it is fitted to
+    left_out : logs that are not usable
+    file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
+    recommended, multiplier, multiplier_std : of the calibration
+    table : leave-one-log-out table as text
+    """
+
+    robot: str
+    group: str
+    logs: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
+    file: str = ""
+    reason: str = ""
+    recommended: str = ""
+    multiplier: float | None = None
+    multiplier_std: float | None = None
+    table: str = ""
+    key: str = ""
+
+
+def pooled_calibrations(rows: Sequence[Row], directory: Path) -> Iterator[PooledCalibration]:
+    """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
+
+    Parameters
+    ----------
+    directory : of the batch, where the runs are; calibration files are written below it
+    """
+    before = {one.key: one for one in _stored(directory)}
+    names: set[str] = set()
+    for (robot, group), members in groups_of(rows).items():
+        key = sha256(
+            msgspec.json.encode([__version__, [(row.log, row.key, row.inputs) for row in members]])
+        ).hexdigest()
+        name = _file_name(robot, group, names)
+        known = before.get(key)
+        if known is not None and (not known.file or (directory / known.file).is_file()):
+            yield known
+        else:
+            logs = tuple(row.log for row in members)
+            yield _pooled(PooledCalibration(robot, group, logs, key=key), members, directory, name)
+
+
+def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Return the logs that could be used, by robot and group."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.status != "failed":
+            found.setdefault((row.robot, row.group), []).append(row)
+    return dict(sorted(found.items()))
+
+
+def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
+    """Return the run directories of a batch by the name of their group: of the manifest, else of the robot.
+
+    Robots that are in the same group of the manifest are distinguished.
+
+    Raises
+    ------
+    LogError
+        The folder does not hold the result of a batch.
+    """
+    try:
+        logs = json.loads((directory / FLEET_FILE).read_bytes())["logs"]
+        used = [(str(one["robot"]), str(one["group"]), str(one["run"])) for one in logs if one["status"] != "failed"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
+        raise LogError(directory, f"its {FLEET_FILE} cannot be read", "name the folder of a batch") from err
+    robots = {robot for robot, _, _ in used}
+    found: dict[str, list[Path]] = {}
+    for robot, group, run in used:
+        name = group if group and len(robots) == 1 else f"{robot} {group}".strip() or directory.name
+        found.setdefault(name, []).append(directory / run)
+    return found
+
+
+def is_fleet(directory: Path) -> bool:
+    """Return whether a folder is that of a batch."""
+    return (directory / FLEET_FILE).is_file()
+
+
+def calibration_documents(found: Sequence[PooledCalibration]) -> list[dict[str, Any]]:
+    """Return plain data for fleet.json."""
+    return [asdict(one) for one in found]
+
+
+def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, name: str) -> PooledCalibration:
+    from icrtool.calibration.from_runs import robot_of
+    from icrtool.calibration.pooled import calibrate, gyro_recording_of
+    from icrtool.output.stored_run import open_run
+    from icrtool.output.tables.held_out import format_held_out
+
+    recordings, robots, left_out, seen = [], [], [], set()
+    try:
+        for row in members:
+            run = open_run(directory / row.run)
+            files = tuple(file["sha256"] for file in run.summary["inputs"])
+            # A copy of a log would be tested on itself.
+            if not run.usable or files in seen:
+                left_out.append(row.log)
+                continue
+            seen.add(files)
+            recordings.append(gyro_recording_of(run))
+            robots.append(robot_of(run))
+        if not recordings:
+            raise ConfigError("calibration", "no log of it is usable")
+        if len({robot["wheel_radius_m"] for robot in robots}) > 1:
+            raise ConfigError("robot.wheel_radius_m", "differs between the logs", "parameters refer to it")
+        result = calibrate(recordings, robots[0])
+    except IcrToolError as err:
+        return _without(one, tuple(left_out), str(err))
+    (directory / CALIBRATIONS).mkdir(exist_ok=True)
+    file = f"{CALIBRATIONS}/{name}.json"
+    with atomic_file(directory / file) as partial:
+        partial.write_bytes(json_bytes(result.calibration.summary()))
+    numbers = result.calibration.controller_numbers()
+    table = "\n".join(format_held_out(result.wheels))
+    used = tuple(log for log in one.logs if log not in left_out)
+    return PooledCalibration(one.robot, one.group, used, tuple(left_out), file, "", result.calibration.recommended,
+                             float(numbers.multiplier), float(numbers.multiplier_std), table, one.key)  # fmt: skip
+
+
+def _without(one: PooledCalibration, left_out: tuple[str, ...], reason: str) -> PooledCalibration:
+    return PooledCalibration(one.robot, one.group, one.logs, left_out, reason=reason, key=one.key)
+
+
+def _stored(directory: Path) -> list[PooledCalibration]:
+    """Return the calibrations of an earlier batch in the same folder."""
+    try:
+        document: Mapping[str, Any] = json.loads((directory / FLEET_FILE).read_bytes())
+        return [msgspec.convert(one, PooledCalibration) for one in document.get("calibrations", [])]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, msgspec.ValidationError):
+        return []
+
+
+def _file_name(robot: str, group: str, taken: set[str]) -> str:
+    """Return a file name for a robot and group, distinct from those that are taken."""
+    text = "-".join(part for part in (robot, group) if part) or "all"
+    name = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text)[:100].strip(".") or "all"
+    unique, number = name, 2
+    while unique.casefold() in taken:
+        unique, number = f"{name}-{number}", number + 1
+    taken.add(unique.casefold())
+    return unique

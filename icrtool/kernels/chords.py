@@ -1,0 +1,29 @@
+"""Chords of a path: how far a robot went, without the noise of its positions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.compiled import njit
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@njit
+def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
+    """Return the first row (c,) and each that is the first at least a step away from the one before it.
+
+    Parameters
+    ----------
+    north, east : (n,) [m], at least one
+    """
+    rows, count = np.empty(len(north), np.int64), 1
+    rows[0] = 0
+    for k in range(1, len(north)):
+        a, b = north[k] - north[rows[count - 1]], east[k] - east[rows[count - 1]]
+        if a * a + b * b >= step_m * step_m:
+            rows[count] = k
+            count += 1
+    return rows[:count]

@@ -1,0 +1,244 @@
+"""The answer that a page begins with: how far without GNSS, which numbers for the controller, whether to trust it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+from icrtool.calibration.record import Calibration, calibration_of
+from icrtool.errors import DataError
+from icrtool.output.exports.controllers import format_export
+from icrtool.output.tables.dropout import metres_text, reach_text
+from icrtool.output.text_format import signed
+from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+
+Grade = Literal["good", "care", "bad", "fact"]
+
+NAMES = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+
+
+class Reach(NamedTuple):
+    """How far the best model stays within a budget, and the others."""
+
+    budget_m: float
+    label: str
+    text: str
+    interval: str
+    others: tuple[tuple[str, str], ...]
+
+
+class Number(NamedTuple):
+    """A number for a controller with its standard deviation, and what it is."""
+
+    name: str
+    value: str
+    meaning: str
+
+
+class Check(NamedTuple):
+    """One reason to trust the numbers, or not to."""
+
+    grade: Grade
+    text: str
+
+
+class Answer(NamedTuple):
+    """What a reader wants to know first.
+
+    Attributes
+    ----------
+    grade, verdict : may the numbers be used, in one word and in one sentence
+    no_reach, no_numbers : reason why there is no distance, or no number; empty where there is one
+    icrs : name and final value of each
+    export : configuration of a diff_drive_controller; empty without a calibration
+    """
+
+    grade: Grade
+    verdict: str
+    reaches: tuple[Reach, ...]
+    no_reach: str
+    numbers: tuple[Number, ...]
+    icrs: tuple[tuple[str, str], ...]
+    no_numbers: str
+    export: str
+    model: str
+    checks: tuple[Check, ...]
+
+
+def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
+    """Return the answer of a run.
+
+    Parameters
+    ----------
+    summary : of the run, equal to its run.json
+    report : what report.json holds
+    """
+    found = report["recommended"]
+    calibration = calibration_of({**found, "created": ""}) if found is not None else None
+    warnings = len(summary["warnings"])
+    grade: Grade
+    if not summary["usable"]:
+        grade, verdict = "bad", f"No: {summary['unusable_because']}."
+    elif not report["passed"]:
+        grade, verdict = "bad", "No: an acceptance limit was exceeded."
+    elif warnings:
+        grade, verdict = "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
+    else:
+        grade, verdict = "good", "Yes."
+    reaches = _reaches(report)
+    numbers, no_numbers = _numbers(summary, calibration)
+    return Answer(
+        grade=grade,
+        verdict=verdict,
+        reaches=reaches,
+        no_reach="" if reaches else "no trial is as long as the shortest horizon",
+        numbers=numbers,
+        icrs=_icrs(summary["icr"]),
+        no_numbers=no_numbers,
+        export=_export(calibration),
+        model=calibration.fitted.model.label if calibration is not None else "",
+        checks=tuple(_checks(summary, report)),
+    )
+
+
+def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
+    def interval_text(one: BudgetDistance) -> str:
+        known = math.isfinite(one.low_m + one.high_m)
+        return f"{one.low_m:.1f} to {one.high_m:.1f} m" if known else "too few trials for an interval"
+
+    known = [
+        BudgetDistance(**{**one, "between_m": tuple(one["between_m"]), "low_m": number(one["low_m"]),
+                          "high_m": number(one["high_m"])})
+        for one in report["budgets"]
+    ]  # fmt: skip
+    found = []
+    for budget_m in dict.fromkeys(one.budget_m for one in known):
+        mine = [one for one in known if one.budget_m == budget_m]
+        best = next((one for one in mine if one.model == "recommended"), mine[0])
+        others = tuple((one.label, reach_text(one)) for one in mine if one is not best)
+        found.append(Reach(budget_m, best.label, reach_text(best), interval_text(best), others))
+    return tuple(found)
+
+
+def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tuple[tuple[Number, ...], str]:
+    icr, numbers = summary["icr"], []
+    width = summary["config"]["robot"]["track_width_m"]
+    if calibration is not None:
+        one = calibration.controller_numbers()
+        numbers += [
+            Number("wheel_separation_multiplier", f"{one.multiplier:.3f} ± {one.multiplier_std:.3f}",
+                   f"the robot turns as if its tracks were {one.multiplier:.2f} times as far apart as {width:g} m"),
+            Number("left_wheel_radius_multiplier", f"{one.left_radius:.3f} ± {one.left_radius_std:.3f}",
+                   "left wheels roll this share of the configured radius"),
+            Number("right_wheel_radius_multiplier", f"{one.right_radius:.3f} ± {one.right_radius_std:.3f}",
+                   "right wheels roll this share of the configured radius"),
+        ]  # fmt: skip
+    elif icr["separation_multiplier"] is not None:
+        value, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
+        text = f"{value:.3f} ± {std:.3f}" if std is not None else f"{value:.3f}"
+        numbers.append(
+            Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")
+        )
+    if width is None:
+        return tuple(
+            numbers
+        ), "robot.track_width_m is not known: without it there is no multiplier and no no-slip model."
+    return tuple(numbers), "" if numbers else "The drive shows none of them."
+
+
+def _icrs(icr: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    final, std = icr["final"], icr["final_std"]
+    return tuple(
+        (name, f"{signed(final[column])} ± {std[column]:.3f}" if final[column] is not None else "not shown")
+        for column, name in NAMES.items()
+    )
+
+
+def _export(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return ""
+    try:
+        return format_export(calibration, "diff_drive_controller")
+    except DataError:
+        return ""
+
+
+def _checks(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
+    """Return the reasons, the gravest first."""
+    grades: dict[Grade, int] = {"bad": 0, "care": 1, "good": 2, "fact": 3}
+    found = [_excitation(summary), *_limits(report), *_incidents(summary, report), *_trials(report)]
+    return sorted(found, key=lambda one: grades[one.grade])
+
+
+def _excitation(summary: Mapping[str, Any]) -> Check:
+    shown = summary["excitation"]
+    weak = [f"{NAMES[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
+    turned = f"it turned {shown['turned_right_deg']:,.0f}° right and {shown['turned_left_deg']:,.0f}° left"
+    if weak:
+        return Check(
+            "care", f"The drive does not show every ICR ({', '.join(weak).replace('weak', 'weakly shown')}): {turned}."
+        )
+    return Check("good", f"The drive shows all three ICRs: {turned}.")
+
+
+def _limits(report: Mapping[str, Any]) -> list[Check]:
+    return [
+        Check("good" if one["passed"] else "bad", f"Acceptance limit: {one['verdict']}.") for one in report["gates"]
+    ]
+
+
+def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
+    """Return what happened on the drive: warnings, slip, outages, rejected fixes."""
+    gnss, events = summary["gnss"], summary["events"]
+    found = []
+    if warnings := len(summary["warnings"]):
+        found.append(Check("care", f"{_count(warnings, 'warning')} about the log: see below."))
+    if events:
+        kinds = [one["kind"] for one in events]
+        each = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+        found.append(Check("care", f"{_count(len(events), 'slip event')} ({each}); the ICRs are not learned there."))
+    real = [one for one in report["outages"] if one["kind"] == "real"]
+    if real:
+        worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
+        error = f"{metres_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
+        found.append(Check("fact", f"{_count(len(real), 'real outage')}: in the worst the filter was {error}."))
+    of = gnss["used"] + gnss["rejected"]
+    if of:
+        share = 100 * gnss["rejected"] / of
+        found.append(Check("fact", f"{share:.0f} % of the positions were rejected ({gnss['rejected']:,} of {of:,})."))
+    if gnss["jumps"]:
+        text = f"{_count(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
+        found.append(Check("care", text))
+    return found
+
+
+def _trials(report: Mapping[str, Any]) -> list[Check]:
+    """Return how many trials the distances rest on, and what share of the error the reference itself may have."""
+    rows = [row for row in report["trials"] if row["trials"]]
+    if not rows:
+        return [Check("bad", "No trial was long enough to measure an error.")]
+    row = min(rows, key=lambda one: abs(one["horizon_m"] - CHOICE_HORIZON_M))
+    found = [
+        Check(
+            "fact", f"{row['trials']:,} trials of {row['horizon_m']:g} m were driven from {report['starts']:,} states."
+        )
+    ]
+    h = [one["horizon_m"] for one in report["reference_error"]]
+    if row["horizon_m"] in h:
+        own = report["reference_error"][h.index(row["horizon_m"])]["p95_m"]
+        mine = next((one for one in report["models"] if one["name"] == "icr"), None)
+        p95 = (
+            None if mine is None else next(r["p95_m"] for r in mine["by_horizon"] if r["horizon_m"] == row["horizon_m"])
+        )
+        if own is not None and p95 is not None:
+            what = f"the {metres_text(p95)} error of the ICRs after {row['horizon_m']:g} m (95 %)"
+            found.append(Check("fact", f"Up to {metres_text(own)} of {what} can be the position reference's own."))
+    return found
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -1,0 +1,223 @@
+"""The numbers that the script of a run's page draws: the drive, decimated, and the wheels, from which paths are driven.
+
+Time series keep the least and the greatest value of each interval. The wheels are not thinned up to `MOST_STEPS`: an
+open-loop path that the page integrates ends where the library's does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.pooled import recorded_rates, recording_of
+from icrtool.calibration.record import Calibration, calibration_of
+from icrtool.errors import DataError
+from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
+from icrtool.kernels.filter_records import GATED, UNSEEN
+from icrtool.motion.trials import wheels_path
+from icrtool.output.figures.decimate import extremes, places
+from icrtool.output.page.columns import packed, packed_sums
+from icrtool.records.run import Run, drive_of
+from icrtool.records.tables import Bools, Ints
+
+MOST_STEPS = 150_000
+"""Wheel samples of a page; of more, equally many are joined to one."""
+
+SERIES_POINTS = 16_000
+"""Rows of the time series: some ten per pixel column, so that a stretch of a tenth still has its extremes."""
+
+FIX_POINTS = 8_000
+
+PATH_CELLS = 4000.0
+"""An odometry path has a point in each cell of this fraction of the drive's extent."""
+
+ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", "expected": "expected_error_m",
+              "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
+
+
+class Steps(NamedTuple):
+    """Which states a page has, all of them or every `joined`-th.
+
+    Attributes
+    ----------
+    rows : (n,) states; the last one is always there
+    joined : wheel samples between two of them
+    """
+
+    rows: Ints
+    joined: int
+
+
+def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dict[str, Any]:
+    """Return plain data for the page of a run.
+
+    Parameters
+    ----------
+    run : what trials of `report` are compared with are its states
+    report : what report.json holds
+    coordinates : whether the axes of the map count from the datum; else from the first state
+    """
+    table = run.table
+    joined = -(-len(table) // MOST_STEPS)
+    steps = Steps(np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1)), joined)
+    origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
+    return {
+        "origin": origin if coordinates else None,
+        "duration_s": float(table.t_s[-1]),
+        "steps": _steps_data(run, steps, origin),
+        "series": _series_data(run, steps),
+        "fixes": _fixes_data(run, origin),
+        "headings": _headings_data(run),
+        "odometry": _odometry_data(odometry(run), run, origin),
+        "models": _models(run, report, steps),
+        "events": _events_data(run, origin),
+        "outages": [
+            {"kind": one["kind"], "begin_s": one["begin_s"], "end_s": one["end_s"]} for one in report["outages"]
+        ],
+        "changes_s": list(run.changes_s),
+        "errors": errors_data(report),
+        "budgets_m": sorted({one["budget_m"] for one in report["budgets"]}),
+    }
+
+
+def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the errors over distance by model, and those of the reference alone."""
+    models = report["models"]
+    reference = report["reference_error"]
+    return {
+        "horizons_m": [row["horizon_m"] for row in models[0]["by_horizon"]] if models else [],
+        "models": [
+            {"name": one["name"], "label": one["label"]}
+            | {key: [row[column] for row in one["by_horizon"]] for key, column in ERROR_KEYS.items()}
+            for one in models
+        ],
+        "reference": {"p95": [row["p95_m"] for row in reference], "expected": [row["expected_m"] for row in reference]},
+    }
+
+
+def _steps_data(run: Run, steps: Steps, origin: tuple[float, float]) -> dict[str, Any]:
+    """Return what the wheels did and where the reference was, at every step."""
+    drive, rows = drive_of(run), steps.rows
+    held = np.where(drive.gap, 0.0, drive.dt_s)
+    held[-1] = 0.0
+    columns = {
+        "left": np.concatenate([[0.0], np.cumsum(held * drive.v_left)[:-1]]),
+        "right": np.concatenate([[0.0], np.cumsum(held * drive.v_right)[:-1]]),
+        "distance": drive.distance,
+        "north": drive.north,
+        "east": drive.east,
+    }
+    gaps = np.searchsorted(rows, np.flatnonzero(drive.gap), side="right") - 1
+    return {
+        "joined": steps.joined,
+        "first_north": float(drive.north[0]) - origin[0],
+        "first_east": float(drive.east[0]) - origin[1],
+        "gaps": np.unique(gaps).tolist(),
+        "without_reference": _spans(drive.in_outage[rows]),
+    } | {name: packed_sums(column[rows]) for name, column in columns.items()}
+
+
+def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
+    """Return the states that the time series show; each is a step too."""
+    table = run.table
+    columns = {
+        "v_left": table.v_left_mps, "v_right": table.v_right_mps,
+        "y_right": table.y_icr_right_m, "y_left": table.y_icr_left_m, "x": table.x_icr_m,
+    }  # fmt: skip
+    at = {name: column[steps.rows] for name, column in columns.items()}
+    rows = extremes(*at.values(), points=SERIES_POINTS)
+    state = steps.rows[rows]
+    at |= {
+        "std_y_right": table.std_y_icr_right_m[steps.rows], "std_y_left": table.std_y_icr_left_m[steps.rows],
+        "std_x": table.std_x_icr_m[steps.rows],
+        "heading": np.angle(np.exp(1j * table.heading_rad[steps.rows])),
+    }  # fmt: skip
+    return {"step": packed(rows, "i32"), "t": packed(table.t_s[state], "f64")} | {
+        name: packed(column[rows], "f32") for name, column in at.items()
+    }
+
+
+def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+    """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
+    fixes, code = run.sensors.fixes, run.gnss.code
+    groups = {"used": (code > UNSEEN) & (code != GATED), "rejected": code == GATED}
+    found = {}
+    for name, chosen in groups.items():
+        difference = run.gnss.difference[chosen]
+        rows = np.flatnonzero(chosen)[extremes(difference, points=FIX_POINTS)] if len(difference) else np.empty(0, int)
+        found[name] = {
+            "t": packed(run.gnss.t_s[rows], "f64"),
+            "north": packed(fixes.north_m[rows] - origin[0], "f32"),
+            "east": packed(fixes.east_m[rows] - origin[1], "f32"),
+            "difference": packed(run.gnss.difference[rows], "f32"),
+        }
+    return found
+
+
+def _headings_data(run: Run) -> dict[str, Any]:
+    """Return how far the headings that the filter used were from its own [deg]."""
+    heading = run.heading
+    used = np.flatnonzero((heading.code > UNSEEN) & (heading.code != GATED))
+    rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
+    return {
+        "t": packed(heading.t_s[rows], "f64"),
+        "difference_deg": packed(np.degrees(heading.difference[rows]), "f32"),
+    }
+
+
+def _odometry_data(found: Odometry, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+    table = run.table
+    extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
+
+    def path(one: OdometryPath | None) -> dict[str, Any] | None:
+        if one is None:
+            return None
+        rows = places(one.north_m, one.east_m, extent / PATH_CELLS)
+        north, east = one.north_m[rows] - origin[0], one.east_m[rows] - origin[1]
+        return {"north": packed(north, "f32"), "east": packed(east, "f32"), "t": packed(table.t_s[rows], "f32")}
+
+    return {"icr": path(found.icr), "no_slip": path(found.no_slip)}
+
+
+def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str, Any]]:
+    """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
+    labels = {one["name"]: one["label"] for one in report["models"]}
+    b, table = run.track_width_m, run.table
+    last = [float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)]
+    icrs: dict[str, Sequence[float] | None] = {"icr": None, "no_slip": None if b is None else [b / 2, -b / 2, 0.0],
+                                               "icr_final": last}  # fmt: skip
+    models: list[dict[str, Any]] = [
+        {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
+    ]
+    if report["recommended"] is not None and "recommended" in labels:
+        calibration = calibration_of({**report["recommended"], "created": ""})
+        if (path := _calibrated_path(run, calibration, steps)) is not None:
+            models.insert(0, {"name": "recommended", "label": labels["recommended"], "path": path})
+    return models
+
+
+def _calibrated_path(run: Run, calibration: Calibration, steps: Steps) -> dict[str, Any] | None:
+    recording = recording_of(run)
+    try:
+        place, heading = wheels_path(recording, *recorded_rates(calibration, recording))
+    except DataError:
+        # Too short a drive to find the delay of its wheels.
+        return None
+    columns = {"forward": place.real, "right": place.imag, "turn": heading}
+    return {name: packed_sums(column[steps.rows]) for name, column in columns.items()}
+
+
+def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:
+    return [
+        {"kind": one["kind"], "begin_s": one["begin_s"], "end_s": one["end_s"], "severity": one["severity"],
+         "north": one["north_m"] - origin[0], "east": one["east_m"] - origin[1]}
+        for one in run.summary["events"]
+    ]  # fmt: skip
+
+
+def _spans(flags: Bools) -> list[list[int]]:
+    """Return first and last row of each stretch of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]

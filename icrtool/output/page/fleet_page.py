@@ -1,0 +1,134 @@
+"""The page of a fleet: ``report.html`` in the folder of a batch, a table that leads to the logs' pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+from icrtool.output.page.render import render, write_html
+from icrtool.output.run_directory import PAGE_FILE
+from icrtool.output.tables.dropout import metres_text
+from icrtool.output.text_format import distance_text, duration_text
+
+FLEET_FILE = "fleet.json"
+
+FLEET_FAMILY = "icrtool/fleet/"
+
+HORIZON_M = 10.0
+"""At this distance the table shows the errors of each model."""
+
+MODELS = {"recommended": "recommended", "icr": "ICR", "no_slip": "no slip"}
+
+
+class Cell(NamedTuple):
+    """One cell of the table: what is shown, and the number it is sorted by (None: nothing to show)."""
+
+    text: str
+    order: float | str | None
+
+
+class Line(NamedTuple):
+    """One log of the table.
+
+    Attributes
+    ----------
+    link : relative address of its page; empty where there is none
+    """
+
+    log: str
+    link: str
+    status: str
+    group: str
+    robot: str
+    search: str
+    reason: str
+    cells: tuple[Cell, ...]
+
+
+def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
+    """Return the page of a fleet as HTML.
+
+    Parameters
+    ----------
+    document : what fleet.json holds
+    folder : of the batch; pages of logs that are there are linked
+    """
+    logs = list(document["logs"])
+    budgets = _budgets(logs)
+    lines = [_line(log, budgets, folder) for log in logs]
+    return render(
+        "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
+        counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
+        statuses=sorted({one.status for one in lines}), groups=sorted({one.group for one in lines} - {""}),
+        robots=sorted({one.robot for one in lines} - {""}), horizon_m=HORIZON_M,
+    )  # fmt: skip
+
+
+def write_fleet_page(document: Mapping[str, Any], folder: Path) -> None:
+    """Write the page of a fleet into its folder.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    write_html(fleet_page(document, folder), folder / PAGE_FILE)
+
+
+def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the error names of distances within a budget, of the best model that some log has."""
+    names = dict.fromkeys(name for log in logs for name in log["errors"] if "_within_" in name)
+    for model in MODELS:
+        if found := [name for name in names if name.startswith(f"{model}_within_")]:
+            return found
+    return []
+
+
+def _columns(budgets: Sequence[str]) -> list[str]:
+    within = [f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for" for name in budgets]
+    errors = [f"95 % after {HORIZON_M:g} m, {label}" for label in MODELS.values()]
+    fixed = ["start", "duration", "distance", "ICR y right", "ICR y left", "ICR x", "multiplier"]
+    return [*fixed, *within, *errors, "events", "warnings", "gates failed"]
+
+
+def _line(log: Mapping[str, Any], budgets: Sequence[str], folder: Path) -> Line:
+    words = (log["log"], log["status"], log["robot"], log["group"], log["reason"], *log["tags"])
+    return Line(
+        log=log["log"], link=_link(log["run"], folder), status=log["status"], group=log["group"], robot=log["robot"],
+        search=" ".join(map(str, words)).casefold(), reason=log["reason"], cells=tuple(_cells(log, budgets)),
+    )  # fmt: skip
+
+
+def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
+    icr, errors = log["icr"], log["errors"]
+    yield Cell(log["start_utc"].replace("T", " ").removesuffix("Z"), log["start_utc"] or None)
+    yield _cell(log["duration_s"], duration_text)
+    yield _cell(log["distance_m"], distance_text)
+    for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
+        yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
+    yield _with_std(log["multiplier"], log["multiplier_std"], "")
+    for name in (*budgets, *(f"{model}_p95_{HORIZON_M:g}m_m" for model in MODELS)):
+        yield _cell(errors.get(name), metres_text)
+    gates = sum(not verdict["passed"] for verdict in log["verdicts"])
+    for count in (log["events"], log["warnings"], gates):
+        yield Cell("" if count is None else f"{count}", count)
+
+
+def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the functions of text_format
+    return Cell("", None) if value is None else Cell(text(value), value)
+
+
+def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
+    if value is None:
+        return Cell("", None)
+    return Cell(f"{value:{sign}.3f}" + (f" ± {std:.3f}" if std is not None else ""), value)
+
+
+def _link(run: str, folder: Path) -> str:
+    """Return the relative address of a log's page; empty where it is not there, or would lead out of the folder."""
+    path = PurePosixPath(run)
+    if path.is_absolute() or ".." in path.parts or not (folder / path / PAGE_FILE).is_file():
+        return ""
+    return f"./{quote(str(path / PAGE_FILE))}"

@@ -1,0 +1,78 @@
+"""The pictures of a page: PNG files of a run directory, with a caption that states what to see."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Picture(NamedTuple):
+    """One picture of a page.
+
+    Attributes
+    ----------
+    name : of its file, without suffix
+    title, caption : one line; what it shows and what to see
+    source : data URL
+    """
+
+    name: str
+    title: str
+    caption: str
+    source: str
+
+
+CAPTIONS = {
+    "trajectory": (
+        "The drive from above",
+        "Filter and position reference should coincide. Odometry leaves them by what wheel speeds alone lose.",
+    ),
+    "icr_estimates": ("ICR estimates over time", "Good: the lines settle early and stay within their bands."),
+    "icr_clusters": (
+        "Where the ICRs lay",
+        "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
+    ),
+    "gnss_difference": (
+        "Filter and position reference",
+        "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
+    ),
+    "summary": (
+        "Error over distance",
+        "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
+    ),
+    "histogram": (
+        "Errors after one distance",
+        "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
+    ),
+    "examples": (
+        "Two typical trials",
+        "A turning and a straight one. The closer a coloured end lies to the black one, the better that model.",
+    ),
+    "worst": ("The worst trials", "What they share (a turn, a slope, a place) is where the model fails."),
+    "outages": ("Outages", "The path without GNSS, forced or real, and where the estimate was when fixes returned."),
+    "ladder": (
+        "Model comparison",
+        "Each model on distance it was not fitted to. Take the simplest of those that are about as good as the best.",
+    ),
+}
+"""By the first word of the file's name: title and caption."""
+
+WITH_PLACE = ("trajectory", "examples", "worst", "outages")
+"""Pictures whose axes may be coordinates of a map grid."""
+
+
+def pictures_in(directory: Path) -> dict[str, Picture]:
+    """Return the PNG pictures of a folder that this module knows, by name; none where the folder is not there."""
+    return pictures_of((file.stem, file.read_bytes()) for file in sorted(directory.glob("*.png")))
+
+
+def pictures_of(found: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
+    """Return pictures given as name and PNG file."""
+    pictures = {}
+    for name, content in found:
+        known = CAPTIONS.get(name) or CAPTIONS.get(name.partition("_")[0])
+        if known is not None:
+            pictures[name] = Picture(name, *known, f"data:image/png;base64,{b64encode(content).decode('ascii')}")
+    return pictures

@@ -1,0 +1,180 @@
+"""The page of a run: ``report.html`` in its directory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.errors import RunError
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
+from icrtool.output.figures.drawing_process import matplotlib_unsaid
+from icrtool.output.page.answer import answer_of
+from icrtool.output.page.drive_data import drive_data
+from icrtool.output.page.pictures import WITH_PLACE, Picture, pictures_in, pictures_of
+from icrtool.output.page.render import render, write_html
+from icrtool.output.page.without_place import without_place
+from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
+from icrtool.output.text_format import position_word
+from icrtool.records.plain_data import plain
+from icrtool.records.run import ICR_COLUMNS, Run
+
+SCRIPTS = (
+    "vendor/uPlot.iife.min.js",
+    "vendor/d3.min.js",
+    "columns.js",
+    "open_loop.js",
+    "charts.js",
+    "map.js",
+    "run.js",
+)
+
+TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
+"""Pictures that a browser with scripts draws itself; they are for printing, and for readers without scripts."""
+
+
+def write_page(
+    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True
+) -> None:
+    """Write a run and its dropout report as one HTML file.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    report : of `icrtool.dropout_report`
+    path : the file
+    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
+    coordinates : False leaves out where on the globe the robot was
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    pictures = pictures_of_run(plots if plots is not None else run.directory)
+    write_html(run_page(run, report_document(report), pictures, coordinates=coordinates), Path(path))
+
+
+def run_page(
+    run: Run, report: Mapping[str, Any], pictures: Mapping[str, Picture], *, coordinates: bool = True
+) -> str:  # fmt: skip
+    """Return the page of a run as HTML.
+
+    Parameters
+    ----------
+    run, coordinates : as in `write_page`
+    report : what report.json holds
+    pictures : by name; those that the page is to show where no script draws
+    """
+    document = plain(report)
+    if not coordinates:
+        pictures = _without_place(run, pictures)
+        run, document = without_place(run, document)
+    summary = run.summary
+    compared = with_smoothed_reference(run) if document.setdefault("smoothed", False) else run
+    return render(
+        "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
+        title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
+        pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
+        begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
+        errors=_error_rows(document), config=_config_lines(summary["config"]), coordinates=coordinates,
+        samples=len(run.table),
+    )  # fmt: skip
+
+
+def read_report(directory: Path) -> dict[str, Any] | None:
+    """Return what the report.json of a run directory holds; None where it has none.
+
+    Raises
+    ------
+    RunError
+        It is not a report of this version.
+    """
+    file = directory / DROPOUT_DIRECTORY / REPORT_FILE
+    try:
+        document = json.loads(file.read_bytes())
+        schema = document["schema"]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as err:
+        raise RunError(file, "cannot be read", "make it again with icrtool dropout-report") from err
+    if schema != DROPOUT_SCHEMA:
+        raise RunError(file, f"its schema is {schema}, this icrtool reads {DROPOUT_SCHEMA}", "make it again")
+    return dict(document)
+
+
+def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
+    """Return the pictures in a run's directory and in that of its dropout report."""
+    if directory is None:
+        return {}
+    return pictures_in(directory / "plots") | pictures_in(directory / DROPOUT_DIRECTORY / "plots")
+
+
+def draw_pictures(run: Run) -> dict[str, Picture]:
+    """Draw the pictures of a run anew, into memory."""
+    from io import BytesIO
+
+    from icrtool.output.figures.run_figures import FIGURES
+    from icrtool.output.figures.style import style
+
+    found = []
+    with matplotlib_unsaid():
+        for name, draw in FIGURES.items():
+            with style():
+                image = BytesIO()
+                draw(run).savefig(image, format="png")
+                found.append((name, image.getvalue()))
+    return pictures_of(found)
+
+
+def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Picture]:
+    """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
+    metric = run.summary["gnss"]["datum"] is None
+    return {name: one for name, one in pictures.items() if not (metric and name.partition("_")[0] in WITH_PLACE)}
+
+
+def _utc(stamp_ns: int) -> str:
+    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
+    horizons = [row["horizon_m"] for row in report["trials"]]
+    distances = np.array(horizons)
+    shown = sorted({int(np.argmin(np.abs(distances - metres))) for metres in SHOWN_HORIZONS_M}) if horizons else []
+    models = sorted(report["models"], key=lambda one: one["name"] != "recommended")
+    return {
+        "horizons_m": [horizons[h] for h in shown],
+        "trials": [report["trials"][h]["trials"] for h in shown],
+        "why_none": [report["trials"][h]["why_none"] for h in shown],
+        "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in models],
+        "reference": [report["reference_error"][h] for h in shown] if report["reference_error"] else [],
+    }
+
+
+def _ladder_rows(ladder: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the model comparison, with the least error at each horizon."""
+    if "left_out" in ladder:
+        return {"left_out": ladder["left_out"], "models": []}
+    held_out = [one for one in ladder["models"] if one["fitted"] != "in sample"]
+    best = [
+        min((one["p95_m"][h] for one in held_out if one["p95_m"][h] is not None), default=None)
+        for h in range(len(ladder["horizons_m"]))
+    ]
+    return {**ladder, "best": best, "left_out": ""}
+
+
+def _config_lines(config: Mapping[str, Any]) -> Sequence[str]:
+    """Return the configuration a key a line, in the form of a configuration file."""
+    lines = []
+    for section, keys in config.items():
+        lines.append(f"[{section}]")
+        lines += [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
+        lines.append("")
+    return lines

@@ -1,0 +1,73 @@
+"use strict";
+// Open-loop paths: what icrtool/kernels/open_loop.py and icrtool/motion/trials.py compute, from the same wheel samples.
+const icrtoolOpenLoop = (() => {
+  const { firstAtLeast } = icrtoolColumns;
+  const LEAST_SEPARATION_M = 1e-6;
+
+  /** Return the path of a model that moves by ICRs (Pentzer 2014, Eqs. 8-12 and 32-34; Euler steps). */
+  function byIcrs(steps, [yRight, yLeft, x], start, end, heading) {
+    const W = Math.max(Math.abs(yLeft - yRight), LEAST_SEPARATION_M);
+    // Samples that were joined to one step move along the headings in between.
+    const into = (steps.joined - 1) / (2 * steps.joined);
+    const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
+    let psi = heading;
+    for (let i = start; i < end; i++) {
+      const left = steps.left[i + 1] - steps.left[i], right = steps.right[i + 1] - steps.right[i];
+      const turn = (left - right) / W, ahead = (left * yRight - right * yLeft) / W, aside = -turn * x;
+      const c = Math.cos(psi + into * turn), s = Math.sin(psi + into * turn), k = i - start;
+      north[k + 1] = north[k] + ahead * c - aside * s;
+      east[k + 1] = east[k] + ahead * s + aside * c;
+      psi += turn;
+    }
+    return { north, east };
+  }
+
+  /** Return the path of a model with constant parameters: its path through the whole drive, turned into place. */
+  function alongPath(path, start, end, heading) {
+    const c = Math.cos(heading - path.turn[start]), s = Math.sin(heading - path.turn[start]);
+    const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
+    for (let i = start; i <= end; i++) {
+      const forward = path.forward[i] - path.forward[start], right = path.right[i] - path.right[start];
+      north[i - start] = forward * c - right * s;
+      east[i - start] = forward * s + right * c;
+    }
+    return { north, east };
+  }
+
+  /**
+   * Drive every model open loop.
+   * data: of the page, decoded; row: of data.series; lengths: metres, ascending.
+   * Gives the steps `start` and `end`, why the longest path ends early (or ""), and of each model its path, relative to
+   * the reference at `start`, and its errors [m] after each length; null where that is not reached or has no reference.
+   */
+  function drive(data, row, lengths) {
+    const { steps, series } = data, start = series.step[row], heading = series.heading[row];
+    const gap = steps.gaps.find((step) => step >= start);
+    const last = gap === undefined ? steps.distance.length - 1 : gap;
+    const ends = lengths.map((metres) => endOf(steps, start, metres));
+    const longest = ends[ends.length - 1], end = Math.min(longest === null ? last : longest, last);
+    let why = "";
+    if (longest === null || longest > last) why = last === gap ? "a gap in the wheel data" : "the end of the log";
+    const hasReference = (step) => !steps.without_reference.some(([from, to]) => from <= step && step <= to);
+    const models = data.models.map((model) => {
+      const icrs = model.icrs || [series.y_right[row], series.y_left[row], series.x[row]];
+      const path = model.path ? alongPath(model.path, start, end, heading) : byIcrs(steps, icrs, start, end, heading);
+      const errors = ends.map((step) => {
+        if (step === null || step > end || !hasReference(step)) return null;
+        const k = step - start;
+        return Math.hypot(path.north[k] - (steps.north[step] - steps.north[start]),
+          path.east[k] - (steps.east[step] - steps.east[start]));
+      });
+      return { name: model.name, label: model.label, path, errors };
+    });
+    return { start, end, why, lengths, models };
+  }
+
+  /** Return the first step at which so much distance is driven; null where the log ends before. */
+  function endOf(steps, start, metres) {
+    const step = firstAtLeast(steps.distance, steps.distance[start] + metres, start);
+    return step < steps.distance.length ? step : null;
+  }
+
+  return { drive };
+})();

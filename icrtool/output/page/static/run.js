@@ -1,0 +1,104 @@
+"use strict";
+// The page of a run: links map, charts and the open-loop paths.
+const icrtoolPage = (() => {
+  const LENGTHS_M = [5, 10, 20];
+  const data = icrtoolColumns.decodeAll(JSON.parse(document.getElementById("data").textContent));
+  const { series } = data, { clock } = icrtoolCharts;
+  const range = document.getElementById("moment"), readout = document.getElementById("readout");
+  let charts = null, errors = null, map = null, moment = 0, result = null, driven = -1;
+
+  function rowAt(t) {
+    const row = Math.min(icrtoolColumns.firstAtLeast(series.t, t), series.t.length - 1);
+    return row > 0 && t - series.t[row - 1] < series.t[row] - t ? row - 1 : row;
+  }
+
+  function difference(t) {
+    const { used } = data.fixes;
+    const row = Math.min(icrtoolColumns.firstAtLeast(used.t, t), used.t.length - 1);
+    return row >= 0 && Math.abs(used.t[row] - t) < 2 ? used.difference[row] : null;
+  }
+
+  function signed(value) {
+    return `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(3)}`;
+  }
+
+  function setMoment(row) {
+    moment = row;
+    const t = series.t[row], off = difference(t);
+    range.value = t;
+    range.setAttribute("aria-valuetext", clock(t));
+    const parts = [`${clock(t)} (${t.toFixed(1)} s), ${data.steps.distance[series.step[row]].toFixed(1)} m driven`,
+      `wheels left ${series.v_left[row].toFixed(2)}, right ${series.v_right[row].toFixed(2)} m/s`,
+      `ICR y right ${signed(series.y_right[row])} ± ${series.std_y_right[row].toFixed(3)}, y left ${signed(series.y_left[row])} ± ${series.std_y_left[row].toFixed(3)}, x ${signed(series.x[row])} ± ${series.std_x[row].toFixed(3)} m`];
+    if (off !== null) parts.push(`filter to fix ${off < 1 ? `${(100 * off).toFixed(1)} cm` : `${off.toFixed(2)} m`}`);
+    readout.textContent = parts.join(" · ");
+    charts.mark(t);
+    map.mark(row);
+  }
+
+  function text(tag, content, parent, attributes = {}) {
+    const element = document.createElement(tag);
+    element.textContent = content;
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    parent.append(element);
+    return element;
+  }
+
+  function openLoop(row = moment) {
+    setMoment(row);
+    driven = row;
+    result = icrtoolOpenLoop.drive(data, row, LENGTHS_M);
+    map.drawLoop(result);
+    const box = document.getElementById("loop"), table = document.createElement("table");
+    text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter`, table);
+    const head = text("tr", "", table.createTHead());
+    text("th", "model", head, { scope: "col" });
+    for (const metres of LENGTHS_M) text("th", `after ${metres} m`, head, { scope: "col" });
+    const body = table.createTBody();
+    for (const model of result.models) {
+      const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
+      name.append(icrtoolCharts.sample({ ...icrtoolCharts.lookOf(model.name) }), ` ${model.label}`);
+      for (const error of model.errors) text("td", error === null ? "–" : error < 1 ? `${error.toFixed(3)} m` : `${error.toFixed(2)} m`, line);
+    }
+    box.replaceChildren(table);
+    const notes = [];
+    if (result.why) notes.push(`The paths end before ${LENGTHS_M[LENGTHS_M.length - 1]} m: ${result.why}.`);
+    if (result.models.some((model) => model.name === "recommended")) notes.push("Here the recommended model is fitted to the whole drive; in the tables it is tested on distance it was not fitted to.");
+    if (notes.length) text("p", notes.join(" "), box);
+    return result;
+  }
+
+  function build() {
+    charts?.destroy();
+    errors?.destroy?.();
+    charts = icrtoolCharts.timeCharts(data, {
+      onMoment: (t) => setMoment(rowAt(t)), onPick: (t) => openLoop(rowAt(t)), onSpan: (from, to) => map?.show(from, to),
+    });
+    errors = icrtoolCharts.errorChart(data);
+    map = icrtoolMap.make(data, { onMoment: setMoment, onPick: openLoop });
+    setMoment(moment);
+    if (driven >= 0) openLoop(driven);
+  }
+
+  build();
+  range.addEventListener("input", () => setMoment(rowAt(Number(range.value))));
+  const onClick = (id, action) => document.getElementById(id).addEventListener("click", action);
+  onClick("go", () => openLoop());
+  onClick("zoom-in", () => map.zoomBy(1.6));
+  onClick("zoom-out", () => map.zoomBy(1 / 1.6));
+  onClick("zoom-all", () => { map.zoomAll(); charts.show(0, data.duration_s); });
+  for (const button of document.querySelectorAll(".at-moment")) {
+    button.addEventListener("click", () => {
+      openLoop(rowAt(Number(button.dataset.t)));
+      document.getElementById("map").scrollIntoView({ block: "center" });
+    });
+  }
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build);
+  let waiting = 0;
+  new ResizeObserver(() => {
+    clearTimeout(waiting);
+    waiting = setTimeout(() => { charts.resize(); errors?.resize?.(); map.resize(); setMoment(moment); }, 120);
+  }).observe(document.querySelector("main"));
+
+  return { data, openLoop, setMoment, rowAt, moment: () => moment, map: () => map, charts: () => charts };
+})();

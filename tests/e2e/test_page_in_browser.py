@@ -1,0 +1,270 @@
+"""Pages in a real browser: headless Chromium draws them, points, clicks and presses keys."""
+
+from __future__ import annotations
+
+import base64
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.estimation.fit import fit
+from icrtool.kernels.open_loop import open_loop_path, trial_ends
+from icrtool.motion.trials import Trials
+from icrtool.output.dropout_directory import report_document
+from icrtool.output.page.fleet_page import fleet_page
+from icrtool.output.page.pictures import pictures_of
+from icrtool.output.page.run_page import run_page
+from icrtool.records.run import Run, drive_of
+from support.barn import TRACK_WIDTH_M, configured, simulate
+from support.browser import Browser, Page, browser, chromium
+
+HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
+LENGTHS_M = (5.0, 10.0, 20.0)
+AXE = Path(sys.prefix) / "axe-core" / "axe.min.js"
+
+pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium on this machine (Debian: apt install chromium)")
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return fit(simulate(), configured())
+
+
+@pytest.fixture(scope="module")
+def report(run: Run) -> DropoutReport:
+    return dropout_report(run)
+
+
+@pytest.fixture(scope="module")
+def file(run: Run, report: DropoutReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    # The smallest PNG: a pixel.
+    pixel = base64.b64decode(
+        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+    )
+    page = run_page(run, report_document(report), pictures_of([("trajectory", pixel), ("ladder", pixel)]))
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    file.write_text(page, encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def page(chrome: Browser, file: Path) -> Page:
+    opened = chrome.page()
+    opened.open(file)
+    return opened
+
+
+def centre(page: Page, selector: str) -> tuple[float, float]:
+    """Bring an element into view, and return its middle."""
+    page.front()
+    page.evaluate(f"document.querySelector({selector!r}).scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    return tuple(
+        page.evaluate(
+            f"(b => [b.left + b.width / 2, b.top + b.height / 2])"
+            f"(document.querySelector({selector!r}).getBoundingClientRect())"
+        )
+    )
+
+
+def test_a_page_loads_without_complaint_and_asks_for_nothing(page: Page) -> None:
+    assert page.complaints() == []
+    assert page.requests() == []
+    assert page.evaluate("document.querySelectorAll('.chart canvas').length") == 5
+    assert page.evaluate("document.querySelectorAll('#map path').length") > 5
+
+
+def test_the_policy_stops_what_a_page_would_load(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    blocked = page.evaluate("fetch('data:,x').then(() => 'loaded', () => 'blocked')")
+    assert blocked == "blocked"
+    inject = (
+        "document.body.append(Object.assign(document.createElement('script'), {textContent: 'window.injected = 1'}))"
+    )
+    page.evaluate(f"{inject}, null")
+    assert page.evaluate("window.injected") is None
+
+
+def test_pointing_at_a_chart_marks_the_moment_on_the_map(page: Page) -> None:
+    x, y = centre(page, "#icrs .u-over")
+    page.mouse("mouseMoved", x, y)
+    moment = page.evaluate("icrtoolPage.data.series.t[icrtoolPage.moment()]")
+    duration = page.evaluate("icrtoolPage.data.duration_s")
+    assert moment == pytest.approx(duration / 2, abs=0.02 * duration)
+    at = page.evaluate("document.getElementById('here').getAttribute('transform').match(/[\\d.]+/g).map(Number)")
+    assert at == pytest.approx(page.evaluate("icrtoolPage.map().pixelsOf(icrtoolPage.moment())"), abs=0.5)
+    left = page.evaluate("icrtoolPage.charts().charts.map((chart) => chart.posToVal(chart.cursor.left, 'x'))")
+    assert left == pytest.approx([moment] * len(left), abs=0.02 * duration)
+
+
+def test_pointing_at_the_map_marks_the_moment_in_the_charts(page: Page) -> None:
+    row = page.evaluate("icrtoolPage.rowAt(0.7 * icrtoolPage.data.duration_s)")
+    centre(page, "#map")
+    x, y = page.evaluate(
+        f"((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().pixelsOf({row}), "
+        "document.getElementById('map').getBoundingClientRect())"
+    )
+    page.mouse("mouseMoved", x, y)
+    moment = page.evaluate("icrtoolPage.data.series.t[icrtoolPage.moment()]")
+    left = page.evaluate("icrtoolPage.charts().charts.map((chart) => chart.posToVal(chart.cursor.left, 'x'))")
+    assert left == pytest.approx([moment] * len(left), abs=0.5)
+    # The nearest point of the drive, whichever time the robot passed there.
+    place = page.evaluate("icrtoolPage.map().pixelsOf(icrtoolPage.moment())")
+    assert place == pytest.approx(page.evaluate(f"icrtoolPage.map().pixelsOf({row})"), abs=3.0)
+
+
+def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    centre(page, "#map")
+    x, y = page.evaluate(
+        "((p, b) => [p[0] + b.left, p[1] + b.top])(icrtoolPage.map().pixelsOf(icrtoolPage.rowAt(20)), "
+        "document.getElementById('map').getBoundingClientRect())"
+    )
+    page.click(x, y)
+    rows = page.evaluate("[...document.querySelectorAll('#loop tbody tr')].map((row) => row.textContent)")
+    assert len(rows) == 4
+    assert all(re.search(r"\d m", row) for row in rows)
+    assert page.complaints() == []
+
+
+def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: Run, report: DropoutReport) -> None:
+    drive, table, b = drive_of(run), run.table, TRACK_WIDTH_M
+    ends = trial_ends(drive, np.array(LENGTHS_M))
+    starts = np.flatnonzero((ends >= 0).all(axis=1))
+    starts = starts[:: len(starts) // 8]
+    assert report.calibration is not None
+    recommended = predictor(report.calibration, recording_of(run))(Trials(starts, ends[starts]))
+    final = (table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
+    # Every state of so short a drive is a row of the series.
+    assert page.evaluate("icrtoolPage.data.series.step.length") == len(table)
+    for number, start in enumerate(starts.tolist()):
+        found = page.evaluate(f"icrtoolPage.openLoop({start}).models.map(({{name, errors}}) => [name, errors])")
+        errors = dict(found)
+        momentary = (table.y_icr_right_m[start], table.y_icr_left_m[start], table.x_icr_m[start])
+        for name, icrs in (("icr", momentary), ("no_slip", (b / 2, -b / 2, 0.0)), ("icr_final", final)):
+            for h, end in enumerate(ends[start].tolist()):
+                path = open_loop_path(drive, *icrs, start, end)
+                error = np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end])
+                # Micrometres of rounding in each column, seven digits in the first heading.
+                assert errors[name][h] == pytest.approx(error, abs=1e-4), (name, start, h)
+        assert errors["recommended"] == pytest.approx(recommended[number].tolist(), abs=1e-4)
+
+
+def test_the_moment_follows_the_keyboard(page: Page) -> None:
+    page.front()
+    page.evaluate("document.getElementById('moment').focus()")
+    page.key("End")
+    assert page.evaluate("icrtoolPage.data.duration_s - icrtoolPage.data.series.t[icrtoolPage.moment()]") < 0.2
+    page.evaluate("document.getElementById('moment').value = 10")
+    page.evaluate("document.getElementById('moment').dispatchEvent(new Event('input')), null")
+    page.key("ArrowRight")
+    assert page.evaluate("icrtoolPage.data.series.t[icrtoolPage.moment()]") == pytest.approx(10.1, abs=0.06)
+    page.evaluate("document.getElementById('go').focus()")
+    page.key("Enter")
+    assert page.evaluate("document.querySelector('#loop caption').textContent").startswith("Open loop from 0:10")
+
+
+def test_hostile_names_stay_text(chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path) -> None:
+    streams = [{**one, "topic": HOSTILE, "why": HOSTILE} for one in run.summary["streams"]]
+    summary = {**run.summary, "log": HOSTILE, "warnings": [HOSTILE], "streams": streams}
+    document = report_document(report)
+    document["models"] = [{**one, "label": HOSTILE} for one in document["models"]]
+    file = tmp_path / "hostile.html"
+    file.write_text(run_page(replace(run, summary=summary), document, {}), encoding="utf-8")
+    page = chrome.page()
+    page.open(file)
+    page.evaluate("icrtoolPage.openLoop(100)")
+    assert page.evaluate("window.hostile") is None
+    assert page.evaluate("document.querySelector('h1').textContent").startswith(HOSTILE)
+    assert page.evaluate("document.querySelector('#warnings li').textContent") == HOSTILE
+    assert page.evaluate("document.querySelectorAll('img[src=x]').length") == 0
+    assert page.complaints() == []
+
+
+def test_without_scripts_pictures_and_tables_are_there(chrome: Browser, file: Path) -> None:
+    page = chrome.page(scripts=False)
+    page.open(file)
+    visible = "[...document.querySelectorAll({})].map((one) => one.getClientRects().length > 0)"
+    assert page.evaluate(visible.format("'.picture img'")) == [True, True]
+    assert set(page.evaluate(visible.format("'.needs-js'"))) == {False}
+    assert all(page.evaluate(visible.format("'#errors table, #worst table, #models table'")))
+
+
+def test_print_shows_pictures_in_place_of_what_is_interactive(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    page.send("Emulation.setEmulatedMedia", media="print")
+    assert page.evaluate("document.querySelector('.twin').getClientRects().length") > 0
+    assert page.evaluate("document.querySelector('.workbench').getClientRects().length") == 0
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not there: make axe")
+def test_a_checker_of_accessibility_finds_no_error(chrome: Browser, file: Path, tmp_path: Path, *, dark: bool) -> None:
+    fleet = tmp_path / "fleet.html"
+    fleet.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
+    for one in (file, fleet):
+        page = chrome.page(dark=dark)
+        page.open(one)
+        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
+        page.evaluate("document.getElementById('go')?.click()")
+        page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
+        what = "[one.id, one.nodes[0].html.slice(0, 200), one.nodes[0].failureSummary]"
+        violations = page.evaluate(f"axe.run().then((found) => found.violations.map((one) => {what}))")
+        assert violations == []
+
+
+LOG = {
+    "log": "b.bag", "run": "runs/b", "status": "done", "reason": "", "robot": "jackal", "group": "grass",
+    "tags": ["dry"], "start_utc": "2024-05-01T10:00:00Z", "duration_s": 60.0, "distance_m": 90.0,
+    "icr": {"y_icr_right_m": 0.4, "std_y_icr_right_m": 0.01}, "multiplier": 1.5, "multiplier_std": 0.1,
+    "errors": {"icr_p95_10m_m": 0.9, "recommended_within_0.5m_m": 8.0}, "events": None, "warnings": 1, "verdicts": [],
+}  # fmt: skip
+FLEET = {
+    "counts": {"done": 2, "failed": 1, "skipped": 0},
+    "gates_failed": 0,
+    "tool_version": "1",
+    "logs": [
+        LOG,
+        {**LOG, "log": "a10.bag", "run": "runs/a10", "multiplier": 1.2, "group": "tarmac"},
+        {**LOG, "log": HOSTILE, "run": "../../etc", "status": "failed", "reason": "no heading", "multiplier": None},
+    ],
+}
+
+
+def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:
+    (tmp_path / "runs" / "b").mkdir(parents=True)
+    (tmp_path / "runs" / "b" / "report.html").touch()
+    file = tmp_path / "report.html"
+    file.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
+    page = chrome.page()
+    page.open(file)
+    names = "[...document.querySelectorAll('tbody tr:not([hidden]) th')].map((one) => one.textContent)"
+    sort = "[...document.querySelectorAll('thead button')].find((one) => one.textContent === '{}').click()"
+    page.evaluate(sort.format("multiplier"))
+    assert page.evaluate(names) == ["a10.bag", "b.bag", HOSTILE]
+    page.evaluate(sort.format("multiplier"))
+    assert page.evaluate(names) == ["b.bag", "a10.bag", HOSTILE]
+    page.evaluate("document.getElementById('words').value = 'TARMAC'")
+    page.evaluate("document.getElementById('words').dispatchEvent(new Event('input')), null")
+    assert page.evaluate(names) == ["a10.bag"]
+    assert page.evaluate("document.getElementById('count').textContent") == "1 of 3 logs"
+    links = page.evaluate("[...document.querySelectorAll('tbody a')].map((one) => one.getAttribute('href'))")
+    assert links == ["./runs/b/report.html"]
+    assert page.evaluate("window.hostile") is None
+    assert page.complaints() == []

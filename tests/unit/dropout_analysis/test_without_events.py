@@ -1,0 +1,65 @@
+"""Trials that cross a slip event are left out on request, and what they cost is reported."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icrtool.config import load_config
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.trials import errors_from_states
+from icrtool.estimation.fit import fit
+from icrtool.kernels.open_loop import trial_ends
+from icrtool.output.tables.dropout import format_dropout
+from icrtool.records.events import SlipEvent
+from icrtool.records.run import Run, drive_of
+from support.drives import make_log
+
+HORIZONS_M = (1.0, 5.0, 10.0)
+EVENT_S = (40.0, 43.0)
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    found = fit(make_log(seconds=120.0), load_config(sets=["robot.track_width_m=0.8"]))
+    begin, end = (int(found.table.stamp_ns[0] + second * 1e9) for second in EVENT_S)
+    event = SlipEvent("slip", begin, end, 0.0, 0.0, 1.0, 0.5, 0.99)
+    # the pose of the reference jumps at the event, so that trials across it have large errors
+    north = found.table.north_m + 0.5 * (found.table.t_s > sum(EVENT_S) / 2)
+    return replace(found, sensors=replace(found.sensors, events=(event,)), table=replace(found.table, north_m=north))
+
+
+def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
+    whole = dropout_report(run, horizons_m=HORIZONS_M, comparison=False)
+    report = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, without_events=True)
+    cost = report.event_cost
+    assert cost is not None
+    assert cost.events == 1
+    t = run.table.t_s
+    ends = trial_ends(drive_of(run), np.array(HORIZONS_M))
+    for h, horizon in enumerate(HORIZONS_M):
+        last = t[np.maximum(ends[:, h], 0)]
+        crossing = (ends[:, h] >= 0) & (t < EVENT_S[1]) & (last > EVENT_S[0])
+        assert cost.trials[h] == np.count_nonzero(crossing)
+        assert report.counts.trials[h] == whole.counts.trials[h] - cost.trials[h]
+        errors = errors_from_states(run, horizon)["icr"]
+        icr = report.result("icr")
+        assert icr is not None
+        kept = errors[np.isfinite(errors) & ~crossing]
+        assert icr.summary.p95[h] == pytest.approx(np.percentile(kept, 95.0))
+        assert cost.with_events["icr"].p95[h] == pytest.approx(np.nanpercentile(errors, 95.0))
+        assert icr.summary.expected[h] < cost.with_events["icr"].expected[h]
+    assert sum(int(column[0]) for column in report.counts) + int(cost.trials[0]) == report.states
+
+
+def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:
+    text = format_dropout(dropout_report(run, horizons_m=HORIZONS_M, comparison=False, without_events=True))
+    assert "1 slip event left out: ICR after 10 m" in text
+    assert "across a slip event" in text
+    quiet = replace(run, sensors=replace(run.sensors, events=()))
+    report = dropout_report(quiet, horizons_m=HORIZONS_M, comparison=False, without_events=True)
+    assert report.event_cost is not None
+    assert not report.event_cost.trials.any()
+    assert "none in this log" in format_dropout(report)

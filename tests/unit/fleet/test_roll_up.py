@@ -1,0 +1,79 @@
+"""The roll-up of a batch: groups, pooled calibrations, figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from icrtool.errors import LogError
+from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
+from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
+from icrtool.fleet.row import Row
+from icrtool.output.calibration_file import open_calibration
+from icrtool.records.run import Run
+
+
+def write(run: Run, directory: Path, sha: str) -> None:
+    """Write a run as that of another file."""
+    named = replace(run, summary=run.summary | {"inputs": [{"path": sha, "bytes": 1, "sha256": sha}]})
+    named.write(directory, plots=())
+
+
+@pytest.fixture(scope="module")
+def place(run: Run, make_run: Callable[..., Run], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("fleet")
+    for name, one, sha in (("a", run, "1"), ("b", make_run(duration_s=70.0), "2"), ("copy", run, "1")):
+        write(one, place / "runs" / name, sha)
+    unusable = replace(run, summary=run.summary | {"usable": False, "unusable_because": "a test"})
+    write(unusable, place / "runs" / "c", "3")
+    return place
+
+
+def rows(*names: str, group: str = "grass", **values: object) -> list[Row]:
+    return [Row(name, f"runs/{name}", "done", robot="barn", group=group, key="k", **values) for name in names]
+
+
+def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    logs = [*rows("a", "b", "c", "copy"), *rows("c", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
+    grass, ice = found = list(pooled_calibrations(logs, place))
+    assert (grass.group, grass.logs, grass.left_out) == ("grass", ("a", "b"), ("c", "copy"))
+    calibration = open_calibration(place / grass.file)
+    assert (len(calibration.logs), calibration.recommended) == (2, grass.recommended)
+    assert grass.multiplier == pytest.approx(calibration.controller_numbers().multiplier)
+    assert "each log left out in turn (2)" in grass.table
+    assert (ice.file, ice.logs) == ("", ("c",))
+    assert "usable" in ice.reason
+    assert grass.table in calibrations_text(found)
+    write_fleet(logs, place, found)
+    monkeypatch.setattr("icrtool.output.stored_run.open_run", None)
+    assert list(pooled_calibrations(logs, place)) == found, "nothing changed: nothing is fitted"
+    with pytest.raises(TypeError):
+        list(pooled_calibrations(logs[:1], place))
+
+
+def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
+    logs = [*rows("a"), *rows("b", "copy", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
+    write_fleet(logs, place)
+    assert runs_of_fleet(place) == {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
+    write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice")], place)
+    assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
+    with pytest.raises(LogError):
+        runs_of_fleet(place / "runs")
+
+
+def test_figures_show_what_there_is(tmp_path: Path) -> None:
+    icr = {"y_icr_right_m": 0.5, "y_icr_left_m": -0.5, "std_y_icr_right_m": 0.01, "std_y_icr_left_m": 0.01}
+    dates = ("2024-05-01T10:00:00Z", "2024-05-02T10:00:00Z")
+    good = [replace(row, start_utc=date) for row, date in
+            zip(rows("a", "$b_x", icr=icr, errors={"icr_p95_10m_m": 0.3}), dates, strict=True)]  # fmt: skip
+    failed = Row("f", "runs/f", "failed", reason="f.mcap: no wheels found; needs a JointState (tried twice)")
+    write_fleet([*good, failed], tmp_path, (), ("png",))
+    assert {file.name for file in (tmp_path / "plots").iterdir()} == {"icrs.png", "errors.png", "failures.png"}
+    write_fleet(good, tmp_path, (), ("svg",))
+    assert {file.name for file in (tmp_path / "plots").iterdir()} == {"icrs.svg", "errors.svg"}
+    assert reason_of(failed) == "no wheels found"
+    assert json.loads((tmp_path / "fleet.json").read_bytes())["calibrations"] == []

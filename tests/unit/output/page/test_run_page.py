@@ -1,0 +1,207 @@
+"""The page of a run: what it holds, and what no text of a log can do to it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.output.dropout_directory import report_document
+from icrtool.output.page.columns import packed, packed_sums
+from icrtool.output.page.pictures import pictures_of
+from icrtool.output.page.run_page import draw_pictures, run_page, write_page
+from icrtool.records.run import Run
+
+HOSTILE_PART = "window.hostile=1"
+VENDOR = Path(__file__).resolve().parents[4] / "icrtool" / "output" / "page" / "static" / "vendor"
+
+
+class Elements(HTMLParser):
+    """Collects elements, and the text outside of scripts and styles."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self._inside = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attributes)))
+        self._inside = tag if tag in {"script", "style"} else ""
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = ""
+
+    def handle_data(self, data: str) -> None:
+        if not self._inside:
+            self.text.append(data)
+
+    def named(self, name: str) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.tags if tag == name]
+
+
+def data_of(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return json.loads(found.group(1))
+
+
+def numbers(column: dict[str, Any]) -> np.ndarray:
+    raw = base64.b64decode(column["data"])
+    if column["type"] == "sums":
+        return np.concatenate([[0.0], np.cumsum(np.frombuffer(raw, "<i2").astype(int)) * column["unit"]])
+    return np.frombuffer(raw, {"f32": "<f4", "f64": "<f8", "i32": "<i4", "u8": "u1"}[column["type"]])
+
+
+@pytest.fixture(scope="module")
+def page(run: Run, report: DropoutReport) -> str:
+    return run_page(run, report_document(report), pictures_of([("worst", b"\x89PNG")]))
+
+
+def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutReport) -> None:
+    text = " ".join("".join(Elements(page).text).split())
+    reached = next(one for one in report.budgets if one.model == "recommended")
+    assert f"{reached.distance_m:.1f} m" in text or f"more than {reached.distance_m:g} m" in text
+    assert report.calibration is not None
+    assert f"{report.calibration.controller_numbers().multiplier:.3f}" in text
+    assert "an acceptance limit was exceeded" in text
+    assert f"{report.worst[0].errors_m['icr']:.3f} m" in text
+
+
+def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
+    warned = replace(run, summary={**run.summary, "warnings": ["the left wheel sings", "so does the right one"]})
+    text = "".join(Elements(run_page(warned, report_document(report), {})).text)
+    assert "the left wheel sings" in text
+    assert "2 warnings" in text
+
+
+def test_a_run_that_is_not_usable_begins_with_that(hostile_run: Run, report: DropoutReport) -> None:
+    page = run_page(hostile_run, report_document(report), {})
+    assert page.index("Not usable") < page.index("How far without GNSS")
+    assert "Do not use them" in page
+
+
+def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -> None:
+    data, table = data_of(page), run.table
+    step = numbers(data["series"]["step"])
+    np.testing.assert_allclose(numbers(data["series"]["t"]), table.t_s[step])
+    np.testing.assert_allclose(numbers(data["series"]["y_right"]), table.y_icr_right_m[step], rtol=1e-6)
+    north = numbers(data["steps"]["north"]) + data["steps"]["first_north"] + data["origin"][0]
+    np.testing.assert_allclose(north, table.north_m, atol=1e-5)
+    held = np.where(run.in_gap[:-1], 0.0, np.diff(table.t_s))
+    driven = np.concatenate([[0.0], np.cumsum(held * table.v_left_mps[:-1])])
+    # Half a unit of a 16-bit step, wherever on the drive.
+    np.testing.assert_allclose(numbers(data["steps"]["left"]), driven, atol=1e-5)
+
+
+def test_running_sums_do_not_gather_errors() -> None:
+    rng = np.random.default_rng(16)
+    column = np.cumsum(rng.normal(0.02, 0.01, 200_000))
+    found = numbers(packed_sums(column))
+    unit = packed_sums(column)["unit"]
+    assert np.abs(found - (column - column[0])).max() <= 0.5001 * unit
+    assert unit < 3e-6
+
+
+def test_columns_survive_their_packing() -> None:
+    column = np.random.default_rng(16).normal(size=100)
+    np.testing.assert_array_equal(numbers(packed(column, "f64")), column)
+    np.testing.assert_array_equal(numbers(packed(np.arange(5), "i32")), np.arange(5))
+
+
+def test_the_page_may_load_nothing_and_run_only_its_own_scripts(page: str) -> None:
+    elements = Elements(page)
+    policy = next(one["content"] for one in elements.named("meta") if one.get("http-equiv"))
+    assert policy is not None
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    for tag, allowed in (("script", "script-src"), ("style", "style-src")):
+        directive = next(part for part in policy.split("; ") if part.startswith(allowed))
+        for content in re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL):
+            digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+            assert f"'sha256-{digest}'" in directive
+    for tag, attributes in elements.tags:
+        assert "style" not in attributes, tag
+        assert not [name for name in attributes if name.startswith("on")], tag
+        for name in ("src", "href"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:", "geo:")), (tag, attributes)
+
+
+def test_text_of_a_log_stays_text(hostile_run: Run, report: DropoutReport) -> None:
+    page = run_page(hostile_run, report_document(report), {})
+    elements = Elements(page)
+    assert HOSTILE_PART in "".join(elements.text)
+    assert not [one for one in elements.named("img") if one.get("src") == "x"]
+    assert "\u202e" not in page
+    for content in re.findall(r"<script[^>]*>(.*?)</script>", page, re.DOTALL):
+        assert HOSTILE_PART not in content
+
+
+def test_json_in_a_page_cannot_end_its_element(page: str, run: Run, report: DropoutReport) -> None:
+    document = report_document(report)
+    document["models"] = [{**one, "label": "</script><b>&"} for one in document["models"]]
+    found = run_page(run, document, {})
+    assert data_of(found)["models"][0]["label"] == "</script><b>&"
+    assert "</script><b>" not in found
+
+
+def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutReport) -> None:
+    gnss = {**run.summary["gnss"], "datum": [40.123456, -77.654321, 312.5]}
+    heading = {**run.summary["heading"], "magnetic_declination_deg": -87.6543,
+               "offset_name": "magnetic declination here is -87.65°"}  # fmt: skip
+    frames = {**run.summary["config"]["frames"], "datum": [40.123456, -77.654321]}
+    summary = {**run.summary, "gnss": gnss, "heading": heading,
+               "config": {**run.summary["config"], "frames": frames},
+               "warnings": ["the heading is off: magnetic declination here is -87.65°"]}  # fmt: skip
+    table = replace(run.table, north_m=run.table.north_m + 4_440_123.0, east_m=run.table.east_m + 612_345.0)
+    there = replace(run, summary=summary, table=table)
+    document = report_document(report)
+    shown, hidden = (run_page(there, document, {}, coordinates=one) for one in (True, False))
+    for trace in ("40.12345", "77.65432", "-87.65", "4440123", "612345"):
+        assert trace in shown, trace
+        assert trace not in hidden, trace
+    assert data_of(hidden)["origin"] is None
+    assert max(map(abs, (data_of(hidden)["steps"]["first_north"], data_of(hidden)["steps"]["first_east"]))) < 1.0
+
+
+def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
+    metric = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "datum": None}})
+    pictures = pictures_of([("worst", b"place"), ("ladder", b"models")])
+    page = run_page(metric, report_document(report), pictures, coordinates=False)
+    assert base64.b64encode(b"models").decode() in page
+    assert base64.b64encode(b"place").decode() not in page
+
+
+def test_a_run_without_track_width_and_a_short_one_have_pages(make_run: Any) -> None:
+    from icrtool.dropout_analysis.dropout_report import dropout_report
+
+    narrow = make_run(track_width_m=None)
+    page = run_page(narrow, report_document(dropout_report(narrow)), {})
+    assert "robot.track_width_m is not known" in unescape(page)
+
+
+def test_drawn_pictures_are_those_of_the_run_directory(run: Run, report: DropoutReport, tmp_path: Path) -> None:
+    run.write(tmp_path / "run")
+    write_page(run, report, tmp_path / "page.html", plots=tmp_path / "run")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    for name in draw_pictures(run):
+        content = (tmp_path / "run" / "plots" / f"{name}.png").read_bytes()
+        assert base64.b64encode(content).decode() in page
+
+
+def test_the_bundled_libraries_are_those_that_are_listed() -> None:
+    listed = (VENDOR / "SOURCES.md").read_text(encoding="utf-8")
+    for file in VENDOR.glob("*.min.*"):
+        assert f"`{file.name}`" in listed
+        assert hashlib.sha256(file.read_bytes()).hexdigest() in listed
