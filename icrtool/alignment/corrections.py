@@ -10,8 +10,6 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,

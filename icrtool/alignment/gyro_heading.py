@@ -31,6 +31,9 @@ STATES, STATES_OF_A_SOURCE = 5, 3
 COURSE, STANDING, NOTHING, ABSOLUTE = range(4)
 
 SETTLED_SIGMAS = 3.0
+LEAST_OFFSET_SIGMAS = 4.0
+LARGEST_RATE_HZ = 20.0
+
 STANDING_S = 0.6
 STANDING_RATE_STD = math.radians(0.05)
 FEWEST_COURSES = 8
@@ -71,7 +74,7 @@ class AbsoluteHeading(NamedTuple):
     ----------
     t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
     rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
-    offset_std : of the offset, about zero [rad]
+    offset_std : of the offset, about zero [rad]; aligned_std : the same where no offset is significant
     """
 
     t: Floats
@@ -79,6 +82,7 @@ class AbsoluteHeading(NamedTuple):
     std: Floats
     rate: Floats
     offset_std: float = math.inf
+    aligned_std: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +107,12 @@ class HeadingEstimate:
     constants_std: Floats
     noises: dict[str, float]
     spread: float
+
+    @property
+    def has_offset(self) -> bool:
+        """Whether the offset of the first absolute heading is significant."""
+        offset = math.remainder(float(self.constants[OFFSET]), 2.0 * math.pi)
+        return abs(offset) > LEAST_OFFSET_SIGMAS * float(self.constants_std[OFFSET])
 
     @property
     def median_std(self) -> float:
@@ -141,7 +151,12 @@ def estimate_heading(
         problem = _Problem(drive, turn, guess, absolute, stands=stands)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
         noises = problem.choose(grids, problem.usual() | noises)
-    return problem.solve(noises)
+    found = problem.solve(noises)
+    if absolute and math.isfinite(absolute[0].aligned_std) and not found.has_offset:
+        # not significant: that of a sensor mounted along the robot
+        problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
+        found = problem.solve(noises)
+    return found
 
 
 def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
@@ -325,10 +340,11 @@ class _Problem:
     def _at_rate_samples(
         self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float], spread: float
     ) -> HeadingEstimate:
-        """Return the estimates at the rate's samples: carried on by the rate from the last event, or between events."""
+        """Return the estimates at samples of the rate: carried on from the last event, or between events."""
         t, turn, G = self.t, self.turn, self.G
         constants, variances = states[-1].copy(), np.diagonal(covariances[-1])
-        rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))
+        every = max(1, round(1.0 / (LARGEST_RATE_HZ * float(np.median(np.diff(turn.t))))))
+        rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]

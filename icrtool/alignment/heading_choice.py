@@ -24,7 +24,6 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
-LARGEST_RATE_HZ = 20.0
 RESPONSE_S = 0.1
 """A robot answers its wheels by up to this much later or earlier: in turns the filter's wheels do not predict a heading
 better than that, and the ICRs must not learn it (`icrtool.alignment.estimator.RESPONSE_STD_S`)."""
@@ -32,7 +31,6 @@ better than that, and the ICRs must not learn it (`icrtool.alignment.estimator.R
 WHEELS_CORRELATION_S = 5.0
 """A heading estimated with the wheels errs alike for about this long: a few courses."""
 
-LEAST_OFFSET_SIGMAS = 4.0
 LARGEST_SPREAD = 2.0
 """Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
 
@@ -147,28 +145,16 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
         turn, axis = found
         absolute: list[AbsoluteHeading] = []
         if stated is not None:
-            absolute.append(attitude_heading(drive, turn))
+            absolute.append(attitude_heading(drive, turn)._replace(aligned_std=ATTITUDE_STD_RAD))
         pair, length = _pair(log, turn)
         absolute += [pair] if pair is not None else []
         estimate = estimate_heading(drive, turn, absolute)
-        if (
-            estimate is not None
-            and stated is not None
-            and abs(_offset(estimate)) < LEAST_OFFSET_SIGMAS * _offset_std(estimate)
-        ):
-            # as a sensor that is mounted along the robot
-            absolute[0] = absolute[0]._replace(offset_std=ATTITUDE_STD_RAD)
-            estimate = estimate_heading(drive, turn, absolute)
         if estimate is None or estimate.spread > LARGEST_SPREAD:
             continue
         if best is None or estimate.median_std < best.estimate.median_std:
             topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
             best = _derived(log, estimate, turn, topic, length, stated)
     return best
-
-
-def _has_offset(estimate: HeadingEstimate) -> bool:
-    return abs(_offset(estimate)) > LEAST_OFFSET_SIGMAS * _offset_std(estimate)
 
 
 def _offset(estimate: HeadingEstimate) -> float:
@@ -225,13 +211,11 @@ def _derived(
 
 
 def _samples(found: HeadingEstimate, turn: TurnRate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
-    """Return causal and smoothed headings as samples, at most `LARGEST_RATE_HZ`, none within a long hole."""
-    interval = float(np.median(np.diff(found.t)))
+    """Return causal and smoothed headings as samples, none within a long hole."""
     inside = np.ones(len(found.t), np.bool_)
     for begin, end in turn.holes[turn.holes[:, 1] - turn.holes[:, 0] > LONGEST_HOLE_S]:
         inside &= (found.t <= begin) | (found.t >= end)
-    rows = np.arange(0, len(found.t), max(1, round(1.0 / (LARGEST_RATE_HZ * interval))))
-    rows = rows[inside[rows]]
+    rows = np.flatnonzero(inside)
     stamps = epoch + np.round(found.t[rows] * 1e9).astype(np.int64)
 
     def as_samples(psi: Floats, std: Floats, some: slice) -> HeadingSamples:
