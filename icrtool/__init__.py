@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from icrtool import figures
+    from icrtool.calibration.fit import fit
     from icrtool.calibration.from_runs import calibrate
     from icrtool.calibration.record import Calibration
     from icrtool.config import Config, load_config
@@ -37,9 +38,9 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
-    from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
     from icrtool.output.calibration_file import open_calibration
+    from icrtool.output.page.run_page import write_page
     from icrtool.output.stored_run import open_run
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
@@ -64,6 +65,7 @@ __all__ = [
     "open_calibration",
     "open_run",
     "read_log",
+    "write_page",
 ]
 
 _HOMES = {
@@ -77,11 +79,12 @@ _HOMES = {
     "calibrate": "icrtool.calibration.from_runs",
     "dropout": "icrtool.dropout_analysis.trials",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
-    "fit": "icrtool.estimation.fit",
+    "fit": "icrtool.calibration.fit",
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.calibration_file",
     "open_run": "icrtool.output.stored_run",
     "read_log": "icrtool.logs",
+    "write_page": "icrtool.output.page.run_page",
 }
 
 

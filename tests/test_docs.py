@@ -21,7 +21,7 @@ from icrtool.config import Config, builtin_robots
 from icrtool.output.tables.configuration import format_configuration
 
 ROOT = Path(__file__).resolve().parents[1]
-SCHEMA = re.compile(r"icrtool/\w+/\d+")
+SCHEMA = re.compile(r"icrtool/[a-z-]+/\d+")
 """Names of JSON schemas look like paths."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")

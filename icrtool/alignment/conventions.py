@@ -1,9 +1,9 @@
-"""Which side is which, which way a heading turns: hypotheses compared by their likelihood.
+"""Which side is which, in which sense a heading turns: hypotheses compared by their likelihood.
 
 Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
 with v the mean of the sides' speeds and u half their difference, its changes in ∫u and ∫v. Sides that are swapped or
 reversed exchange v and u or change their signs; a heading or a position of the other handedness turns psi round. One
-robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis says what they
+robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis gives what they
 should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left side. Its cost is the squared
 Mahalanobis distance from there.
 
@@ -114,7 +114,7 @@ def decide_conventions(
     Parameters
     ----------
     metric : whether positions may be mirrored (a pose in a local frame); geodetic ones are not
-    gyro_sense : +1 where a gyro turns as the heading is named, -1 where the other way, 0 without one
+    gyro_sense : +1 where a gyro turns as the heading is named, -1 where in the opposite sense, 0 without one
     mirror_allowed : whether the heading's handedness is free
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
@@ -225,7 +225,7 @@ def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
 
 
 def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
-    """Say which sides or senses are not as named; the heading's own is reported with its offset."""
+    """Return sentences on which sides or senses are not as named; the heading's own is reported with its offset."""
     one, done = decision.convention, ": corrected" if corrects else ""
     notes = []
     if one.swapped:
@@ -249,7 +249,7 @@ def _in_words(one: Convention) -> str:
 
 
 def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
-    """Return +1 where the gyro turns as the heading is named, -1 where the other way, 0 without one or in doubt."""
+    """Return +1 where the gyro turns as the heading is named, -1 where in the opposite sense, 0 where not shown."""
     if log.gyro is None or len(drive.heading_t) < 3:
         return 0
     t = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9

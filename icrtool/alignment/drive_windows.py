@@ -15,7 +15,7 @@ WINDOW_IN_POSITION_STD = 12.0
 """A window is so long that noise of the fixes turns its displacement by no more than 7 deg."""
 
 WINDOW_IN_VALUES = 12.0
-"""A value that is held while the robot accelerates ends a window early or late by a part of its own distance."""
+"""A value that is held while the robot accelerates moves the end of a window by a part of its own distance."""
 
 STARTS_A_WINDOW = 8
 LONGEST_WINDOW_S = 30.0
@@ -25,7 +25,7 @@ TURN_WINDOW_S, TURN_STEP_S = 1.0, 0.5
 """Heading changes are compared over this time; windows start at every step."""
 
 UNSTATED_STD_M, NOISIER = 0.01, 1.5
-"""Noise of fixes that state none; and what their second differences must exceed it by to be believed instead."""
+"""Noise of fixes that state none; and what their second differences must exceed it by to be used instead."""
 
 
 MOST_WHEEL_SAMPLES = 100_000

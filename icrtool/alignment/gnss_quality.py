@@ -1,4 +1,4 @@
-"""Judge the fixes: fixed, float or other by what they say and how they move; noise by class; jumps counted.
+"""Classes of the fixes: fixed, float or other by what they state and how they move; noise by class; jumps counted.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds: taken for independent they would pull the filter along. Some drivers go on claiming a centimetre.
@@ -13,7 +13,7 @@ import numpy as np
 
 from icrtool.alignment.gnss_steps import FixSteps, measure_steps
 from icrtool.alignment.heading_alignment import HeadingAlignment
-from icrtool.alignment.misreported_fixes import find_sold
+from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
 from icrtool.records.tables import (
     FIXED_FIX,
@@ -29,17 +29,17 @@ from icrtool.records.tables import (
 )
 
 LARGEST_SANE_GNSS_STD_M = 100.0
-"""A message that states more says nothing about its noise (1000 or 1e6 stand for "unknown")."""
+"""A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""
 
 REFERENCE = 0
 CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED_FIX: "fixed"}
-"""Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and nothing is told apart."""
+"""Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and has one class."""
 
 FIXED_STD_M = 0.1
-"""What states more than this is no fixed solution; nmea_navsat_driver says 0.02 m times HDOP of one, 4 m of a float."""
+"""What states more than this is no fixed solution; nmea_navsat_driver states 0.02 m times HDOP of one, 4 m of float."""
 
 SURELY_FIXED_STD_M = 0.05
-"""... and what states less is one, where no status says anything."""
+"""... and what states less is one, where no status is given."""
 
 NORM_SHARE = 0.5
 """Where at least this share of the fixes is fixed, the others are RTK losses."""
@@ -51,7 +51,7 @@ CORRELATION_S = 10.0
 """How long such a fix errs alike."""
 
 NOISIER = 1.5
-"""White noise from step to step that is this many times what the messages state is believed instead."""
+"""White noise from step to step that is this many times what the messages state is used instead."""
 
 SHORTEST_LOSS_S = 2.0
 
@@ -66,7 +66,7 @@ class FixQuality:
     fix_class : uint8 (m,), keys of `CLASSES`
     sold : bool (m,), fixes that claim to be fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
-    step_std_m : by class name, white noise from step to step [m]; NaN where too few steps tell
+    step_std_m : by class name, white noise from step to step [m]; NaN where there are too few steps
     jump_stamp_ns : (j,) first fix after a jump; jump_m : (j,) its size
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
     """
@@ -83,9 +83,9 @@ class FixQuality:
 
 
 def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> FixQuality:
-    """Tell the classes of the fixes apart, and give each the noise it deserves.
+    """Return the classes of the fixes, and the noise of each.
 
-    The order of evidence: what the message tells (status, flags, solution type), the variance it states, then how the
+    The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
     fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
     other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
@@ -94,7 +94,7 @@ def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> Fix
     sense, offset = heading.remaining
     steps = measure_steps(log, mirrored=sense < 0, offset_rad=offset)
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    kinds, sold = _classes(log, stated, steps)
+    kinds, misreported = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
     fixed = kinds == FIXED_FIX
     norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
@@ -109,7 +109,7 @@ def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> Fix
     quality = FixQuality(
         log=replace(log, gnss=gnss),
         fix_class=kinds,
-        sold=sold,
+        sold=misreported,
         down_weighted=down,
         step_std_m=white,
         jump_stamp_ns=gnss.stamp_ns[steps.jump_row],
@@ -126,18 +126,20 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none
-    told = _told(gnss.stated_class, stated)
-    said = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
-    sold = find_sold(gnss.stamp_ns, steps, told == FIXED_FIX, said)
-    return np.where(sold, FLOAT_FIX, told).astype(np.uint8), sold
+    stated_kind = _stated_class(gnss.stated_class, stated)
+    flagged = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
+    misreported = find_misreported(gnss.stamp_ns, steps, stated_kind == FIXED_FIX, flagged)
+    return np.where(misreported, FLOAT_FIX, stated_kind).astype(np.uint8), misreported
 
 
-def _told(told: Bytes | None, stated: Floats) -> Bytes:
-    """Return the class of each fix by what its message says: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
-    told = np.full(len(stated), NOT_STATED, np.uint8) if told is None else told
+def _stated_class(stated_kind: Bytes | None, stated: Floats) -> Bytes:
+    """Return the class of each fix by what its message states: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
+    stated_kind = np.full(len(stated), NOT_STATED, np.uint8) if stated_kind is None else stated_kind
     rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
     silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
-    kinds: Bytes = np.select([told == RTK_FIX, told == NOT_STATED], [rtk, silent], told).astype(np.uint8)
+    kinds: Bytes = np.select([stated_kind == RTK_FIX, stated_kind == NOT_STATED], [rtk, silent], stated_kind).astype(
+        np.uint8
+    )
     return kinds
 
 
@@ -192,14 +194,14 @@ def _spans(pairs: list[tuple[int, int]]) -> Ints:
 
 
 def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
-    """Say what the fixes do not say of themselves, and what was done to their noise."""
-    notes, sold, rows = [], quality.sold, quality.fix_class
-    if sold.any():
+    """Return sentences on what the fixes do not state, and on what was done to their noise."""
+    notes, misreported, rows = [], quality.sold, quality.fix_class
+    if misreported.any():
         notes.append(
-            f"{_counted(sold)} claim {_accuracy(stated[sold], 'to be fixed')} but scatter or jump like "
+            f"{_counted(misreported)} claim {_accuracy(stated[misreported], 'to be fixed')} but scatter or jump like "
             f"RTK float{': taken as float' if changes else ''}"
         )
-    down = quality.down_weighted & ~sold
+    down = quality.down_weighted & ~misreported
     if down.any():
         gnss = quality.log.gnss
         given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)

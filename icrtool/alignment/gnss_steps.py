@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes, RobotLog
 
 FEWEST_STEPS = 40
-"""Fewer steps tell no noise; a stretch is judged by as many."""
+"""Fewer steps show no noise; a stretch is evaluated by as many."""
 
 FEWEST_FIXES = 30
 MEDIAN_OF_RAYLEIGH = 1.1774
@@ -31,7 +31,7 @@ MOST_TO_FIT = 10_000
 GAP_IN_INTERVALS = 5.0
 
 LONGEST_INTERVAL_S = 1.0
-"""Between wheel samples further apart the way is not known."""
+"""Between wheel samples further apart the path is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class FixSteps:
         return np.asarray(np.abs(self.jump), np.float64)
 
     def white_std_m(self, rows: Bools) -> float:
-        """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where too few steps tell."""
+        """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where there are too few steps."""
         inside = rows[:-2] & rows[1:-1] & rows[2:] & np.isfinite(self.product)
         if np.count_nonzero(inside) < FEWEST_STEPS:
             return float("nan")
@@ -84,7 +84,7 @@ class FixSteps:
 
 
 def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 0.0) -> FixSteps:
-    """Compare each step between fixes with the way of the wheels along the heading.
+    """Compare each step between fixes with the path of the wheels along the heading.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
 
     Notes
     -----
-    Scale and direction of the way, and an arm from the body origin, are fitted to the steps by clipped least squares:
+    Scale and direction of the path, and an arm from the body origin, are fitted to the steps by clipped least squares:
     wheels that slip and an antenna that is off centre make no jumps.
     """
     gnss, wheels, heading = log.gnss, log.wheels, log.heading
@@ -103,7 +103,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
         return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, still, np.empty(0, np.int64), none)
     speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
     travelled = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
-    way = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
+    distance = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
 
     def nose(stamps: Ints) -> Complexes:
         # The sample at hand is near enough for steps of centimetres, and needs no unwrapping of all the others.
@@ -111,7 +111,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
         psi = heading.heading_rad[row]
         return np.asarray(np.exp(1j * ((-psi if mirrored else psi) - offset_rad)), np.complex128)
 
-    laid = way * nose(gnss.stamp_ns[:-1] + np.diff(gnss.stamp_ns) // 2)
+    laid = distance * nose(gnss.stamp_ns[:-1] + np.diff(gnss.stamp_ns) // 2)
     swing = np.diff(nose(gnss.stamp_ns))
     seen = np.diff(gnss.north_m + 1j * gnss.east_m)
     dt = np.diff(gnss.stamp_ns) / 1e9
@@ -120,7 +120,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     along, arm = _explain(laid[some], swing[some], seen[some])
     step = seen - along * laid - arm * swing
     step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
-    moves = np.abs(way) > MOVES_MPS * dt
+    moves = np.abs(distance) > MOVES_MPS * dt
     moving = step[moves & np.isfinite(step)]
     scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
     with np.errstate(invalid="ignore"):
@@ -186,5 +186,5 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
 
 
 def unbroken(interval_s: Floats) -> Floats:
-    """Return intervals between wheel samples [s], zero for those that are too long to say what happened in them."""
+    """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
     return np.where(interval_s < LONGEST_INTERVAL_S, interval_s, 0.0)

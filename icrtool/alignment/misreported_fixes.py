@@ -13,8 +13,9 @@ USUAL_M2 = 2 * 0.005**2
 """Stretches are not compared below this variance, both axes."""
 
 STRETCH_VARIANCE = 9.0
-"""A stretch whose white noise has this many times the usual variance is float by itself, unless it says that it is
-fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where it parks.
+"""A stretch whose white noise has this many times the usual variance is float by itself, unless its messages state
+that it is fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where
+it parks.
 """
 
 BESIDE_JUMP = 5
@@ -29,24 +30,24 @@ MOST_JUMPS = 500
 """With more of them the position reference is something else than RTK that is lost now and then."""
 
 
-def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools, said: Bools) -> Bools:
+def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     """Return the fixes (m,) among the `claimed` ones that move like RTK float.
 
     Parameters
     ----------
-    claimed : bool (m,), taken for fixed; said : bool (m,), by a flag of the message itself and not by its variance
+    claimed : bool (m,), taken for fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
 
-    A jump alone does not say which of its sides is wrong: noise does, or a return. What neither tells stays as it is.
+    A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
     """
-    sold = np.zeros(len(stamps), np.bool_)
+    misreported = np.zeros(len(stamps), np.bool_)
     level, moves = steps.stretch_levels(claimed), steps.stretch_moves()
     known, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
     if len(known) < 2:
-        return sold
+        return misreported
     usual = max(float(np.median(moving if len(moving) >= 2 else known)), USUAL_M2)
     with np.errstate(invalid="ignore"):
         noisy = level > STRETCH_VARIANCE * usual
-    noisy &= ~said[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
+    noisy &= ~flagged[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
     undecided, beside, nearby = [], _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
     for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
@@ -54,14 +55,14 @@ def find_sold(stamps: Ints, steps: FixSteps, claimed: Bools, said: Bools) -> Boo
         noisy[stretches] = True
         if not decided:
             undecided.append(jump)
-    sold[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
+    misreported[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
     for jump, back in pairwise(undecided):
         first, last = steps.jump_row[jump], steps.jump_row[back]
         away, home = steps.jump[jump], steps.jump[back]
         short = back == jump + 1 and stamps[last] - stamps[first] < LONGEST_EXCURSION_S * 1e9
         if short and abs(away + home) < TAKEN_BACK * min(abs(away), abs(home)):
-            sold[first:last] = True
-    return sold & claimed
+            misreported[first:last] = True
+    return misreported & claimed
 
 
 def _moving_mean(level: Floats, width: int) -> Floats:
@@ -75,7 +76,7 @@ def _moving_mean(level: Floats, width: int) -> Floats:
 
 
 def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> tuple[bool, slice]:
-    """Return whether noise tells the sides of a jump in stretch `at` apart, and the stretches that are float then."""
+    """Return whether noise distinguishes the sides of a jump in stretch `at`, and the stretches that are float then."""
     before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
     if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
         return False, slice(0, 0)

@@ -11,7 +11,7 @@ from icrtool.config import FilterConfig
 from icrtool.records.tables import Floats, HeadingSamples, PositionFixes
 
 LARGEST_SANE_HEADING_STD_RAD = math.radians(60.0)
-"""A message that states more says nothing about its noise (1000 or 1e6 stand for "unknown")."""
+"""A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""
 
 
 def position_variance(fixes: PositionFixes, settings: FilterConfig) -> Floats:

@@ -95,7 +95,7 @@ def find_slip_events(sensors: SensorData, width_m: float, motion: Motion | None 
     squared Mahalanobis distance is chi-squared with 3 degrees of freedom.
 
     A reference that is worse than it states makes the robot do too much as often as too little. Windows in which a side
-    does more than its wheels, which no slip can cause, are counted: where there are many, the others are not believed
+    does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
     """
     knots = lay_knots(sensors, width_m)
@@ -259,7 +259,7 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
 
 
 def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
-    """Say whether the reference makes up, shortly before or after, for the distance that the event misses.
+    """Return whether the reference makes up, shortly before or after, for the distance that the event misses.
 
     A position that is wrong for a while comes back; distance lost by slip does not.
     """

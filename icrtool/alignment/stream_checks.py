@@ -46,11 +46,11 @@ def check_streams(log: RobotLog) -> None:
                 "leave those rows out",
             )
     variances = {"position": (log.gnss.var_north_m2, log.gnss.var_east_m2), "heading": (log.heading.var_rad2,)}
-    for what, told in variances.items():
-        negative = np.logical_or.reduce([variance < 0 for variance in told])
+    for what, stated in variances.items():
+        negative = np.logical_or.reduce([variance < 0 for variance in stated])
         if negative.any():
             why = f"a {what} variance is negative, the first at row {int(negative.argmax())}"
-            raise DataError(log.name, why, "NaN says that it is not known")
+            raise DataError(log.name, why, "NaN stands for unknown")
     fastest = float(np.abs(columns["wheel"]).max())
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")

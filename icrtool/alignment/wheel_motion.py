@@ -15,7 +15,7 @@ from icrtool.records.measurements import SensorData
 from icrtool.records.tables import Bools, Complexes, Floats, GyroSamples, Ints
 
 KNOT_S = 0.1
-"""Fixes closer together than this are thinned: they say little more, and their noise much."""
+"""Fixes closer together than this are thinned: they show little more, and their noise much."""
 
 SPEED_S = 0.1
 """The speed at a knot is the mean of this much time about it."""
@@ -26,7 +26,7 @@ LONGEST_HOLE_S, HOLE_IN_INTERVALS = 0.6, 5.0
 FIT_WINDOW_S = 1.0
 FEWEST_WINDOWS = 30
 MOVING_SHARE = 0.2
-"""Windows in which the wheels do less than this part of the usual say nothing of the motion model."""
+"""Windows in which the wheels do less than this part of the usual show nothing of the motion model."""
 
 LONGEST_HELD_IN_USUAL = 2.0
 """A value held for longer than this many times the usual was constant."""

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.calibration.held_out import Fold, HeldOut
-from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.calibration.measured_errors import ControllerErrors
+from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.motion.fit import PooledFit
 from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_parameters, track_geometry
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import twist_rates
+from icrtool.motion.recording import Recording, Windows, cut_windows
+from icrtool.motion.trials import drawn_path, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Floats
 
@@ -135,27 +136,37 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
 def _misses(recordings: Sequence[Recording], length_m: float, table: HeldOut) -> Floats:
     """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
     rows = [np.empty((0, 6))]
+    windows: dict[int, Windows | None] = {}
     for fold, fit in zip(table.folds, table.without, strict=True):
-        try:
-            rows.append(_fold_misses(recordings[fold.recording], length_m, fold, fit, table.typical))
-        except DataError:  # no window of this length in the recording
-            continue
+        recording = recordings[fold.recording]
+        if fold.recording not in windows:
+            windows[fold.recording] = _windows(recording, length_m)
+        if (found := windows[fold.recording]) is not None:
+            rows.append(_fold_misses(recording, found, fold, fit, table.typical))
     return np.concatenate(rows)
 
 
-def _fold_misses(recording: Recording, length_m: float, fold: Fold, fit: PooledFit, typical: TypicalDrive) -> Floats:
-    windows, t, held = cut_windows(recording, (length_m,)), recording.t_s, recording.held_s
+def _windows(recording: Recording, length_m: float) -> Windows | None:
+    """Return the windows of one length in a recording, None where there is none."""
+    try:
+        return cut_windows(recording, (length_m,))
+    except DataError:
+        return None
+
+
+def _fold_misses(recording: Recording, windows: Windows, fold: Fold, fit: PooledFit, typical: TypicalDrive) -> Floats:
+    t = recording.t_s
     row = np.searchsorted(t, windows.knot_t)
     mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
-    s, e = row[windows.start[mine]], row[windows.end[mine]]
+    s, e = windows.start[mine], windows.end[mine]
     geometry = track_geometry(fit.model, fit.parameters, recording.width_m, typical)
-    v_x, v_y, omega = twist_rates(recording, CONTROLLER, controller_parameters(geometry))
-    theta = np.concatenate([[0.0], np.cumsum(held * omega)[:-1]])
-    place = np.concatenate([[0.0], np.cumsum(held * (v_x + 1j * v_y) * np.exp(1j * theta))[:-1]])
+    rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=windows.steps)
+    theta, place = drawn_path(windows.steps, rates)(windows.knot_t)
     miss = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
-    turn = recording.drive.heading[e] - recording.drive.heading[s]
+    turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]
     turned = theta[e] - theta[s] - turn
-    return np.column_stack([miss.real, miss.imag, turned, t[e] - t[s], turn, np.full(len(s), length_m)])
+    lasting = windows.knot_t[e] - windows.knot_t[s]
+    return np.column_stack([miss.real, miss.imag, turned, lasting, turn, windows.length_m[mine]])
 
 
 def _variances(misses: Floats) -> tuple[float, float, float]:
@@ -165,8 +176,13 @@ def _variances(misses: Floats) -> tuple[float, float, float]:
 
 
 def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
-    """Return a, b >= 0 with miss^2 about a first^2 + b second^2."""
-    from scipy.optimize import nnls
-
-    shares, _ = nnls(np.column_stack([first**2, second**2]), miss**2)
-    return max(float(shares[0]), SMALLEST_VARIANCE), max(float(shares[1]), SMALLEST_VARIANCE)
+    """Return a, b >= 0 with miss^2 about a first^2 + b second^2, by least squares."""
+    columns = np.column_stack([first**2, second**2])
+    square, product = columns.T @ columns, columns.T @ miss**2
+    both = np.linalg.lstsq(square, product, rcond=None)[0]
+    if both.min() < 0.0:
+        # at the bound one of them is zero: the one that leaves less
+        alone = np.divide(product, np.diag(square), out=np.zeros(2), where=np.diag(square) > 0.0)
+        better = int(np.argmax(alone * product))
+        both = np.where(np.arange(2) == better, np.maximum(alone, 0.0), 0.0)
+    return max(float(both[0]), SMALLEST_VARIANCE), max(float(both[1]), SMALLEST_VARIANCE)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.trials import Summary
@@ -39,21 +40,6 @@ SHORTEST_BLOCK_M, MOST_BLOCKS = 25.0, 5
 
 FEWEST_RESIDUALS = 20
 
-LONGEST_DELAY_S = 1.0
-"""States kept beside a block, for wheels that are read later or earlier."""
-
-FEWEST_TO_CHOOSE = 3
-"""With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
-
-UNCHOSEN = "icr"
-"""The paper's model stands where there are too few folds to choose."""
-
-BASELINE = "multiplier"
-"""What is worse than this one is never recommended."""
-
-MOST_GIVEN_UP = 0.05
-"""A simpler model may cost this share of the best one's error, no more: few folds show their own noise badly."""
-
 AT_ONCE = 2
 
 
@@ -65,9 +51,14 @@ class Fold(NamedTuple):
     begin_m: float
     end_m: float
 
+    @property
+    def whole(self) -> bool:
+        """Whether all of the recording is left out."""
+        return bool(np.isinf(self.begin_m) and np.isinf(self.end_m))
+
 
 @dataclass(frozen=True, slots=True)
-class ModelScores:
+class HeldOutRow:
     """One model on what it was not fitted to.
 
     Attributes
@@ -99,7 +90,7 @@ class HeldOut:
     scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
         what a controller makes of that
     fits : of everything, by model name
-    without : by fold, the model chosen without it and fitted without it
+    without : by fold, the model chosen without it and fitted without it; delays_s : of the wheels in it
     typical : curvature and speed at which ICRs and multiplier are stated
     recommended : name of the model chosen with all folds
     chosen : by fold, the model chosen without it
@@ -108,15 +99,16 @@ class HeldOut:
 
     horizons_m: tuple[float, ...]
     folds: tuple[Fold, ...]
-    scores: tuple[ModelScores, ...]
+    scores: tuple[HeldOutRow, ...]
     fits: dict[str, PooledFit]
     without: tuple[PooledFit, ...]
+    delays_s: tuple[float, ...]
     typical: TypicalDrive
     recommended: str
     chosen: tuple[str, ...]
     why: str
 
-    def score(self, name: str) -> ModelScores:
+    def score(self, name: str) -> HeldOutRow:
         """Return the row of a model."""
         return next(score for score in self.scores if score.name == name)
 
@@ -165,44 +157,84 @@ def hold_out(
     DataError
         Too short a drive, or too little left beside a fold.
     """
-    folds = plan_folds(recordings)
-    tester = _Tester(recordings, folds, horizons_m)
+    tester = _Tester(recordings)
+    tester.cut_trials(horizons_m)
     gyro = all(one.gyro_radps is not None for one in recordings)
 
-    def job(model: MotionModel) -> list[_Tested]:
-        alone = tester.test(model)
-        return [alone, tester.test(model.with_gyro(), alone)] if gyro else [alone]
+    def job(fitted: _Fitted) -> list[_Tested]:
+        alone = tester.test(fitted)
+        return [alone, tester.test(tester.fit(fitted.model.with_gyro(), fitted.whole), alone)] if gyro else [alone]
 
     with ThreadPoolExecutor(AT_ONCE) as threads:
-        tested = list(threads.map(job, tuple(MODELS.values()) if models is None else models))
-    alone = [one[0] for one in tested]
-    wheels = _table(tester, folds, horizons_m, alone, _nested_choice(alone, folds))
+        fitted = list(threads.map(tester.fit, tuple(MODELS.values()) if models is None else models))
+        tested = list(threads.map(job, fitted))
+    alone, choice = [one[0] for one in tested], _choose(fitted, tester.folds)
+    wheels = _table(tester, horizons_m, alone, choice)
     if not gyro:
         return wheels, None
     # the same models: a choice of its own for the gyro would only add noise
-    names = _Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
-    return wheels, _table(tester, folds, horizons_m, [one[1] for one in tested], names)
+    names = Choice(f"{wheels.recommended}_gyro", wheels.why, tuple(f"{name}_gyro" for name in wheels.chosen))
+    return wheels, _table(tester, horizons_m, [one[1] for one in tested], names)
+
+
+class Recommendation(NamedTuple):
+    """The model that `hold_out` recommends, fitted to everything, without the scores of a table.
+
+    Attributes
+    ----------
+    why : the reason, one sentence
+    typical : curvature and speed at which ICRs and multiplier are stated
+    """
+
+    fit: PooledFit
+    why: str
+    typical: TypicalDrive
+
+
+def recommend(recordings: Sequence[Recording]) -> Recommendation:
+    """Return the model that `hold_out` recommends for recordings, in a fraction of its time.
+
+    Raises
+    ------
+    DataError
+        Too short a drive, or too little left beside a fold.
+    """
+    tester = _Tester(recordings)
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        fitted = list(threads.map(tester.fit, MODELS.values()))
+    choice = _choose(fitted, tester.folds)
+    best = next(one for one in fitted if one.model.name == choice.recommended)
+    return Recommendation(best.whole, choice.why, tester.typical)
+
+
+class _Fitted(NamedTuple):
+    """A model fitted to everything, and what it is chosen by.
+
+    ``inner[f, g]`` (folds, folds): expected error [m] of the windows of fold g, fitted without f and g, to first order.
+    """
+
+    model: MotionModel
+    pool: Pool
+    whole: PooledFit
+    inner: Floats
 
 
 class _Tested(NamedTuple):
-    """A model's fits, whole and without each fold; by fold trial errors and the wheels' delay [s]; window errors.
-
-    ``inner[f, g]`` (folds, folds): expected error of fold g, fitted without f and g; ``inner[f, f]`` without f alone.
-    """
+    """A model's fits, whole and without each fold; by fold trial errors and the wheels' delay [s]."""
 
     model: MotionModel
     whole: PooledFit
     fits: list[PooledFit]
     errors: list[Floats]
     delays: list[float]
-    inner: Floats
 
 
 class _Tester:
     """What all models are fitted to and tested by."""
 
-    def __init__(self, recordings: Sequence[Recording], folds: Sequence[Fold], horizons_m: Sequence[float]) -> None:
-        self._folds = folds
+    def __init__(self, recordings: Sequence[Recording]) -> None:
+        self.folds = folds = plan_folds(recordings)
+        self._recordings = recordings
         self._windows = [cut_windows(one, pooled=recordings) for one in recordings]
         self._widths = [one.width_m for one in recordings]
         self._clear, self._inside = mask_windows(self._windows, folds)
@@ -210,30 +242,46 @@ class _Tester:
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
-        trials = [cut_trials(one, horizons_m) for one in recordings]
-        self._tested = [_within(recordings[fold.recording], trials[fold.recording], fold) for fold in folds]
+        self._trials: list[Trials] = []
         self.typical = typical_drive(
             [(wheel_motion(one.drive.v_left, one.drive.v_right, one.width_m), one.held_s) for one in recordings]
         )
 
-    def test(self, model: MotionModel, wheels: _Tested | None = None) -> _Tested:
-        """Fit and test a model; one with a gyro weighs the turn rates of the same fits for wheels alone."""
-        pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.whole.turning)
-        whole, count = pool.fit(), len(self._folds)
-        fits, errors, delays, inner = [], [], [], np.full((count, count), np.nan)
+    def cut_trials(self, horizons_m: Sequence[float]) -> None:
+        """Cut the trials of every fold."""
+        trials = [cut_trials(one, horizons_m) for one in self._recordings]
+        self._trials = [
+            trials[fold.recording].within(
+                self._recordings[fold.recording].drive.distance, fold.begin_m, fold.end_m
+            )
+            for fold in self.folds
+        ]  # fmt: skip
+
+    def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> _Fitted:
+        """Fit a model to everything; one with a gyro weighs the turn rate of a fit for wheels alone."""
+        pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.turning)
+        whole, count = pool.fit(), len(self.folds)
+        inner = np.full((count, count), np.nan)
         for f in range(count):
+            for g in range(f, count):
+                if f == g or count >= FEWEST_TO_CHOOSE:
+                    x = pool.without(whole, ~(self._clear[f] & self._clear[g]))
+                    inner[f, g] = self._window_error(whole, g, x)
+                    inner[g, f] = self._window_error(whole, f, x)
+        return _Fitted(model, pool, whole, inner)
+
+    def test(self, fitted: _Fitted, wheels: _Tested | None = None) -> _Tested:
+        """Test a model; one with a gyro weighs the turn rates of the fits for wheels alone without the same folds."""
+        model, pool, fits, errors, delays = fitted.model, fitted.pool, [], [], []
+        for f in range(len(self.folds)):
             if wheels is not None:
                 pool = Pool(self._windows, self._widths, model, wheels.fits[f].turning)
-            fit = pool.fit(self._clear[f], pool.without(whole, ~self._clear[f]))
-            fits.append(fit)
+            fit = pool.fit(self._clear[f], fitted.pool.without(fitted.whole, ~self._clear[f]))
             found, delay = self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f])
+            fits.append(fit)
             errors.append(found)
             delays.append(delay)
-            inner[f, f] = self._window_error(fit, f, fit.solution.x)
-            for g in range(count):
-                if g != f and count >= FEWEST_TO_CHOOSE:
-                    inner[f, g] = self._window_error(fit, g, pool.without(fit, ~self._clear[g]))
-        return _Tested(model, whole, fits, errors, delays, inner)
+        return _Tested(model, fitted.whole, fits, errors, delays)
 
     def _window_error(self, fit: PooledFit, f: int, x: Floats) -> float:
         """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit.
@@ -242,7 +290,7 @@ class _Tester:
         -----
         Without the recording's heading offset: trials start with the heading of the reference as it is.
         """
-        rows, offset = self._inside[f], len(fit.model.terms) + 3 * self._folds[f].recording
+        rows, offset = self._inside[f], len(fit.model.terms) + 3 * self.folds[f].recording
         away = x - fit.solution.x
         away[offset] = -fit.solution.x[offset]
         residuals = fit.residuals[rows] + fit.jacobian[rows] @ away
@@ -259,20 +307,21 @@ class _Tester:
         Delay and gyro bias are constants of a recording: from what is left of it, or, where all of it is left out,
         from itself with the parameters of the others.
         """
-        i = self._folds[f].recording
-        whole_recording = self._folds[f].begin_m == -np.inf and self._folds[f].end_m == np.inf
-        own = pool.own_constants(i, fit.parameters) if whole_recording else fit.constants[i]
+        fold = self.folds[f]
+        i = fold.recording
+        own = pool.own_constants(i, fit.parameters) if fold.whole else fit.constants[i]
         turn = None if wheels is None else wheels.turning
-        recording, trials = self._tested[f]
-        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]))
-        return trial_errors(recording, trials, rates, float(own[1])), float(own[1])
+        recording, steps = self._recordings[i], self._windows[i].steps
+        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]), steps)
+        return trial_errors(recording, self._trials[f], rates, float(own[1]), steps), float(own[1])
 
     def controller_errors(self, fit: PooledFit, f: int, delay_s: float) -> Floats:
         """Return the errors of a fold's trials with what a controller can express of a fit without the fold."""
-        recording, trials = self._tested[f]
+        i = self.folds[f].recording
+        recording, steps = self._recordings[i], self._windows[i].steps
         geometry = track_geometry(fit.model, fit.parameters, recording.width_m, self.typical)
-        rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry))
-        return trial_errors(recording, trials, rates, delay_s)
+        rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=steps)
+        return trial_errors(recording, self._trials[f], rates, delay_s, steps)
 
 
 def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequence[float]) -> Trials:
@@ -282,45 +331,14 @@ def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequen
     return Trials(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _within(recording: Recording, trials: Trials, fold: Fold) -> tuple[Recording, Trials]:
-    """Return the part of a recording that a fold's trials need, delays included, and the trials in it."""
-    mine = trials.within(recording.drive.distance, fold.begin_m, fold.end_m)
-    if not len(mine.starts):
-        return recording, mine
-    last = max(int(mine.ends.max()), int(mine.starts[-1]))
-    t = recording.t_s
-    first = int(np.searchsorted(t, t[mine.starts[0]] - LONGEST_DELAY_S))
-    stop = min(int(np.searchsorted(t, t[last] + LONGEST_DELAY_S)) + 1, len(t))
-    shifted = Trials(mine.starts - first, np.where(mine.ends >= 0, mine.ends - first, -1))
-    return recording.part(first, stop), shifted
-
-
-class _Choice(NamedTuple):
-    """The model recommended and why, and the one chosen without each fold."""
-
-    recommended: str
-    why: str
-    chosen: tuple[str, ...]
-
-
-def _nested_choice(tested: Sequence[_Tested], folds: Sequence[Fold]) -> _Choice:
-    """Choose with all folds, and without each of them."""
-    by_name = {one.model.name: one for one in tested}
-    sizes = {name: len(one.model.terms) for name, one in by_name.items()}
-    baseline = BASELINE if BASELINE in by_name else next(iter(by_name))
-    recommended, why = choose({name: np.diag(one.inner) for name, one in by_name.items()}, sizes, baseline)
-    chosen = [UNCHOSEN if UNCHOSEN in by_name else baseline] * len(folds)
-    if len(folds) < FEWEST_TO_CHOOSE and folds[0].recording == folds[-1].recording:
-        return _Choice(chosen[0], f"{len(folds)} blocks are too few to choose a model", tuple(chosen))
-    if len(folds) >= FEWEST_TO_CHOOSE:
-        for f in range(len(folds)):
-            others = [g for g in range(len(folds)) if g != f]
-            chosen[f], _ = choose({name: one.inner[f, others] for name, one in by_name.items()}, sizes, baseline)
-    return _Choice(recommended, why, tuple(chosen))
+def _choose(fitted: Sequence[_Fitted], folds: Sequence[Fold]) -> Choice:
+    inner = {one.model.name: one.inner for one in fitted}
+    sizes = {one.model.name: len(one.model.terms) for one in fitted}
+    return nested_choice(inner, sizes, one_recording=folds[0].recording == folds[-1].recording)
 
 
 def _table(
-    tester: _Tester, folds: tuple[Fold, ...], horizons_m: Sequence[float], tested: Sequence[_Tested], choice: _Choice
+    tester: _Tester, horizons_m: Sequence[float], tested: Sequence[_Tested], choice: Choice
 ) -> HeldOut:  # fmt: skip
     """Return the table of models that were tested on the same folds."""
     by_name = {one.model.name: one for one in tested}
@@ -330,44 +348,14 @@ def _table(
     )
     fits = {name: one.whole for name, one in by_name.items()}
     without = tuple(by_name[name].fits[f] for f, name in enumerate(choice.chosen))
+    delays = tuple(by_name[name].delays[f] for f, name in enumerate(choice.chosen))
     if not any(fit.model.uses_gyro for fit in without):
-        delays = [by_name[name].delays[f] for f, name in enumerate(choice.chosen)]
         errors = [tester.controller_errors(fit, f, delays[f]) for f, fit in enumerate(without)]
         rows.append(_scores(CONTROLLER.name, CONTROLLER.label, errors))
     return HeldOut(
-        tuple(horizons_m), folds, tuple(rows), fits, without, tester.typical, choice.recommended, choice.chosen,
-        choice.why,
+        tuple(horizons_m), tester.folds, tuple(rows), fits, without, delays, tester.typical, choice.recommended,
+        choice.chosen, choice.why,
     )  # fmt: skip
-
-
-def choose(errors: dict[str, Floats], sizes: dict[str, int], baseline: str) -> tuple[str, str]:
-    """Return the model to recommend and why: the simplest whose held-out error is within noise of the best.
-
-    Parameters
-    ----------
-    errors : by model, expected error of each fold (folds,) [m], NaN where it has no window
-    sizes : by model, how many parameters it has
-    baseline : what is worse than this one is not recommended
-
-    Notes
-    -----
-    The rule of one standard error (Breiman et al. 1984), of the logarithms' differences over the same folds, since some
-    folds are harder than others for every model.
-    """
-    logs = {name: np.log(np.maximum(values[np.isfinite(values)], 1e-9)) for name, values in errors.items()}
-    logs = {name: values for name, values in logs.items() if len(values) and values.mean() <= logs[baseline].mean()}
-    if not logs:
-        return baseline, "the drive is too short to compare models"
-    best = min(logs, key=lambda name: float(logs[name].mean()))
-    for name in sorted(logs, key=lambda one: sizes[one]):
-        apart = logs[name] - logs[best]
-        noise = float(apart.std(ddof=1)) / np.sqrt(len(apart)) if len(apart) > 1 else np.inf
-        if name == best or float(apart.mean()) <= min(noise, MOST_GIVEN_UP):
-            break
-    if name == best:
-        return name, f"least expected error after {CHOICE_HORIZON_M:g} m on what it was not fitted to"
-    share = 100.0 * float(np.expm1((logs[name] - logs[best]).mean()))
-    return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
 
 
 def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[list[Bools], list[Bools]]:
@@ -385,9 +373,9 @@ def mask_windows(windows: Sequence[Windows], folds: Sequence[Fold]) -> tuple[lis
     return clear, inside
 
 
-def _scores(name: str, label: str, errors: Sequence[Floats]) -> ModelScores:
+def _scores(name: str, label: str, errors: Sequence[Floats]) -> HeldOutRow:
     folds = tuple(summarise(one) for one in errors)
-    return ModelScores(name, label, folds, summarise(np.concatenate(errors)))
+    return HeldOutRow(name, label, folds, summarise(np.concatenate(errors)))
 
 
 def _over(function: Callable[[Floats], Any], folds: Sequence[Summary], column: str, h: int) -> float:

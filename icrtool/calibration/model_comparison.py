@@ -22,7 +22,7 @@ from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs, Summary
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
-from icrtool.records.dropout import MeasuredHeading, Rung
+from icrtool.records.dropout import MeasuredHeading, ModelScore
 from icrtool.records.run import Run, half_width_m
 from icrtool.records.tables import Floats
 
@@ -44,7 +44,7 @@ FITTED_TO = {
 
 
 @dataclass(frozen=True, slots=True)
-class Ladder:
+class ModelComparison:
     """The table.
 
     Attributes
@@ -63,7 +63,7 @@ class Ladder:
     horizons_m: tuple[float, ...]
     blocks: int
     starts: int
-    rungs: tuple[Rung, ...]
+    scores: tuple[ModelScore, ...]
     chosen: tuple[str, ...]
     fits: dict[str, FittedModel]
     best: str
@@ -75,30 +75,30 @@ class Ladder:
     @property
     def summaries(self) -> dict[str, Summary]:
         """The errors of each row, by its name."""
-        return {rung.name: rung.summary for rung in self.rungs}
+        return {score.name: score.summary for score in self.scores}
 
-    def rung(self, name: str) -> Rung:
-        """Return a rung by name."""
-        return next(rung for rung in self.rungs if rung.name == name)
+    def score(self, name: str) -> ModelScore:
+        """Return a score by name."""
+        return next(score for score in self.scores if score.name == name)
 
 
-class Comparison(NamedTuple):
+class ComparedModels(NamedTuple):
     """The table, and what gives the errors of the recommended model in any trials (see `block_predictor`)."""
 
-    table: Ladder
+    table: ModelComparison
     recommended: ErrorsOf
 
 
-def judge_ladder(
+def comparison_table(
     run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
-) -> Ladder:
+) -> ModelComparison:
     """Return the table of `compare_models`."""
     return compare_models(run, headings, horizons_m=horizons_m).table
 
 
 def compare_models(
     run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
-) -> Comparison:
+) -> ComparedModels:
     """Test every model on distance it was not fitted to.
 
     Parameters
@@ -120,14 +120,14 @@ def compare_models(
     recording, heading, notes = _with_heading(run, headings)
     wheels, turned = hold_out([recording], horizons_m=horizons_m)
     trials = block_trials(recording, plan_folds([recording]), horizons_m)
-    rungs = list(_wheels_rungs(run, recording, trials, wheels))
+    scores = list(_wheels_scores(run, recording, trials, wheels))
     if turned is not None:
-        rungs += _turned_rungs(run, recording, trials, turned, heading)
-    table = Ladder(
+        scores += _turned_scores(run, recording, trials, turned, heading)
+    table = ModelComparison(
         horizons_m=tuple(horizons_m),
         blocks=len(wheels.folds),
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
-        rungs=tuple(rungs),
+        scores=tuple(scores),
         chosen=wheels.chosen,
         fits={name: FittedModel(fit.model, fit.parameters, fit.covariance) for name, fit in wheels.fits.items()},
         best=wheels.recommended,
@@ -136,7 +136,7 @@ def compare_models(
         notes=notes,
         calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
     )
-    return Comparison(table, block_predictor(recording, wheels))
+    return ComparedModels(table, block_predictor(recording, wheels))
 
 
 def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:
@@ -169,7 +169,7 @@ def _icrs_of(run: Run, name: str) -> FrozenIcrs:
     return FrozenIcrs(*columns) if name == "icr" else FrozenIcrs(*(column[-1:] for column in columns))
 
 
-def _wheels_rungs(run: Run, recording: Recording, trials: Trials, table: HeldOut) -> Iterator[Rung]:
+def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOut) -> Iterator[ModelScore]:
     for name in MODELS:
         if name in FAMILY:
             if name == "no_slip" and run.track_width_m is None:
@@ -181,12 +181,12 @@ def _wheels_rungs(run: Run, recording: Recording, trials: Trials, table: HeldOut
             ends = np.full((len(drive.distance), trials.ends.shape[1]), -1, np.int64)
             ends[trials.starts] = trials.ends
             summary = summarise(open_loop_errors(drive, _icrs_of(run, name), ends)[trials.starts])
-        yield Rung(name, LABELS[name], FITTED_TO[name], False, summary)
+        yield ModelScore(name, LABELS[name], FITTED_TO[name], False, summary)
 
 
-def _turned_rungs(
+def _turned_scores(
     run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
-) -> Iterator[Rung]:  # fmt: skip
+) -> Iterator[ModelScore]:  # fmt: skip
     """Yield the models that turn by wheels and a measured heading; a multiplier alone says nothing of the path."""
     for name in MODELS:
         if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
@@ -196,7 +196,7 @@ def _turned_rungs(
             summary = table.score(of if of == "recommended" else f"{of}_gyro").together
         else:
             summary = summarise(_errors_along(run, recording, trials, _icrs_of(run, name)))
-        yield Rung(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
+        yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 
 def _errors_along(run: Run, recording: Recording, trials: Trials, icrs: FrozenIcrs) -> Floats:

@@ -11,6 +11,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
+from icrtool.calibration.error_growth import measure_error_sources
 from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_out, mask_windows
 from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
 from icrtool.errors import ConfigError
@@ -167,6 +168,7 @@ def calibration_from(
         logs=logs,
         held_out=tuple(scores),
         controller=controller_errors(recordings, wheels),
+        sources=measure_error_sources(recordings, wheels),
         warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,

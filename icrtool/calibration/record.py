@@ -13,6 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.measured_errors import (
+    ControllerErrors,
+    ErrorSources,
+    controller_errors_of,
+    error_sources_of,
+)
 from icrtool.motion.models import (
     MotionModel,
     TrackGeometry,
@@ -118,25 +124,6 @@ class ControllerNumbers(NamedTuple):
     right_radius_std: float
 
 
-class ControllerErrors(NamedTuple):
-    """Errors of what a controller can express of the recommended model, on distance it was not fitted to.
-
-    Attributes
-    ----------
-    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
-    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
-    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
-    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; NaN without a trial of 10 m
-    """
-
-    pose_variance: tuple[float, float, float]
-    twist_variance: tuple[float, float, float]
-    turn_noise: tuple[float, float]
-    way_noise: tuple[float, float]
-    p95_m: float
-    full_p95_m: float
-
-
 class Odometry(NamedTuple):
     """A path from wheel speeds alone, from the origin with heading zero; (n,) each."""
 
@@ -160,6 +147,7 @@ class Calibration:
     logs : what it was fitted to
     held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
     controller : errors of what a controller can express; None where the drive is too short to measure them
+    sources : of the errors beside those of the parameters; None where the drive is too short to measure them
     warnings : what to know before use
     created : date and time, UTC, ISO 8601
     name : stem of its file; empty for one just made
@@ -178,6 +166,7 @@ class Calibration:
     created: str
     tool_version: str
     name: str = field(default="", compare=False)
+    sources: ErrorSources | None = None
 
     @property
     def recommended(self) -> str:
@@ -195,14 +184,7 @@ class Calibration:
 
     def controller_numbers(self) -> ControllerNumbers:
         """Return multiplier and radius factors of the recommended model for a controller."""
-        geometry, covariance = self.geometry()
-        std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-        left, right = float(self.robot.get("left_scale", 1.0)), float(self.robot.get("right_scale", 1.0))
-        return ControllerNumbers(
-            geometry.multiplier, std["multiplier"],
-            left * geometry.radius_left, left * std["radius_left"],
-            right * geometry.radius_right, right * std["radius_right"],
-        )  # fmt: skip
+        return _controller_numbers(*self.geometry(), self.robot)
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
         """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks; NaN without."""
@@ -277,30 +259,50 @@ class Calibration:
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for the calibration file."""
-        geometry, covariance = self.geometry()
         return {
             "schema": CALIBRATION_SCHEMA,
             "tool_version": self.tool_version,
             "created": self.created,
             "robot": dict(self.robot),
             "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
-            "model": self.fitted.model.name,
             "recommended": self.recommended,
             "why": self.why,
-            **_plain(self.fitted),
-            "not_shown": list(self.fitted.not_shown),
-            "geometry": geometry._asdict(),
-            "typical": self.typical._asdict(),
-            "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+            **fitted_document(self.fitted, self.robot, self.typical),
             "gyro": None if self.gyro is None else {"model": self.gyro.model.name, **_plain(self.gyro)},
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
-            "controller": None
-            if self.controller is None
-            else plain(self.controller_numbers()._asdict() | self.controller._asdict()),
+            "controller": plain(
+                self.controller_numbers()._asdict() | ({} if self.controller is None else self.controller._asdict())
+            ),
+            "error_sources": None if self.sources is None else self.sources._asdict(),
             "warnings": list(self.warnings),
         }
+
+
+def fitted_document(fitted: FittedModel, robot: Mapping[str, Any], typical: TypicalDrive) -> dict[str, Any]:
+    """Return plain data of a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
+    geometry, covariance = fitted.geometry(float(robot["track_width_m"]), typical)
+    return {
+        "model": fitted.model.name,
+        **_plain(fitted),
+        "not_shown": list(fitted.not_shown),
+        "geometry": geometry._asdict(),
+        "typical": typical._asdict(),
+        "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        "controller": _controller_numbers(geometry, covariance, robot)._asdict(),
+    }
+
+
+def _controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:
+    """Return multiplier and radius factors with one standard deviation each."""
+    std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    left, right = float(robot.get("left_scale", 1.0)), float(robot.get("right_scale", 1.0))
+    return ControllerNumbers(
+        geometry.multiplier, std["multiplier"],
+        left * geometry.radius_left, left * std["radius_left"],
+        right * geometry.radius_right, right * std["radius_right"],
+    )  # fmt: skip
 
 
 def _plain(one: FittedModel) -> dict[str, Any]:
@@ -338,24 +340,12 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
         why=str(document["why"]),
         logs=tuple(CalibrationLog(**log) for log in document["logs"]),
         held_out=tuple(HeldOutScore(**score) for score in document["held_out"]),
-        controller=_controller_errors(document["controller"]),
+        controller=controller_errors_of(document["controller"]),
         warnings=tuple(str(warning) for warning in document["warnings"]),
         created=str(document["created"]),
         tool_version=str(document["tool_version"]),
+        sources=error_sources_of(document.get("error_sources")),
     )
-
-
-def _controller_errors(document: Mapping[str, Any] | None) -> ControllerErrors | None:
-    if document is None:
-        return None
-    pose, twisted, turn, way = (
-        tuple(map(float, document[name])) for name in ("pose_variance", "twist_variance", "turn_noise", "way_noise")
-    )
-    p95, full = (float("nan") if document[name] is None else float(document[name]) for name in ("p95_m", "full_p95_m"))
-    return ControllerErrors(
-        (pose[0], pose[1], pose[2]), (twisted[0], twisted[1], twisted[2]), (turn[0], turn[1]), (way[0], way[1]),
-        p95, full,
-    )  # fmt: skip
 
 
 def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:

@@ -8,12 +8,13 @@ single run, without the blocks that it touches.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.error_differences import ErrorDifference, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.calibration.pooled import CalibrationResult, block_predictor, fixed_predictor, gyro_recording_of, predictor
 from icrtool.calibration.record import Calibration
@@ -67,8 +68,23 @@ class Cell(NamedTuple):
 
 
 class ErrorChange(NamedTuple):
-    """Errors of the second group's held-out calibration minus those of the first's, with 95 % intervals [m]."""
+    """Errors of the second group's held-out calibration minus those of the first's; `paired`: on the same route."""
 
+    horizon_m: float
+    p95_m: float
+    p95_low_m: float
+    p95_high_m: float
+    expected_m: float
+    expected_low_m: float
+    expected_high_m: float
+    paired: bool
+
+
+class TransferCost(NamedTuple):
+    """Errors of the calibration of one group minus those of the tested group's own, held out, in the same trials."""
+
+    calibrated_on: str
+    tested_on: str
     horizon_m: float
     p95_m: float
     p95_low_m: float
@@ -96,11 +112,18 @@ class Transfer:
     calibrations : by group
     pairs : the first group with each of the others
     cells : the transfer matrix, by row, column and horizon
+    costs : of each cell beside the diagonal, against the diagonal of its column
     """
 
     calibrations: Mapping[str, Calibration]
     pairs: tuple[Pair, ...]
     cells: tuple[Cell, ...]
+    costs: tuple[TransferCost, ...]
+
+    def cost(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCost:
+        """Return what a calibration of one group costs on another."""
+        where = (calibrated_on, tested_on, horizon_m)
+        return next(one for one in self.costs if one[:3] == where)
 
     def cell(self, calibrated_on: str, tested_on: str, horizon_m: float) -> Cell:
         """Return a cell of the matrix."""
@@ -126,8 +149,9 @@ def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_S
     Notes
     -----
     Parameters of different logs are independent, and their covariances are clustered by distance; errors have intervals
-    of a moving-block bootstrap over the distance of all runs of a group, blocks as long as the horizon. The interval of
-    a difference of errors adds the half-widths of both sides in squares.
+    of a moving-block bootstrap over the distance of all runs of a group, blocks as long as the horizon. Differences of
+    errors have a bootstrap of their own, over pairs of blocks where both are of the same trials or the same route
+    (`icrtool.calibration.error_differences`).
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
@@ -142,6 +166,7 @@ def compare_calibrations(
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     calibrations = {name: result.calibration for name, result in results.items()}
     cells: list[Cell] = []
+    errors_of_cell: dict[tuple[str, str], tuple[Floats, Floats]] = {}
     for row, calibration in calibrations.items():
         for column, tested in recordings.items():
             if row == column and len(tested) == 1:
@@ -157,10 +182,41 @@ def compare_calibrations(
                 trials = cut_trials(one, HORIZONS_M)
                 errors.append(errors_of(trials))
                 path.append(_path(one, trials, path[-1][-1] if path else 0.0))
-            cells += _cells(row, column, np.concatenate(errors), np.concatenate(path), seed)
+            errors_of_cell[row, column] = np.concatenate(errors), np.concatenate(path)
+            cells += _cells(row, column, *errors_of_cell[row, column], seed)
     first, *others = results
-    pairs = tuple(_pair(first, other, calibrations, cells) for other in others)
-    return Transfer(calibrations, pairs, tuple(cells))
+    pairs = []
+    for other in others:
+        alike = len(recordings[first]) == len(recordings[other]) == 1 and same_route(
+            *(_route(recordings[name][0]) for name in (first, other))
+        )
+        own = errors_of_cell[first, first], errors_of_cell[other, other]
+        changes = tuple(
+            ErrorChange(h, *difference, alike) for h, difference in _differences(*own, paired=alike, seed=seed)
+        )
+        pairs.append(Pair(first, other, _parameter_differences(first, other, calibrations), changes))
+    costs = tuple(
+        TransferCost(row, column, horizon, *difference)
+        for (row, column), foreign in errors_of_cell.items() if row != column
+        for horizon, difference in _differences(errors_of_cell[column, column], foreign, paired=True, seed=seed)
+    )  # fmt: skip
+    return Transfer(calibrations, tuple(pairs), tuple(cells), costs)
+
+
+def _route(recording: Recording) -> tuple[Floats, Floats, Floats]:
+    drive = recording.drive
+    return drive.distance, drive.north, drive.east
+
+
+def _differences(
+    first: tuple[Floats, Floats], second: tuple[Floats, Floats], *, paired: bool, seed: int
+) -> Iterator[tuple[float, ErrorDifference]]:
+    """Yield each horizon with the difference of errors (k, h), each given with the path length at its start (k,)."""
+    for h, horizon in enumerate(HORIZONS_M):
+        blocks = [blocks_of(path, horizon) for _, path in (first, second)]
+        yield horizon, compare_errors(
+            first[0][:, h], blocks[0], second[0][:, h], blocks[1], paired=paired, seed=seed
+        )  # fmt: skip
 
 
 def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
@@ -192,27 +248,13 @@ def _cells(row: str, column: str, errors: Floats, path: Floats, seed: int) -> li
     ]  # fmt: skip
 
 
-def _pair(first: str, second: str, calibrations: Mapping[str, Calibration], cells: Sequence[Cell]) -> Pair:
+def _parameter_differences(first: str, second: str, calibrations: Mapping[str, Calibration]) -> tuple[Difference, ...]:
     (before, covariance_before), (after, covariance_after) = (calibrations[name].geometry() for name in (first, second))
     places = [TrackGeometry._fields.index(name) for name in COMPARED]
-    parameters = tuple(
+    return tuple(
         Difference(
             name, before[k], after[k], after[k] - before[k],
             math.sqrt(covariance_before[k, k] + covariance_after[k, k]),
         )
         for name, k in zip(COMPARED, places, strict=True)
-    )  # fmt: skip
-    own = {name: [one for one in cells if one.calibrated_on == one.tested_on == name] for name in (first, second)}
-    errors = tuple(_change(a, b) for a, b in zip(own[first], own[second], strict=True))
-    return Pair(first, second, parameters, errors)
-
-
-def _change(a: Cell, b: Cell) -> ErrorChange:
-    p95, expected = b.p95_m - a.p95_m, b.expected_m - a.expected_m
-    return ErrorChange(
-        a.horizon_m,
-        p95, p95 - math.hypot(b.p95_m - b.p95_low_m, a.p95_high_m - a.p95_m),
-        p95 + math.hypot(b.p95_high_m - b.p95_m, a.p95_m - a.p95_low_m),
-        expected, expected - math.hypot(b.expected_m - b.expected_low_m, a.expected_high_m - a.expected_m),
-        expected + math.hypot(b.expected_high_m - b.expected_m, a.expected_m - a.expected_low_m),
     )  # fmt: skip

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Draw the residuals before and after the calibration: png, svg, pdf. One log.",
 )
+@json_option
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, x_icr: float | None, plot: Path | None,
+    sources: tuple[Path, ...], output: Path | None, x_icr: float | None, plot: Path | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
@@ -83,7 +85,9 @@ def command(
     if plot is not None:
         _draw(sources[0], runs[0], plot)
         texts.append(f"drawn to {plot}")
-    if not quiet:
+    if as_json:
+        print_json("calibrate", {"calibration": document})
+    elif not quiet:
         click.echo("\n\n".join(texts))
 
 

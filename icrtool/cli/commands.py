@@ -17,6 +17,7 @@ _COMMANDS = {
     "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
     "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",
     "fit": "Learn the track ICRs of a robot from its logs.",
+    "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
     "report": "Write a run, a fleet or a comparison as one HTML file.",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.json_output import json_option, print_json
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -18,11 +19,12 @@ if TYPE_CHECKING:
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
 @click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="Write the transfer matrix.")
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Write it all as JSON.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw it: png, svg, pdf.")
+@json_option
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[str, ...], csv_file: Path | None, output: Path | None, as_json: bool,
+    sources: tuple[str, ...], csv_file: Path | None, output: Path | None, plot: Path | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
@@ -36,21 +38,18 @@ def command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
-    from icrtool.errors import ConfigError
     from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
     from icrtool.output.run_directory import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
-    places: dict[str, list[Path]] = {}
-    for source in sources:
-        name, path = _named(source)
-        places.setdefault(name, []).append(path)
-    if len(places) < 2:
-        raise ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+    places = _groups(sources)
     for file in (csv_file, output):
         if file is not None:
             check_place(file)
+    if plot is not None:
+        check_picture(plot)
     found = [(name, one) for name, paths in places.items() for path in paths for one in _expand(path)]
     groups: dict[str, list[Run]] = {}
     with options.progress_bar("reading", quiet=quiet) as progress:
@@ -59,15 +58,36 @@ def command(
             if progress is not None:
                 progress(number / len(found))
     transfer = compare_groups(groups)
-    document = json_bytes(transfer_document(transfer))
-    for file, content in ((csv_file, transfer_csv(transfer)), (output, document)):
+    document = transfer_document(transfer)
+    for file, content in ((csv_file, transfer_csv(transfer)), (output, json_bytes(document))):
         if file is not None:
             with atomic_file(file) as partial:
                 partial.write_bytes(content)
+    if plot is not None:
+        write_transfer_picture(transfer, plot)
     if as_json:
-        click.echo(document, nl=False)
+        print_json("compare", document)
     elif not quiet:
         click.echo(format_transfer(transfer))
+
+
+def _groups(sources: tuple[str, ...]) -> dict[str, list[Path]]:
+    """Return the places of each group.
+
+    Raises
+    ------
+    ConfigError
+        There is only one group.
+    """
+    from icrtool.errors import ConfigError
+
+    places: dict[str, list[Path]] = {}
+    for source in sources:
+        name, path = _named(source)
+        places.setdefault(name, []).append(path)
+    if len(places) < 2:
+        raise ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+    return places
 
 
 def _named(source: str) -> tuple[str, Path]:

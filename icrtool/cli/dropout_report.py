@@ -6,15 +6,16 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from icrtool.cli import options
 from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
+from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.options import POSITIVE
 from icrtool.cli.stages import Stages
-from icrtool.records.text import LogText
+from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -37,6 +38,7 @@ class Request:
     ----------
     horizons_m, outage_s : empty: those of the run's configuration
     config : that of the options; logs are fitted with it
+    prints : results on standard output
     """
 
     config: Config
@@ -58,6 +60,7 @@ class Request:
     smoothed: bool
     overwrite: bool
     quiet: bool
+    prints: bool
     verbose: bool
 
 
@@ -94,6 +97,7 @@ class Request:
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
 @options.page
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
+@json_option
 @options.configuration
 @options.verbosity
 def command(
@@ -102,7 +106,7 @@ def command(
     gates: tuple[str, ...], baseline: Path | None, strict: bool,
     calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
     ladder: bool, reference: str, starts: Literal["moving", "all"], without_events: bool, trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None,
+    junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
@@ -130,12 +134,25 @@ def command(
         gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
         starts=starts, without_events=without_events, trials=trials,
         seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder, page=page,
-        smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet, verbose=verbose,
+        smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet,
+        prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
     with picture_process(formats, fits=bool(places)) as drawer:
         outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
+    if as_json:
+        print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
     leave(outcomes, junit=junit, markdown=markdown)
+
+
+def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
+    """Return the outcome of a source as plain data: its report, or the reason why there is none."""
+    from icrtool.errors import IcrToolError
+    from icrtool.output.dropout_directory import report_document
+
+    if isinstance(outcome, IcrToolError):
+        return {"source": escaped(source), "status": "failed", "reason": str(outcome)}
+    return {"source": escaped(source), "status": "done", "report": report_document(outcome)}
 
 
 def picture_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
@@ -197,7 +214,7 @@ def report_all(
     from icrtool.errors import IcrToolError
 
     for number, source in enumerate(sources):
-        if number and not request.quiet:
+        if number and request.prints:
             click.echo()
         try:
             yield source, _report_one(source, places.get(source), request, drawer)
@@ -245,7 +262,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
         from icrtool.output.page.run_page import write_page
 
         write_page(run, report, directory / PAGE_FILE, plots=directory)
-    if not request.quiet:
+    if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
         click.echo(format_dropout(report))
@@ -290,7 +307,7 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
 
         stages.begin("reading")
         measured = read_log(log, request.config, stages.share)
-        from icrtool.estimation.fit import fit
+        from icrtool.calibration.fit import fit
 
         run = fit(measured, request.config, smooth=request.smoothed, watch=stages.begin)
         if (before := replaced_log(directory, run)) is not None:

@@ -25,7 +25,7 @@ class FitRequest(NamedTuple):
     """What the options ask for, the same for every log."""
 
     config: Config
-    states: Literal["csv", "parquet"]
+    states: Literal["csv", "parquet"] | None
     formats: tuple[str, ...]
     warm_start: Path | None
     changes_s: tuple[float, ...]
@@ -42,7 +42,9 @@ class FitRequest(NamedTuple):
 @options.LOGS
 @options.place
 @click.option(
-    "--states", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True, help="Format of the states."
+    "--states",
+    type=click.Choice(["csv", "parquet"]),
+    help="Format of the states; default: csv, parquet for over a million states.",
 )
 @click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
 @click.option(
@@ -65,7 +67,8 @@ class FitRequest(NamedTuple):
 @options.configuration
 @options.verbosity
 def command(
-    logs: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool, states: str, plots: str,
+    logs: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
+    states: Literal["csv", "parquet"] | None, plots: str,
     warm_start: Path | None, changes: tuple[float, ...], smooths: bool, as_json: bool,
     start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -84,7 +87,7 @@ def command(
 
     config = options.load(config_file, robot, sets)
     request = FitRequest(
-        config, "parquet" if states == "parquet" else "csv", plot_formats(plots), warm_start,
+        config, states, plot_formats(plots), warm_start,
         check_times(changes), smooths, overwrite, quiet, quiet or as_json, verbose, start, end,
     )  # fmt: skip
     logs = logs_of(logs, quiet=quiet)
@@ -193,9 +196,9 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         from icrtool.logs import read_log
 
         stages.begin("reading")
-        options.load_ahead("pymap3d", "icrtool.estimation.fit")
+        options.load_ahead("pymap3d", "icrtool.calibration.fit")
         measured = read_log(log, request.config, stages.share, start=request.start, end=request.end)
-        from icrtool.estimation.fit import fit
+        from icrtool.calibration.fit import fit
 
         run = fit(
             measured,

@@ -105,7 +105,7 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
         found.survey = survey_log(found.log, config, stages.share, start=start, end=end)
         found.measured = assemble(found.survey, config)
     found.measured = with_wheel_speeds(found.measured, config)
-    from icrtool.estimation.fit import fit
+    from icrtool.calibration.fit import fit
 
     found.run = fit(found.measured, config, watch=stages.begin)
 

@@ -178,7 +178,7 @@ def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
 
     if not formats:
         return DrawingProcess(())
-    importlib.import_module("icrtool.estimation.fit")
+    importlib.import_module("icrtool.calibration.fit")
     importlib.import_module("icrtool.logs.read_log")
     from icrtool.output.run_directory import load_figures
 

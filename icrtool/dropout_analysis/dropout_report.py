@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-from icrtool.calibration.model_comparison import Comparison, compare_models
-from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.model_comparison import ComparedModels, compare_models
+from icrtool.calibration.pooled import gyro_recording_of, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.baseline import BaselineReport
@@ -59,7 +59,7 @@ def dropout_report(
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds what they cost
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
-        ``calibration:STEM`` of its file where there are several
+        ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
     comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
     reference : what trials are compared with: the filter's states or the smoother's
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
@@ -143,7 +143,7 @@ def _calibration_rows(
 ) -> tuple[tuple[UsedCalibration, ...], list[ConstantModel]]:
     """Return what is known of each calibration, and the model of its row."""
     used, models = [], []
-    recording = recording_of(run) if calibrations else None
+    recording = gyro_recording_of(run) if calibrations else None
     for number, one in enumerate(calibrations, start=1):
         stem = one.name or str(number)
         if sum(other.name == one.name for other in calibrations) > 1:
@@ -154,10 +154,14 @@ def _calibration_rows(
             models.append(ConstantModel(name, label, predictor(one, recording)))
             seen = one.fitted_to(recording.sha256)
             used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created))
+            if one.gyro is not None and recording.gyro_radps is not None:
+                name, label = f"{name}_gyro", f"{label} + gyro"
+                models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=True)))
+                used.append(UsedCalibration(name, label, one.gyro.model.name, len(one.logs), seen, one.created))
     return tuple(used), models
 
 
-def _compare(compared: Run, run: Run) -> tuple[Comparison | None, str]:
+def _compare(compared: Run, run: Run) -> tuple[ComparedModels | None, str]:
     """Compare the models of a run; where that cannot be, None and why."""
     try:
         return compare_models(compared, measured_headings(run)), ""

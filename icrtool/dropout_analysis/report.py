@@ -33,7 +33,7 @@ from icrtool.records.tables import Floats, Ints
 if TYPE_CHECKING:
     import pandas as pd
 
-    from icrtool.calibration.model_comparison import Ladder
+    from icrtool.calibration.model_comparison import ModelComparison
     from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.baseline import BaselineReport
 
@@ -93,7 +93,7 @@ class DropoutReport:
     examples: tuple[ExampleTrial, ...] = ()
     outages: tuple[Outage, ...] = ()
     by_turning: tuple[TurningSplit, ...] = ()
-    comparison: Ladder | None = None
+    comparison: ModelComparison | None = None
     no_comparison: str = ""
     calibrations: tuple[UsedCalibration, ...] = ()
     expected: tuple[str, ...] = ()

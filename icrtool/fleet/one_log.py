@@ -120,8 +120,8 @@ def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File,
 
 def _results(request: Request, stage: Stage) -> Row:
     """Fit and analyse a log, write run and report."""
+    from icrtool.calibration.fit import fit
     from icrtool.dropout_analysis.dropout_report import dropout_report
-    from icrtool.estimation.fit import fit
     from icrtool.logs import read_log
     from icrtool.output.baseline_file import open_baseline
     from icrtool.output.run_directory import PAGE_FILE, check_target

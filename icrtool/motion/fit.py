@@ -1,12 +1,7 @@
 """Robust fit of motion models to windows of driven distance, pooled over recordings.
 
-With z = forward + j right, heading Theta and place S are prefix sums over the wheel samples, and a window from s to e
-displaces the robot, in the body frame of its start, by
-
-    d = e^{-j Theta_s} (S_e - S_s).
-
-omega is linear in the parameters, so d Theta / d theta does not depend on them; the derivatives of S are prefix sums
-too, and all windows of a recording with their derivatives cost a few passes over its samples.
+Heading and place are sums over the wheel samples, and so are their derivatives: all windows of a recording cost one
+pass over its samples (`icrtool.kernels.window_residuals`).
 
 Each recording has constants of its own, which are not part of a calibration: the offset of its reference heading, the
 delay of its wheels relative to its poses, the bias of its gyro.
@@ -20,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
+from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import MotionModel, model_columns, twist, wheel_motion
 from icrtool.motion.recording import STRETCH_M, Windows
-from icrtool.records.tables import Bools, Complexes, Floats, Ints
+from icrtool.records.tables import Bools, Floats
 
 CONSTANTS = ("heading_offset_rad", "wheels_read_later_s", "gyro_bias_radps")
 """Constants of each recording: offset added to the reference heading; delay of the wheels; added to the turn rate."""
@@ -74,58 +70,36 @@ class WindowResiduals:
     """
 
     def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
-        motion = wheel_motion(windows.v_left, windows.v_right, width_m)
+        steps = windows.steps
+        motion = wheel_motion(steps.v_left, steps.v_right, width_m)
         if wheels is not None:
-            motion = motion._replace(gyro=windows.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
-        fixed, free = model_columns(model, motion)
-        self._w = windows
-        self._fixed_omega = fixed[2]
-        self._fixed_v = fixed[0] + 1j * fixed[1]
-        bias = np.zeros((1, 3, len(windows.t)))
-        bias[0, 2] = float(model.uses_gyro)
-        columns = np.concatenate([free, bias])
-        self._omega = np.ascontiguousarray(columns[:, 2])
-        self._v = columns[:, 0] + 1j * columns[:, 1]
-        self._angle = _prefix(self._omega * windows.held)
-        self._angle_taken = self._angle[:, :-1] + self._omega * windows.into
+            motion = motion._replace(gyro=steps.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
+        self._fixed, axes, columns = model_columns(model, motion)
+        # the gyro's bias is one more column of the turn rate
+        self._axes = np.append(axes, OMEGA)
+        self._columns = np.concatenate([columns, np.full((1, len(steps.t)), float(model.uses_gyro))])
+        self._windows = windows
+        self._reference = np.column_stack([windows.reference.real, windows.reference.imag])
         self._root = np.sqrt(windows.length_m)
-        # the end of the last step, or a delayed knot would find no sample
-        self._t = np.append(windows.t, windows.t[-1] + max(float(windows.held[-1]), 1e-9))
 
     def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
         """Return residuals (2 w,), forward then right [m per root metre], and derivatives (2 w, k + 3)."""
-        w = self._w
-        offset, delay, bias = constants
-        p = np.append(parameters, bias)
-        omega, v = self._fixed_omega + p @ self._omega, self._fixed_v + p @ self._v
-        theta = _prefix(omega * w.held)
-        direction = _direction(theta[:-1] + omega * w.into)
-        moved = v * direction
-        place = _prefix(moved * w.held)
-        place_by = _prefix((self._v * direction + 1j * self._angle_taken * moved) * w.held)
-        at = w.knot_t + delay
-        row, share = self._locate(at)
-        knot_theta, knot_place = _between(theta, row, share), _between(place, row, share)
-        knot_angle, knot_place_by = _between(self._angle, row, share), _between(place_by, row, share)
-        back = np.conj(_direction(np.real(knot_theta[w.start])))
-        went = knot_place[w.end] - knot_place[w.start]
-        d = back * went
-        expected = w.reference * np.exp(-1j * offset)
-        d_by = back * (knot_place_by[:, w.end] - knot_place_by[:, w.start] - 1j * knot_angle[:, w.start] * went)
-        rate = moved[row]
-        d_shift = back * (rate[w.end] - rate[w.start] - 1j * omega[row][w.start] * went)
-        by = np.empty((len(parameters) + 3, len(d)), np.complex128)
-        by[: len(parameters)] = d_by[:-1]
-        by[-3], by[-2], by[-1] = 1j * expected, d_shift, d_by[-1]
-        residual, by = (d - expected) / self._root, by / self._root
-        return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T
-
-    def _locate(self, at: Floats) -> tuple[Ints, Floats]:
-        """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
-        row = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, len(self._w.t) - 1)
-        held = self._w.held[row]
-        passed = np.clip(at - self._t[row], 0.0, held)
-        return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
+        windows, steps = self._windows, self._windows.steps
+        offset, delay, bias = constants.tolist()
+        row, share = steps.locate(windows.knot_t + delay)
+        terms, knots, count = len(self._axes), len(row), len(windows.start)
+        rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
+        sums_at_knots(
+            self._fixed, self._columns, self._axes, np.append(parameters, bias), steps.held, steps.into, row, share,
+            rate, sums, by,
+        )  # fmt: skip
+        residual, jacobian = np.empty(2 * count), np.empty((2 * count, terms + 2))
+        window_residuals(
+            rate, sums, by, windows.start, windows.end, self._reference, offset, self._root, residual, jacobian
+        )
+        # terms, bias, offset, delay: to terms, then `CONSTANTS`
+        order = [*range(terms - 1), terms, terms + 1, terms - 1]
+        return residual, jacobian[:, order]
 
 
 class Pool:
@@ -232,22 +206,3 @@ class Pool:
         H, g = normal_equations(fit.residuals[out], fit.jacobian[out], scale, self.overlap(fit.kept))
         changed: Floats = fit.solution.x + np.linalg.solve(fit.solution.information - H, g)
         return changed
-
-
-def _prefix(steps: Floats | Complexes) -> Floats | Complexes:
-    """Return cumulative sums along the last axis with a zero in front."""
-    total = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), steps.dtype)
-    np.cumsum(steps, axis=-1, out=total[..., 1:])
-    return total
-
-
-def _between(sums: Floats | Complexes, row: Ints, share: Floats) -> Floats | Complexes:
-    low = sums[..., row]
-    return low + share * (sums[..., row + 1] - low)
-
-
-def _direction(angle: Floats) -> Complexes:
-    """Return e^{j angle} in a third of the time of a complex exponential."""
-    direction = np.empty(angle.shape, np.complex128)
-    direction.real, direction.imag = np.cos(angle), np.sin(angle)
-    return direction

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.records.tables import Floats
+from icrtool.kernels.window_residuals import OMEGA, VX, VY
+from icrtool.records.tables import Floats, Ints
 
 Axis = int
-VX, VY, OMEGA = 0, 1, 2
 
 
 class WheelMotion(NamedTuple):
@@ -146,8 +146,8 @@ MODELS: dict[str, MotionModel] = {
         MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
         MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
         MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
-        MotionModel("six", "+ side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
-        MotionModel("eight", "+ turn gain", _EIGHT, "with gains that depend on curvature and speed"),
+        MotionModel("six", "ICRs, scales, side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
+        MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains that depend on curvature and speed"),
         MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004"),
         MotionModel("slip", "slip regression", (*_FIVE, "vx_absw", "vy_vw"), "Seegmiller 2014, Baril 2024"),
     )
@@ -155,10 +155,9 @@ MODELS: dict[str, MotionModel] = {
 """Every model by name, simplest first."""
 
 
-def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Floats]:
-    """Return the twist without the free terms (3, n) and the columns of the free terms (k, 3, n)."""
+def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints, Floats]:
+    """Return the twist without the free terms (3, n), the axis of each free term (k,), and its column (k, n)."""
     fixed = np.zeros((3, len(motion.v)))
-    free = np.zeros((len(model.terms), 3, len(motion.v)))
     if model.uses_gyro:
         fixed[OMEGA] = motion.gyro
     for term in TERMS.values():
@@ -166,16 +165,18 @@ def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Floa
             continue
         if term.name not in model.terms and term.nominal:
             fixed[term.axis] += term.nominal * term.column(motion)
-    for k, name in enumerate(model.terms):
-        term = TERMS[name]
-        free[k, term.axis] = term.column(motion)
-    return fixed, free
+    axes = np.array([TERMS[name].axis for name in model.terms], np.int64)
+    columns = np.empty((len(model.terms), len(motion.v)))
+    for row, name in zip(columns, model.terms, strict=True):
+        row[:] = TERMS[name].column(motion)
+    return fixed, axes, columns
 
 
 def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
     """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
-    fixed, free = model_columns(model, motion)
-    result: Floats = fixed + np.tensordot(parameters, free, axes=1)
+    result, axes, columns = model_columns(model, motion)
+    for axis, parameter, column in zip(axes, parameters, columns, strict=True):
+        result[axis] += parameter * column
     return result
 
 

@@ -77,18 +77,15 @@ class Recording:
         return replace(self, t_s=self.t_s[rows], drive=Drive._make(c[rows] for c in self.drive), gyro_radps=gyro)
 
 
-class Windows(NamedTuple):
-    """Overlapping windows of driven distance of one recording, ready to be fitted.
+class Steps(NamedTuple):
+    """Wheel samples of a recording, joined; (n,) each.
 
     Attributes
     ----------
-    t, held, v_left, v_right, gyro : (n,) steps: wheel samples joined, `held` 0 over gaps
-    into : (n,) [s] how far into a step its heading is taken: Euler steps of m samples at a constant turn rate move
-        along the heading (m - 1) / 2 samples into them
-    knot_t : (m,) times at which windows start or end [s], ascending
-    start, end : (w,) rows of `knot_t`
-    start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
-    reference : complex (w,), displacement forward + j right in the body frame of the start [m]
+    t, held : begin and duration [s], `held` 0 over gaps
+    v_left, v_right, gyro : mean over the step
+    into : [s] how far into a step its heading is taken: Euler steps of m samples at a constant turn rate move along the
+        heading (m - 1) / 2 samples into them
     """
 
     t: Floats
@@ -97,6 +94,30 @@ class Windows(NamedTuple):
     v_right: Floats
     gyro: Floats
     into: Floats
+
+    def locate(self, at: Floats) -> tuple[Ints, Floats]:
+        """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
+        # the end of the last step, or a delayed time would find no sample
+        t = np.append(self.t, self.t[-1] + max(float(self.held[-1]), 1e-9))
+        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(self.t) - 1)
+        held = self.held[row]
+        passed = np.clip(at - t[row], 0.0, held)
+        return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
+
+
+class Windows(NamedTuple):
+    """Overlapping windows of driven distance of one recording, ready to be fitted.
+
+    Attributes
+    ----------
+    steps : wheel samples joined
+    knot_t : (m,) times at which windows start or end [s], ascending
+    start, end : (w,) rows of `knot_t`
+    start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
+    reference : complex (w,), displacement forward + j right in the body frame of the start [m]
+    """
+
+    steps: Steps
     knot_t: Floats
     start: Ints
     end: Ints
@@ -135,7 +156,7 @@ def cut_windows(
     start, end = begins[row], ends[row, column]
     knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
     return Windows(
-        *_joined_steps(recording, sum(float(one.held_s.sum()) for one in together)),
+        joined_steps(recording, samples_a_step(recording, sum(float(one.held_s.sum()) for one in together))),
         knot_t=recording.t_s[knots],
         start=rows[: len(start)],
         end=rows[len(start) :],
@@ -146,36 +167,38 @@ def cut_windows(
     )
 
 
-def samples_a_step(held_s: Floats, v_left: Floats, v_right: Floats, pooled_s: float | None = None) -> int:
+def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
     """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
     A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
     metre.
     """
-    lasting = held_s > 0.0
+    drive, held = recording.drive, recording.held_s
+    lasting = held > 0.0
     if not lasting.any():
         return 1
-    total_s = float(held_s.sum())
-    speed_mps = float((held_s * (np.abs(v_left) + np.abs(v_right))).sum()) / 2.0 / total_s
+    total_s = float(held.sum())
+    speed_mps = float((held * (np.abs(drive.v_left) + np.abs(drive.v_right))).sum()) / 2.0 / total_s
     step_s = min(
         (total_s if pooled_s is None else pooled_s) / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S
     )
-    return max(int(max(step_s, STEP_S) / float(np.median(held_s[lasting]))), 1)
+    return max(int(max(step_s, STEP_S) / float(np.median(held[lasting]))), 1)
 
 
-def _joined_steps(recording: Recording, pooled_s: float) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Return t, held, v_left, v_right, gyro, into of steps with the mean speeds over their time."""
+def joined_steps(recording: Recording, samples: int) -> Steps:
+    """Return a recording's wheel samples, so many joined to a step with the mean speeds over its time."""
     drive, held = recording.drive, recording.held_s
-    joined = samples_a_step(held, drive.v_left, drive.v_right, pooled_s)
-    first = np.arange(0, len(held), joined)
-    lasting = np.add.reduceat(held, first)
     gyro = recording.gyro_radps if recording.gyro_radps is not None else np.zeros(len(held))
+    if samples == 1:
+        return Steps(recording.t_s, held, drive.v_left, drive.v_right, gyro, np.zeros(len(held)))
+    first = np.arange(0, len(held), samples)
+    lasting = np.add.reduceat(held, first)
 
     def mean(column: Floats) -> Floats:
         total = np.add.reduceat(held * column, first)
         return np.divide(total, lasting, out=np.zeros(len(first)), where=lasting > 0.0)
 
-    return (
+    return Steps(
         recording.t_s[first], lasting, mean(drive.v_left), mean(drive.v_right), mean(gyro),
-        lasting * (joined - 1) / (2.0 * joined),
+        lasting * (samples - 1) / (2.0 * samples),
     )  # fmt: skip

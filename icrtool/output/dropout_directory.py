@@ -23,7 +23,7 @@ from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.figures.dropout_figures import ReportFigures
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.tables.dropout import why_no_trial
-from icrtool.output.tables.model_comparison import LADDER_COLUMNS, ladder_document, ladder_rows
+from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.trials_file import trials_file
 from icrtool.records.dropout import ExampleTrial, ModelResult
 from icrtool.records.tables import Ints
@@ -123,7 +123,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(report)))
     (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(report.worst)))
     if report.comparison is not None:
-        (directory / "ladder.csv").write_bytes(_csv(LADDER_COLUMNS, ladder_rows(report.comparison)))
+        (directory / "ladder.csv").write_bytes(_csv(COMPARISON_COLUMNS, comparison_rows(report.comparison)))
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
@@ -158,7 +158,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "recommended": _recommended_document(report),
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
-        "ladder": ladder_document(report.comparison)
+        "ladder": comparison_document(report.comparison)
         if report.comparison is not None
         else {"left_out": report.no_comparison},
         "gates": [

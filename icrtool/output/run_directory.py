@@ -31,6 +31,9 @@ STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": 
 
 SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parquet": "parquet"}
 
+MOST_CSV_STATES = 1_000_000
+"""With more states, states.csv would have over 300 MB, and take longer to read than the log."""
+
 PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
@@ -83,7 +86,7 @@ def write_run(
     run: Run,
     directory: Path,
     *,
-    states: StatesFormat = "csv",
+    states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
     drawer: Drawer | None = None,
     note: Callable[[str], None] | None = None,
@@ -94,7 +97,7 @@ def write_run(
     ----------
     run : its smoothed states, where it has them, are written as ``smoothed`` in the same format
     directory : where it shall appear; an old run there is replaced, with all that was made from it
-    states : format of the states
+    states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
@@ -106,6 +109,10 @@ def write_run(
     """
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
+    if states is None:
+        states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
+        if states != "csv" and note is not None:
+            note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
     sources = [os.path.realpath(file["path"]) for file in run.summary["inputs"]]
     with (
         atomic_directory(

@@ -70,3 +70,17 @@ def duration_text(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d} h"
+
+
+def model_text(label: str, name: str, parameters: int) -> str:
+    """Return a recommended model as ``three ICRs (3 parameters, model icr)``."""
+    count = "one parameter" if parameters == 1 else f"{parameters} parameters"
+    return f"{label} ({count}, model {name})"
+
+
+def controller_text(numbers: Mapping[str, Any]) -> str:
+    """Return what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
+    return (
+        f"wheel_separation_multiplier {numbers['multiplier']:.2f} ± {numbers['multiplier_std']:.2f}, left/right wheel "
+        f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"
+    )

@@ -83,7 +83,7 @@ class Outage:
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
+class ModelScore:
     """One model's errors.
 
     Attributes

@@ -159,7 +159,7 @@ class Run:
         self,
         path: str | Path,
         *,
-        states: Literal["csv", "parquet"] = "csv",
+        states: Literal["csv", "parquet"] | None = None,
         plots: tuple[str, ...] = ("png",),
     ) -> None:
         """Write the run directory, whole or not at all; an older run at `path` is replaced.
@@ -167,7 +167,7 @@ class Run:
         Parameters
         ----------
         path : the directory
-        states : format of the states
+        states : format of the states; default: ``csv``, of over a million states ``parquet``
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
 
         Raises

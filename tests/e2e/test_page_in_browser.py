@@ -165,6 +165,19 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
         assert errors["recommended"] == pytest.approx(recommended[number].tolist(), abs=1e-4)
 
 
+@pytest.mark.parametrize("scale", [0.0, 3.7e-4, 0.0954, 0.3, 1.0, 13.0, 950.0])
+def test_the_chart_of_errors_takes_numbers_of_any_size(chrome: Browser, file: Path, scale: float) -> None:
+    page = chrome.page()
+    page.open(file)
+    page.evaluate(
+        f"icrtoolPage.data.errors.models.forEach((model) => ['p95', 'p95_low', 'p95_high'].forEach((key) => {{"
+        f" model[key] = model[key].map((value) => value === null ? null : {scale} * value) }})), null"
+    )
+    page.evaluate("icrtoolCharts.errorChart(icrtoolPage.data), null")
+    assert page.evaluate("new Promise((done) => setTimeout(() => done('drawn'), 50))") == "drawn"
+    assert page.complaints() == []
+
+
 def test_the_moment_follows_the_keyboard(page: Page) -> None:
     page.front()
     page.evaluate("document.getElementById('moment').focus()")

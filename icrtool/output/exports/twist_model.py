@@ -10,12 +10,13 @@ import numpy as np
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import POSE_AFTER_M
 from icrtool.calibration.record import Calibration
-from icrtool.motion.models import TERMS, VX, VY, Term, wheel_motion
+from icrtool.kernels.window_residuals import OMEGA, VX, VY
+from icrtool.motion.models import TERMS, Term, wheel_motion
 from icrtool.output.run_directory import json_bytes
 
 TWIST_SCHEMA = "icrtool/twist/1"
 
-AXES = {VX: "v_x", VY: "v_y", 2: "yaw_rate"}
+AXES = {VX: "v_x", VY: "v_y", OMEGA: "yaw_rate"}
 SYMBOLS = {
     "v": "(v_left + v_right) / 2",
     "w": "(v_right - v_left) / b",

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
 from icrtool.output.atomic_file import atomic_file, check_place
 from icrtool.output.figures.drawing_process import matplotlib_unsaid
 from icrtool.output.run_directory import PLOT_FORMATS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.transfer import Transfer
 
 
 def check_picture(file: Path) -> None:
@@ -32,10 +40,48 @@ def write_picture(name: str, residuals: WindowResiduals, file: Path) -> None:
     OutputError
         The file cannot be written.
     """
+
+    def draw() -> Figure:
+        from icrtool.output.figures.calibration import draw_calibration
+
+        return draw_calibration(name, residuals)
+
+    save_picture(draw, file)
+
+
+def write_forecast_picture(forecast: Forecast, title: str, budgets_m: tuple[float, ...], file: Path) -> None:
+    """Draw a forecast, as `write_picture`."""
+
+    def draw() -> Figure:
+        from icrtool.output.figures.forecast import draw_forecast
+
+        return draw_forecast(forecast, title, budgets_m)
+
+    save_picture(draw, file)
+
+
+def write_transfer_picture(transfer: Transfer, file: Path) -> None:
+    """Draw compared groups, as `write_picture`."""
+
+    def draw() -> Figure:
+        from icrtool.output.figures.transfer import draw_transfer
+
+        return draw_transfer(transfer)
+
+    save_picture(draw, file)
+
+
+def save_picture(draw: Callable[[], Figure], file: Path) -> None:
+    """Write the figure that `draw` makes, in our style; the suffix gives the format.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
     form = file.suffix.removeprefix(".").lower()
     with atomic_file(file) as partial, matplotlib_unsaid():
-        from icrtool.output.figures.calibration import draw_calibration
         from icrtool.output.figures.style import save, style
 
         with style():
-            save(draw_calibration(name, residuals), partial.with_suffix(""), (form,))
+            save(draw(), partial.with_suffix(""), (form,))

@@ -12,7 +12,7 @@ from icrtool.output.figures.dropout_errors import draw_histogram, draw_summary
 from icrtool.output.figures.dropout_paths import draw_examples, draw_outages, draw_worst
 from icrtool.output.figures.gnss_difference import draw_gnss_difference
 from icrtool.output.figures.icrs import draw_icr_clusters, draw_icr_estimates
-from icrtool.output.figures.model_comparison import draw_ladder
+from icrtool.output.figures.model_comparison import draw_comparison
 from icrtool.output.figures.style import style
 from icrtool.output.figures.trajectory import draw_trajectory
 from icrtool.output.text_format import run_title
@@ -79,7 +79,7 @@ def model_comparison(report: DropoutReport) -> Figure:
     table = report.comparison
     if table is None:
         raise DataError(report.name, "the report holds no model comparison", report.no_comparison)
-    return _drawn(lambda: draw_ladder(run_title(report.run_summary), table.rungs, table.horizons_m, table.blocks))
+    return _drawn(lambda: draw_comparison(run_title(report.run_summary), table.scores, table.horizons_m, table.blocks))
 
 
 def _check(report: DropoutReport, content: tuple[object, ...], what: str) -> None:

@@ -63,7 +63,7 @@ class ReportFigures:
         if report.counts.trials.any():
             self._draw(write_figure, "summary", title, numbers_of(report))
         if (table := report.comparison) is not None:
-            self._draw(write_figure, "ladder", title, table.rungs, table.horizons_m, table.blocks)
+            self._draw(write_figure, "ladder", title, table.scores, table.horizons_m, table.blocks)
 
 
 def numbers_of(report: DropoutReport) -> DropoutReport:
@@ -98,12 +98,12 @@ def _figures() -> dict[str, Callable[..., Figure]]:
     """Return the figures by the first word of their file's name."""
     from icrtool.output.figures import dropout_errors as figure_dropout
     from icrtool.output.figures import dropout_paths as figure_dropout_paths
-    from icrtool.output.figures import model_comparison as figure_ladder
+    from icrtool.output.figures import model_comparison as comparison_figure
 
     return {
         "summary": figure_dropout.draw_summary,
         "histogram": figure_dropout.draw_histogram,
-        "ladder": figure_ladder.draw_ladder,
+        "ladder": comparison_figure.draw_comparison,
         "examples": figure_dropout_paths.draw_examples,
         "worst": figure_dropout_paths.draw_worst,
         "outages": figure_dropout_paths.draw_outages,

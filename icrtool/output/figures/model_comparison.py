@@ -1,4 +1,4 @@
-"""The model ladder as a picture: 95 % and expected error at one horizon, a line a model."""
+"""The model comparison as a picture: 95 % and expected error at one horizon, a line a model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.output.figures.style import ICR, inches, new_figure
 from icrtool.output.text_format import FITTED
-from icrtool.records.dropout import CHOICE_HORIZON_M, Rung
+from icrtool.records.dropout import CHOICE_HORIZON_M, ModelScore
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 WIDTH_IN, ROW_IN = 7.2, 0.27
 
 
-def draw_ladder(title: str, rungs: Sequence[Rung], horizons_m: Sequence[float], blocks: int) -> Figure:
+def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequence[float], blocks: int) -> Figure:
     """Draw 95 % (filled) and expected error (open) of each model; held-out ones as circles, others as squares.
 
     Parameters
     ----------
-    rungs, horizons_m, blocks : of a `icrtool.calibration.model_comparison.Ladder`
+    scores, horizons_m, blocks : of a `icrtool.calibration.model_comparison.ModelComparison`
     """
     h = int(np.argmin(np.abs(np.array(horizons_m) - CHOICE_HORIZON_M)))
-    rungs = [rung for rung in rungs if rung.summary.trials[h]]
-    groups = sum(1 for rung in rungs if rung.measured_heading) > 0
+    scores = [score for score in scores if score.summary.trials[h]]
+    groups = sum(1 for score in scores if score.measured_heading) > 0
     figure = new_figure(
         title,
         f"Open-loop error after {horizons_m[h]:g} m, 95 % / expected; {blocks} blocks of the drive held out in turn",
         width_in=WIDTH_IN,
-        height_in=1.65 + ROW_IN * (len(rungs) + 0.6 * groups),
+        height_in=1.65 + ROW_IN * (len(scores) + 0.6 * groups),
     )
     axes = figure.subplots()
     figure.subplots_adjust(**inches(figure, left=2.75, right=1.05, top=0.62, bottom=0.9))
-    _draw_rows(axes, rungs, h)
+    _draw_rows(axes, scores, h)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -55,14 +55,14 @@ def draw_ladder(title: str, rungs: Sequence[Rung], horizons_m: Sequence[float], 
     return figure
 
 
-def _draw_rows(axes: Axes, rungs: list[Rung], h: int) -> None:
+def _draw_rows(axes: Axes, scores: list[ModelScore], h: int) -> None:
     """Draw a row a model, best-known at the bottom; models with a measured heading stand apart."""
     places, labels, y = [], [], 0.0
-    for before, rung in zip([None, *rungs], rungs, strict=False):
-        y -= 1.6 if before is not None and rung.measured_heading and not before.measured_heading else 1.0
-        held_out = rung.fitted == "others"
+    for before, score in zip([None, *scores], scores, strict=False):
+        y -= 1.6 if before is not None and score.measured_heading and not before.measured_heading else 1.0
+        held_out = score.fitted == "others"
         color, marker = (ICR.color, "o") if held_out else ("0.6", "s")
-        p95, expected = float(rung.summary.p95[h]), float(rung.summary.expected[h])
+        p95, expected = float(score.summary.p95[h]), float(score.summary.expected[h])
         axes.plot([expected, p95], [y, y], color=color, linewidth=1.2)
         axes.plot([p95], [y], marker=marker, color=color, markersize=6.5, linestyle="none")
         axes.plot(
@@ -73,8 +73,8 @@ def _draw_rows(axes: Axes, rungs: list[Rung], h: int) -> None:
             fontsize=8, color="0.2", annotation_clip=False,
         )  # fmt: skip
         places.append(y)
-        note = FITTED[rung.fitted]
-        labels.append(f"{rung.label} ({note})" if note else rung.label)
+        note = FITTED[score.fitted]
+        labels.append(f"{score.label} ({note})" if note else score.label)
     axes.set_yticks(places, labels)
     axes.set_ylim(y - 0.7, -0.3)
     axes.tick_params(axis="y", length=0)

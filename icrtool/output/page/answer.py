@@ -18,6 +18,10 @@ Grade = Literal["good", "care", "bad", "fact"]
 NAMES = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 
+SMALLEST_SHOWN = 0.0005
+"""A standard deviation below this would be printed as zero."""
+
+
 class Reach(NamedTuple):
     """How far the best model stays within a budget, and the others."""
 
@@ -107,6 +111,8 @@ def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
         return math.nan if value is None else value
 
     def interval_text(one: BudgetDistance) -> str:
+        if one.beyond:
+            return f"no trial is longer than {one.distance_m:g} m"
         known = math.isfinite(one.low_m + one.high_m)
         return f"{one.low_m:.1f} to {one.high_m:.1f} m" if known else "too few trials for an interval"
 
@@ -130,16 +136,16 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
     if calibration is not None:
         one = calibration.controller_numbers()
         numbers += [
-            Number("wheel_separation_multiplier", f"{one.multiplier:.3f} ± {one.multiplier_std:.3f}",
+            Number("wheel_separation_multiplier", _with_std(one.multiplier, one.multiplier_std),
                    f"the robot turns as if its tracks were {one.multiplier:.2f} times as far apart as {width:g} m"),
-            Number("left_wheel_radius_multiplier", f"{one.left_radius:.3f} ± {one.left_radius_std:.3f}",
+            Number("left_wheel_radius_multiplier", _with_std(one.left_radius, one.left_radius_std),
                    "left wheels roll this share of the configured radius"),
-            Number("right_wheel_radius_multiplier", f"{one.right_radius:.3f} ± {one.right_radius_std:.3f}",
+            Number("right_wheel_radius_multiplier", _with_std(one.right_radius, one.right_radius_std),
                    "right wheels roll this share of the configured radius"),
         ]  # fmt: skip
     elif icr["separation_multiplier"] is not None:
         value, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
-        text = f"{value:.3f} ± {std:.3f}" if std is not None else f"{value:.3f}"
+        text = _with_std(value, std) if std is not None else f"{value:.3f}"
         numbers.append(
             Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")
         )
@@ -148,6 +154,10 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
             numbers
         ), "robot.track_width_m is not known: without it there is no multiplier and no no-slip model."
     return tuple(numbers), "" if numbers else "The drive shows none of them."
+
+
+def _with_std(value: float, std: float) -> str:
+    return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f} ± less than 0.001"
 
 
 def _icrs(icr: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
@@ -196,7 +206,7 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
     gnss, events = summary["gnss"], summary["events"]
     found = []
     if warnings := len(summary["warnings"]):
-        found.append(Check("care", f"{_count(warnings, 'warning')} about the log: see below."))
+        found.append(Check("care", f"{_count(warnings, 'warning')} about the log."))
     if events:
         kinds = [one["kind"] for one in events]
         each = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
@@ -208,8 +218,8 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
         found.append(Check("fact", f"{_count(len(real), 'real outage')}: in the worst the filter was {error}."))
     of = gnss["used"] + gnss["rejected"]
     if of:
-        share = 100 * gnss["rejected"] / of
-        found.append(Check("fact", f"{share:.0f} % of the positions were rejected ({gnss['rejected']:,} of {of:,})."))
+        rejected = f"{gnss['rejected']:,} ({100 * gnss['rejected'] / of:.0f} %)" if gnss["rejected"] else "None"
+        found.append(Check("fact", f"{rejected} of {of:,} positions were rejected."))
     if gnss["jumps"]:
         text = f"{_count(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
         found.append(Check("care", text))
@@ -235,8 +245,9 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
             None if mine is None else next(r["p95_m"] for r in mine["by_horizon"] if r["horizon_m"] == row["horizon_m"])
         )
         if own is not None and p95 is not None:
+            share = f"Up to {metres_text(own)}" if own < p95 else "All"
             what = f"the {metres_text(p95)} error of the ICRs after {row['horizon_m']:g} m (95 %)"
-            found.append(Check("fact", f"Up to {metres_text(own)} of {what} can be the position reference's own."))
+            found.append(Check("fact", f"{share} of {what} can be the position reference's own."))
     return found
 
 

@@ -21,7 +21,7 @@ from icrtool.output.page.pictures import WITH_PLACE, Picture, pictures_in, pictu
 from icrtool.output.page.render import render, write_html
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
-from icrtool.output.text_format import position_word
+from icrtool.output.text_format import duration_text, length_text, position_word
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 
@@ -83,8 +83,8 @@ def run_page(
         title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
         pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
         begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
-        errors=_error_rows(document), config=_config_lines(summary["config"]), coordinates=coordinates,
-        samples=len(run.table),
+        errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
+        coordinates=coordinates, samples=len(run.table),
     )  # fmt: skip
 
 
@@ -156,6 +156,23 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
         "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in models],
         "reference": [report["reference_error"][h] for h in shown] if report["reference_error"] else [],
     }
+
+
+def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the worst trials, each with what the position reference did meanwhile."""
+    found = []
+    for one in report["worst"]:
+        speed = one["speed_mean_mps"]
+        end_s = one["t_s"] + (one["horizon_m"] / speed if speed else 0.0)
+        end_ns = one["stamp_ns"] + round(1e9 * (end_s - one["t_s"]))
+        sizes = [
+            jump["size_m"] for jump in summary["gnss"]["jump_list"] if one["stamp_ns"] <= jump["stamp_ns"] <= end_ns
+        ]
+        lost = [out for out in report["outages"] if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
+        notes = [f"jumps by {length_text(max(sizes))}"] if sizes else []
+        notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
+        found.append({**one, "note": ", ".join(notes)})
+    return found
 
 
 def _ladder_rows(ladder: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,8 +9,16 @@ from textwrap import wrap
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.tables.model_comparison import format_ladder
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, run_title, unusable_lines
+from icrtool.output.tables.model_comparison import format_comparison
+from icrtool.output.text_format import (
+    TABLE_WIDTH,
+    controller_text,
+    distance_text,
+    duration_text,
+    model_text,
+    run_title,
+    unusable_lines,
+)
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
 
 LABEL = 26
@@ -54,7 +62,7 @@ def format_dropout(report: DropoutReport) -> str:
         *(part for line in budget_lines(report.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
     ]
     if report.comparison is not None:
-        lines += ["", *format_ladder(report.comparison).splitlines()]
+        lines += ["", *format_comparison(report.comparison).splitlines()]
     elif report.no_comparison:
         lines += ["", f"models on distance they were not fitted to: left out: {report.no_comparison}"]
     if report.outages:
@@ -88,16 +96,14 @@ def headline(report: DropoutReport) -> list[str]:
     calibration, reached = report.calibration, {one.model: one for one in reversed(report.budgets)}
     if calibration is None or (best := reached.get("recommended")) is None:
         return []
-    count, numbers = len(calibration.fitted.parameters), calibration.controller_numbers()
+    fitted, numbers = calibration.fitted, calibration.controller_numbers()
     interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
-    radii = f"left/right wheel radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
-    parameters = "one parameter" if count == 1 else f"{count} parameters"
-    model = f"{calibration.fitted.model.label} ({parameters}, model {calibration.recommended})"
+    model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
         f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
-        f"Controller: wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}, {radii}.",
+        f"Controller: {controller_text(numbers._asdict())}.",
     ]
 
 

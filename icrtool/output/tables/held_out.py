@@ -7,7 +7,7 @@ from textwrap import wrap
 
 import numpy as np
 
-from icrtool.calibration.held_out import HeldOut, ModelScores
+from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration, FittedModel
 from icrtool.motion.models import TERMS
@@ -34,7 +34,7 @@ def format_result(result: CalibrationResult) -> str:
     ]
     lines += ["", *format_parameters(calibration), "", *format_held_out(result.wheels)]
     if result.gyro is not None:
-        lines += ["", *format_held_out(result.gyro)]
+        lines += ["", "wheels and gyro", *format_held_out(result.gyro)]
     return "\n".join([*lines, *result.notes])
 
 
@@ -62,12 +62,12 @@ def _parameter_lines(fitted: FittedModel) -> list[str]:
 
 def format_held_out(table: HeldOut) -> list[str]:
     """Return the leave-one-out table: p95 / expected error by horizon, median over folds and worst fold."""
-    what = "log" if math.isinf(table.folds[0].begin_m) and math.isinf(table.folds[0].end_m) else "block"
+    what = "log" if table.folds[0].whole else "block"
     head = f"each {what} left out in turn ({len(table.folds)}): 95 % / expected error [m], median {what} (worst {what})"
     lines = [head, f"{'model':<25}" + "".join(f"{f'{horizon:g} m':>25}" for horizon in table.horizons_m)]
     for row in table.scores:
         cells = "".join(f"{_cell(row, h):>25}" for h in range(len(table.horizons_m)))
-        lines.append(f"{row.label:<25.25}{cells}")
+        lines.append(f"{row.label.removesuffix(' + gyro'):<25.25}{cells}")
     used = ", ".join(dict.fromkeys(table.chosen))
     lines += wrap(
         f"recommended: chosen without the {what} it is tested on ({used}); of all: {table.recommended}", TABLE_WIDTH
@@ -75,7 +75,7 @@ def format_held_out(table: HeldOut) -> list[str]:
     return lines
 
 
-def _cell(row: ModelScores, h: int) -> str:
+def _cell(row: HeldOutRow, h: int) -> str:
     if not math.isfinite(row.median("p95", h)):
         return "–"
     median, worst = ((over("p95", h), over("expected", h)) for over in (row.median, row.worst))

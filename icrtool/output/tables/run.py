@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from textwrap import wrap
 from typing import Any
 
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_format import (
     TABLE_WIDTH,
+    controller_text,
     distance_text,
     duration_text,
     length_text,
+    model_text,
     position_word,
     run_title,
     unusable_lines,
@@ -51,6 +54,7 @@ def format_run(run: Run) -> str:
         "",
         *_icr_lines(run),
         *_multiplier_lines(run),
+        *_recommended_lines(run),
         *excitation_lines(run),
         *_terrain_lines(run),
         "",
@@ -139,7 +143,26 @@ def _multiplier_lines(run: Run) -> list[str]:
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     doubt = "" if shown else ": not shown well enough to be used"
     said = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
-    return [_line("multiplier", f"{said} = (y right - y left) / b, with b = {width:g} m{doubt}")]
+    return [_line("multiplier", f"{said} = (y right - y left) / b of these, with b = {width:g} m{doubt}")]
+
+
+def _recommended_lines(run: Run) -> list[str]:
+    """Return the motion model to use, as `icrtool calibrate` recommends it, and what a controller is given."""
+    found = run.summary.get("recommended")
+    if found is None or not run.usable:
+        return []
+    rows = found["parameters"].items()
+    values = ", ".join(f"{name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
+    model = model_text(found["label"], found["model"], len(rows))
+    sentences = (
+        ("recommended", f"{model}: {values}; what error it makes: icrtool dropout-report"),
+        ("controller", controller_text(found["controller"])),
+    )
+    return [
+        _line(label if number == 0 else "", part)
+        for label, sentence in sentences
+        for number, part in enumerate(wrap(sentence, TABLE_WIDTH - LABEL))
+    ]
 
 
 def _terrain_lines(run: Run) -> list[str]:

@@ -38,6 +38,7 @@ def transfer_document(transfer: Transfer) -> dict[str, Any]:
             for pair in transfer.pairs
         ],
         "transfer": [cell._asdict() for cell in transfer.cells],
+        "costs": [cost._asdict() for cost in transfer.costs],
     }
 
 
@@ -64,7 +65,8 @@ def format_transfer(transfer: Transfer) -> str:
             lines.append(f"{one.quantity:<24}{one.first:>+16.3f}{one.second:>+16.3f}{difference:>24}")
         for change in pair.errors:
             if math.isfinite(change.p95_m):
-                lines.append(f"held-out error after {change.horizon_m:g} m: 95 % {_change(change[1:4])}; "
+                route = ", the same route" if change.paired else ""
+                lines.append(f"held-out error after {change.horizon_m:g} m{route}: 95 % {_change(change[1:4])}; "
                              f"expected {_change(change[4:7])}")  # fmt: skip
         lines.append("")
     lines.append(f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column")
@@ -83,16 +85,12 @@ def verdict(transfer: Transfer, pair: Pair) -> str:
     change = f"by {one.difference:+.2f} ± {one.std:.2f}"
     if not one.significant:
         change += ", which may be chance"
-    own = transfer.cell(pair.second, pair.second, CHOICE_HORIZON_M)
-    foreign = transfer.cell(pair.first, pair.second, CHOICE_HORIZON_M)
-    if not math.isfinite(own.p95_m + foreign.p95_m):
+    cost = transfer.cost(pair.first, pair.second, CHOICE_HORIZON_M)
+    if not math.isfinite(cost.p95_m):
         return f"The multiplier of {pair.second} differs from that of {pair.first} {change}."
-    cost = foreign.p95_m - own.p95_m
-    sentence = (
-        f"costs {cost:.2f} m (95 %) at {CHOICE_HORIZON_M:g} m on {pair.second}"
-        if cost > 0.0
-        else f"is no worse than its own on {pair.second} at {CHOICE_HORIZON_M:g} m"
-    )
+    sentence = f"costs {_change(cost[3:6])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
+    if cost.p95_low_m <= 0.0 <= cost.p95_high_m:
+        sentence += ", which may be chance"
     return (
         f"The multiplier of {pair.second} differs from that of {pair.first} {change}; a calibration of {pair.first} "
         f"{sentence}."

@@ -1,4 +1,4 @@
-"""The ladder: nothing left out reaches a fit or a choice, all rungs stand on the same trials."""
+"""The comparison: nothing left out reaches a fit or a choice, all scores stand on the same trials."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.held_out import block_trials, plan_folds
-from icrtool.calibration.model_comparison import _errors_along, judge_ladder
+from icrtool.calibration.model_comparison import _errors_along, comparison_table
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import parse_config
 from icrtool.errors import DataError
@@ -68,48 +68,48 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
 def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
     heading = run.table.heading_rad
     gyro = MeasuredHeading("gyro", 0.97 * heading + 0.01 * run.table.t_s)
-    exact = judge_ladder(run, [MeasuredHeading("gyro", heading.copy())])
-    scaled = judge_ladder(run, [gyro])
+    exact = comparison_table(run, [MeasuredHeading("gyro", heading.copy())])
+    scaled = comparison_table(run, [gyro])
     assert scaled.heading == "gyro"
-    assert scaled.rung("icr_final_gyro").summary.p95[1] == pytest.approx(
-        exact.rung("icr_final_gyro").summary.p95[1], abs=0.01
+    assert scaled.score("icr_final_gyro").summary.p95[1] == pytest.approx(
+        exact.score("icr_final_gyro").summary.p95[1], abs=0.01
     )
-    other = judge_ladder(run, [MeasuredHeading("gyro", 0.1 * heading)])
+    other = comparison_table(run, [MeasuredHeading("gyro", 0.1 * heading)])
     assert other.heading == ""
     assert "does not turn with the robot" in other.notes[0]
 
 
 def test_a_gyro_of_the_other_sign_is_turned_and_said(run: Run) -> None:
     told = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
-    usual, turned = (judge_ladder(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
+    usual, turned = (comparison_table(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
     assert usual.notes == ()
     assert turned.notes == ("the gyro counts turns the other way: its sign was turned",)
-    for one, other in zip(usual.rungs, turned.rungs, strict=True):
+    for one, other in zip(usual.scores, turned.scores, strict=True):
         assert one.name == other.name
         assert np.allclose(one.summary.p95, other.summary.p95, atol=ROUNDING_M, equal_nan=True)
 
 
-def test_all_rungs_are_judged_on_the_same_trials(run: Run) -> None:
-    ladder = judge_ladder(run, measured_headings(run))
-    names = [rung.name for rung in ladder.rungs]
+def test_all_models_are_compared_on_the_same_trials(run: Run) -> None:
+    comparison = comparison_table(run, measured_headings(run))
+    names = [score.name for score in comparison.scores]
     assert names == [
         "no_slip", "multiplier", "icr", "icr_final", "window", "extended", "no_slip_heading", "icr_heading",
         "icr_final_heading", "window_heading", "extended_heading",
     ]  # fmt: skip
-    for rung in ladder.rungs:
-        assert np.array_equal(rung.summary.trials, ladder.rungs[0].summary.trials)
-        assert rung.measured_heading == rung.name.endswith("_heading")
+    for score in comparison.scores:
+        assert np.array_equal(score.summary.trials, comparison.scores[0].summary.trials)
+        assert score.measured_heading == score.name.endswith("_heading")
 
 
 def test_constant_icrs_predict_better_than_no_slip_and_momentary(run: Run) -> None:
-    ladder = judge_ladder(run)
-    p95 = {rung.name: float(rung.summary.p95[1]) for rung in ladder.rungs}
+    comparison = comparison_table(run)
+    p95 = {score.name: float(score.summary.p95[1]) for score in comparison.scores}
     assert p95["window"] < p95["icr"] < p95["no_slip"]
 
 
 def test_too_short_a_drive_is_refused() -> None:
     with pytest.raises(DataError, match="too short to fit on one part"):
-        judge_ladder(fit(make_log(0, 30.0), CONFIG))
+        comparison_table(fit(make_log(0, 30.0), CONFIG))
 
 
 def test_window_fit_beats_momentary_icrs_on_the_shared_logs(shared_logs) -> None:
@@ -125,6 +125,6 @@ def test_window_fit_beats_momentary_icrs_on_the_shared_logs(shared_logs) -> None
     ratios = []
     for name, robot in robots.items():
         config = load_config(robot=robot)
-        ladder = judge_ladder(fit(read_log(shared_logs / "simulated" / name, config), config))
-        ratios.append(ladder.rung("icr").summary.p95[1] / ladder.rung("window").summary.p95[1])
+        comparison = comparison_table(fit(read_log(shared_logs / "simulated" / name, config), config))
+        ratios.append(comparison.score("icr").summary.p95[1] / comparison.score("window").summary.p95[1])
     assert np.median(ratios) > 1.5

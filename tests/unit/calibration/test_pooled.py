@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.from_runs import robot_of
-from icrtool.calibration.held_out import choose, hold_out, plan_folds
+from icrtool.calibration.held_out import hold_out, plan_folds
+from icrtool.calibration.model_choice import choose
 from icrtool.calibration.pooled import CalibrationResult, block_predictor, calibrate, predictor, recording_of
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from icrtool.calibration.error_differences import compare_errors
 from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.transfer import Transfer, compare_calibrations, compare_groups
 from icrtool.errors import ConfigError
@@ -66,3 +68,36 @@ def test_text_csv_and_json_hold_the_same(transfer: Transfer) -> None:
 def test_one_group_is_refused() -> None:
     with pytest.raises(ConfigError):
         compare_groups({"one": []})
+
+
+def test_costs_are_differences_in_the_same_trials(transfer: Transfer) -> None:
+    cost = transfer.cost("old", "new", 10.0)
+    own, foreign = transfer.cell("new", "new", 10.0), transfer.cell("old", "new", 10.0)
+    assert cost.p95_m == pytest.approx(foreign.p95_m - own.p95_m, rel=1e-9)
+    assert 0.0 < cost.p95_low_m < cost.p95_m < cost.p95_high_m
+    same = transfer.cost("old", "again", 10.0)
+    assert same.expected_low_m < 0.1
+
+
+def test_pairs_of_blocks_take_what_is_hard_for_both_out_of_the_difference() -> None:
+    """Errors of 40 stretches, some hard for both, that differ by 0.1 m: intervals hold it, paired ones tightly."""
+    inside, widths = 0, []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        hard, block = np.repeat(rng.exponential(1.0, 40), 20), np.repeat(np.arange(40), 20)
+        first = hard + rng.normal(0.0, 0.05, len(hard)) + np.repeat(rng.normal(0.0, 0.05, 40), 20)
+        second = hard + 0.1 + rng.normal(0.0, 0.05, len(hard)) + np.repeat(rng.normal(0.0, 0.05, 40), 20)
+        paired, apart = (compare_errors(first, block, second, block, paired=how, seed=1) for how in (True, False))
+        inside += paired.expected_low_m <= 0.1 <= paired.expected_high_m
+        widths.append((paired.expected_high_m - paired.expected_low_m) / (apart.expected_high_m - apart.expected_low_m))
+    assert inside >= 34
+    assert np.median(widths) < 0.3
+
+
+def test_the_same_route_driven_twice_is_paired() -> None:
+    first, second = (make_recording(FIVE, OLD, 1, 150.0, name=name) for name in ("one", "two"))
+    second = replace(second, drive=second.drive._replace(north=second.drive.north + 0.2))
+    groups = {"one": [first], "two": [second]}
+    found = compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
+    assert all(change.paired for change in found.pairs[0].errors)
+    assert "the same route" in format_transfer(found)

@@ -89,7 +89,7 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
     )
     assert json.loads(format_export(own, "json"))["left_radius_multiplier"] == numbers.left_radius
     # the controller's model is tested in the same trials as the whole one
-    assert exported.full_p95_m == report.comparison.rung("extended").summary.p95[1]  # type: ignore[union-attr]
+    assert exported.full_p95_m == report.comparison.score("extended").summary.p95[1]  # type: ignore[union-attr]
     assert exported.p95_m != exported.full_p95_m
 
 

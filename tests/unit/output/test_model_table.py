@@ -1,4 +1,4 @@
-"""The ladder as text and data."""
+"""The comparison as text and data."""
 
 from __future__ import annotations
 
@@ -7,45 +7,45 @@ from dataclasses import replace
 
 import pytest
 
-from icrtool.calibration.model_comparison import Ladder, judge_ladder
+from icrtool.calibration.model_comparison import ModelComparison, comparison_table
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.output.run_directory import json_bytes
 from icrtool.output.tables.model_comparison import (
-    LADDER_COLUMNS,
+    COMPARISON_COLUMNS,
+    comparison_document,
+    comparison_rows,
     extended_line,
-    format_ladder,
-    ladder_document,
-    ladder_rows,
+    format_comparison,
 )
 
 
 @pytest.fixture(scope="module")
-def ladder(make_run) -> Ladder:
+def comparison(make_run) -> ModelComparison:
     run = make_run(duration_s=90.0)
-    return judge_ladder(run, measured_headings(run))
+    return comparison_table(run, measured_headings(run))
 
 
-def test_every_model_has_its_line(ladder: Ladder) -> None:
-    text = format_ladder(ladder)
-    for rung in ladder.rungs:
-        assert any(line.startswith(rung.label) for line in text.splitlines())
+def test_every_model_has_its_line(comparison: ModelComparison) -> None:
+    text = format_comparison(comparison)
+    for score in comparison.scores:
+        assert any(line.startswith(score.label) for line in text.splitlines())
     assert "held out" in text
 
 
-def test_every_row_of_the_csv_has_a_cell_for_each_column(ladder: Ladder) -> None:
-    rows = list(ladder_rows(ladder))
-    assert len(rows) == len(ladder.rungs) * len(ladder.horizons_m)
-    assert {len(row) for row in rows} == {len(LADDER_COLUMNS)}
+def test_every_row_of_the_csv_has_a_cell_for_each_column(comparison: ModelComparison) -> None:
+    rows = list(comparison_rows(comparison))
+    assert len(rows) == len(comparison.scores) * len(comparison.horizons_m)
+    assert {len(row) for row in rows} == {len(COMPARISON_COLUMNS)}
     assert {row[2] for row in rows} == {"wheels", "heading"}
 
 
-def test_the_document_is_json(ladder: Ladder) -> None:
-    document = json.loads(json_bytes(ladder_document(ladder)))
-    assert [model["name"] for model in document["models"]] == [rung.name for rung in ladder.rungs]
+def test_the_document_is_json(comparison: ModelComparison) -> None:
+    document = json.loads(json_bytes(comparison_document(comparison)))
+    assert [model["name"] for model in document["models"]] == [score.name for score in comparison.scores]
     assert set(document["fits"]["window"]["value"]) >= {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}
 
 
-def test_the_line_names_what_was_chosen_or_why_nothing_was(ladder: Ladder) -> None:
-    line = extended_line(replace(ladder, blocks=3, chosen=("icr", "five", "five"), best="eight"))
-    assert [ladder.fits[name].model.label in line for name in ("icr", "five", "eight")] == [True] * 3
-    assert "too few" in extended_line(replace(ladder, blocks=2, chosen=("multiplier",) * 2, best="icr"))
+def test_the_line_names_what_was_chosen_or_why_nothing_was(comparison: ModelComparison) -> None:
+    line = extended_line(replace(comparison, blocks=3, chosen=("icr", "five", "five"), best="eight"))
+    assert [comparison.fits[name].model.label in line for name in ("icr", "five", "eight")] == [True] * 3
+    assert "too few" in extended_line(replace(comparison, blocks=2, chosen=("multiplier",) * 2, best="icr"))

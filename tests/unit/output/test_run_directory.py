@@ -151,3 +151,17 @@ def test_an_interrupted_drawing_leaves_nothing(tmp_path: Path, run: Run, monkeyp
 def test_an_unknown_plot_format_is_a_mistake_of_the_caller(tmp_path: Path, run: Run) -> None:
     with pytest.raises(ValueError, match="gif"):
         write_run(run, tmp_path / "barn", plots=("gif",))
+
+
+def test_many_states_are_written_as_parquet_and_that_is_noted(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes: list[str] = []
+    monkeypatch.setattr("icrtool.output.run_directory.MOST_CSV_STATES", len(run.table) - 1)
+    write_run(run, tmp_path / "many", plots=(), note=notes.append)
+    assert (tmp_path / "many" / "states.parquet").is_file()
+    assert not (tmp_path / "many" / "states.csv").exists()
+    assert any("states.parquet" in note for note in notes)
+    write_run(run, tmp_path / "asked", states="csv", plots=())
+    assert (tmp_path / "asked" / "states.csv").is_file()
+    assert len(open_run(tmp_path / "many").table) == len(run.table)

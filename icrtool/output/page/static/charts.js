@@ -246,6 +246,21 @@ const icrtoolCharts = (() => {
     keys(document.getElementById("differences-keys"), entries);
   }
 
+  /** Return the range of positive values with a margin; of none, one that can be drawn. */
+  function logRange(columns) {
+    let low = Infinity, high = 0;
+    for (const value of columns.flat()) {
+      if (value !== null && value > 0) {
+        low = Math.min(low, value);
+        high = Math.max(high, value);
+      }
+    }
+    if (!(high > 0)) return [0.01, 10];
+    // uPlot counts its ticks from the lowest value, and needs one that is a tick: one digit and zeros.
+    const unit = 10 ** Math.floor(Math.log10(low));
+    return [Number((Math.floor(low / unit) * unit).toPrecision(1)), high * 1.3];
+  }
+
   const LOOKS = {
     recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
     no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
@@ -293,7 +308,7 @@ const icrtoolCharts = (() => {
         width: element.clientWidth || 600, height: 320, legend: { show: false }, bands, series, axes: chartAxes,
         cursor: { drag: { x: false, y: false }, points: { size: 7 } },
         scales: { x: { time: false, range: () => [log ? horizons[0] : 0, horizons[horizons.length - 1]] },
-          y: log ? { distr: 3, range: (u, min, max) => [min / 1.3, max * 1.3] } : { range: (u, min, max) => [0, (max || 1) * 1.05] } },
+          y: log ? { distr: 3, range: () => logRange(columns.slice(1)) } : { range: (u, min, max) => [0, (max || 1) * 1.05] } },
       }, columns, element);
     }
 

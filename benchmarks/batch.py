@@ -1,0 +1,96 @@
+"""Time a batch: one process against several, overhead beside the logs' own work, Dask with two workers, resume.
+
+Run it on an idle machine: ``python benchmarks/batch.py FOLDER [--logs N] [--dask]``. The logs (5 min, simulated, each
+with its own seed) are made in FOLDER once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ICRTOOL = (sys.executable, "-P", "-m", "icrtool")
+ROBOT = ("--robot", "husky-a200")
+RATES = ("--wheel-rate", "50", "--gnss-rate", "5", "--heading-rate", "50")
+
+
+def make_logs(folder: Path, count: int) -> Path:
+    """Simulate the logs that are not there yet."""
+    logs = folder / f"logs{count}"
+    logs.mkdir(parents=True, exist_ok=True)
+    for seed in range(count):
+        log = logs / f"drive{seed:03d}.mcap"
+        if not log.exists():
+            path = ("lawnmower", "curved", "figure-eight")[seed % 3]
+            options = ("--seed", str(seed), "--duration", "300", "--path", path, *ROBOT, *RATES)
+            subprocess.run([*ICRTOOL, "simulate", "-q", "-o", log, *options], check=True)
+            log.with_suffix(".mcap.truth.csv").unlink(missing_ok=True)
+    return logs
+
+
+def run(logs: Path, output: Path, *options: str, fresh: bool = True) -> dict[str, float]:
+    """Run a batch; return wall time, the logs' own time, CPU time [s] and the largest process [MB]."""
+    if fresh:
+        shutil.rmtree(output, ignore_errors=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begun = time.monotonic()
+    subprocess.run([*ICRTOOL, "batch", logs, "-o", output, "-q", *ROBOT, *options], check=True)
+    wall = time.monotonic() - begun
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    rows = json.loads((output / "fleet.json").read_bytes())["logs"]
+    if failed := [row["log"] for row in rows if row["status"] == "failed"]:
+        raise SystemExit(f"{failed}: failed")
+    return {
+        "wall_s": wall,
+        "logs_s": sum(row["took_s"] for row in rows),
+        "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        "largest_mb": after.ru_maxrss / 1024,
+    }
+
+
+def with_dask(logs: Path, output: Path) -> dict[str, float]:
+    """Run a batch on a scheduler and two workers on this machine."""
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "8799",
+            "--dashboard-address", "127.0.0.1:0"]  # fmt: skip
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "tcp://127.0.0.1:8799", "--nthreads", "1"]
+    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in (dask, worker, worker)]
+    try:
+        time.sleep(5.0)
+        return run(logs, output, "--scheduler", "tcp://127.0.0.1:8799")
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait()
+
+
+def main() -> None:
+    """Print a line per measurement."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--logs", type=int, default=200)
+    parser.add_argument("--dask", action="store_true")
+    asked = parser.parse_args()
+    logs, output = make_logs(asked.folder, asked.logs), asked.folder / "out"
+    jobs = str(os.cpu_count() or 1)
+    print(f"{asked.logs} logs of 5 min, {jobs} cores, load {os.getloadavg()[0]:.1f}")
+    found = {"-j 1": run(logs, output, "-j", "1"), f"-j {jobs}": run(logs, output, "-j", jobs)}
+    found["resume"] = run(logs, output, "-j", jobs, fresh=False)
+    if asked.dask:
+        found["dask"] = with_dask(logs, output)
+    for name, one in found.items():
+        count = int(jobs) if name not in ("-j 1", "resume") else 1
+        overhead = f"  overhead {100 * (one['wall_s'] * count / one['logs_s'] - 1):.1f} %" if name != "resume" else ""
+        print(f"{name:7} wall {one['wall_s']:7.1f} s  CPU {one['cpu_s']:7.1f} s  largest process "
+              f"{one['largest_mb']:.0f} MB{overhead}")  # fmt: skip
+    print(f"{found['-j 1']['wall_s'] / found[f'-j {jobs}']['wall_s']:.2f} times faster than -j 1")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Compare every motion model on recordings that it was not fitted to: ``benchmarks/models.py FOLDER --robot NAME``.
+
+Each recording or run below FOLDER belongs to the ground that its folder is named after; with --ground PATTERN=NAME, to
+NAME where its path holds PATTERN. For each ground every recording is left out in turn; a single one is cut into blocks.
+The table is Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from icrtool.calibration.held_out import HeldOut, hold_out
+from icrtool.calibration.pooled import gyro_recording_of
+from icrtool.config import Config, load_config
+from icrtool.errors import IcrToolError
+from icrtool.estimation.fit import fit
+from icrtool.fleet.recordings import find_recordings
+from icrtool.logs import read_log
+from icrtool.motion.models import CONTROLLER, MODELS
+from icrtool.motion.recording import Recording
+from icrtool.output.run_directory import RUN_FILE, is_run_directory
+from icrtool.output.stored_run import open_run
+
+
+def main() -> None:
+    """Print a table for each ground."""
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("folder", type=Path)
+    ask.add_argument("--robot")
+    ask.add_argument("--config", type=Path)
+    ask.add_argument("--ground", action="append", default=[], metavar="PATTERN=NAME")
+    given = ask.parse_args()
+    grounds = dict(text.split("=", 1) for text in given.ground)
+    found: dict[str, list[Recording]] = {}
+    for path, recording in recordings_below(given.folder, load_config(given.config, given.robot)):
+        names = [name for pattern, name in grounds.items() if pattern in str(path)]
+        found.setdefault(names[0] if names else path.parent.name, []).append(recording)
+    for ground, recordings in found.items():
+        print("\n".join(format_ground(ground, recordings)), flush=True)
+
+
+def recordings_below(folder: Path, config: Config) -> Iterator[tuple[Path, Recording]]:
+    """Yield runs below a folder, or else recordings, fitted; one that cannot be used is named."""
+    runs = sorted(file.parent for file in folder.rglob(RUN_FILE) if is_run_directory(file.parent))
+    for path in runs or sorted(one.path for one in find_recordings([folder])):
+        try:
+            run = open_run(path) if runs else fit(read_log(path, config), config)
+            yield path, gyro_recording_of(run)
+        except IcrToolError as err:
+            print(f"<!-- left out: {err} -->")
+
+
+def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
+    """Yield the lines of one ground's table."""
+    wheels, gyro = hold_out(recordings)
+    metres = sum(float(one.drive.distance[-1]) for one in recordings)
+    fold = "log" if wheels.folds[0].whole else "block"
+    yield f"\n**{ground}**: {len(recordings)} recorded, {metres:.0f} m; {len(wheels.folds)} {fold}s left out in turn\n"
+    horizons = [f"{horizon:g} m" for horizon in wheels.horizons_m]
+    yield "| model | " + " | ".join([*horizons, *(f"{one}, with gyro" for one in horizons)]) + " |"
+    yield "|---|" + "---|" * (2 * len(horizons))
+    for name in (*MODELS, "recommended", CONTROLLER.name):
+        with_gyro = name if name == "recommended" else f"{name}_gyro"
+        row = [*cells(wheels, name), *cells(gyro, with_gyro)]
+        yield f"| `{name}` | " + " | ".join(row) + " |"
+    yield f"\nRecommended for all of it: `{wheels.recommended}`."
+
+
+def cells(table: HeldOut | None, name: str) -> list[str]:
+    """Return p95 / expected error [m] at each horizon, median over what was left out."""
+    row = None if table is None else next((one for one in table.scores if one.name == name), None)
+    if row is None:
+        return ["", "", ""]
+    return [f"{row.median('p95', h):.2f} / {row.median('expected', h):.2f}" for h in range(len(row.folds[0].p95))]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,266 @@
+"""How the error of a motion model grows along a path, measured on distance it was not fitted to.
+
+The position error of a drive without GNSS has two parts. The parameters have a covariance; what it makes of the path
+follows from their derivatives. What the model leaves out is described by a few sources of error with a variance each:
+the heading at the start, a turn rate off by a constant, turns off by a share, a turn rate that wanders, a speed off by
+a share, a speed that wanders. Their variances are fitted to the squared errors of held-out windows of several lengths,
+and the quantiles are scaled so that they hold there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from icrtool.calibration.held_out import HeldOut
+from icrtool.calibration.measured_errors import ErrorSources
+from icrtool.errors import DataError
+from icrtool.kernels.window_residuals import sums_at_knots
+from icrtool.motion.models import MotionModel, model_columns, wheel_motion
+from icrtool.motion.recording import Recording, Steps, cut_windows
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.tables import Complexes, Floats, Ints
+
+LENGTHS_M = (2.0, 5.0, 10.0, 20.0)
+"""Held-out windows of these lengths are compared."""
+
+SCALED_FROM_M = 5.0
+"""Shorter windows say more of the reference's noise than of the model; they do not scale the quantiles."""
+
+FEWEST_WINDOWS = 20
+
+ANGLES = 48
+DESCENTS = 400
+
+SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 4.0
+"""Of the quantiles; of p95 never less than 1: a few windows do not show that the errors are smaller than normal."""
+
+
+Values = TypeVar("Values", Floats, Complexes)
+
+SOURCES = len(ErrorSources._fields) - 2
+
+
+class Spread(NamedTuple):
+    """Second moments of errors at the ends of windows, in the body frame of their start.
+
+    Attributes
+    ----------
+    heading : (w, c) [rad^2]; xx, xy, yy : (w, c) [m^2], forward and right; c sources, or one column of all together
+    """
+
+    heading: Floats
+    xx: Floats
+    xy: Floats
+    yy: Floats
+
+    def combined(self, variances: Floats) -> Spread:
+        """Return the moments (w, 1) for variances (c,) of the sources."""
+        return Spread(*((one @ variances)[:, None] for one in self))
+
+    def plus(self, other: Spread) -> Spread:
+        """Return the moments of independent errors together."""
+        return Spread(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+class Ends(NamedTuple):
+    """Starts and ends of windows on a path of steps.
+
+    Attributes
+    ----------
+    knot_t : (m,) times, ascending; start, end : (w,) rows of it
+    """
+
+    knot_t: Floats
+    start: Ints
+    end: Ints
+
+
+class PathErrors(NamedTuple):
+    """What a model makes of windows: moved (w,) forward + j right [m], turned (w,) [rad], and moments of its errors.
+
+    `of_parameters` has one column, `of_sources` one for each source.
+    """
+
+    moved: Complexes
+    turned: Floats
+    of_parameters: Spread
+    of_sources: Spread
+
+
+def path_errors(
+    steps: Steps, ends: Ends, model: MotionModel, parameters: Floats, covariance: Floats, width_m: float,
+    delay_s: float = 0.0,
+) -> PathErrors:  # fmt: skip
+    """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
+
+    Parameters
+    ----------
+    delay_s : of the wheels relative to the times of the knots
+    """
+    fixed, axes, columns = model_columns(model, wheel_motion(steps.v_left, steps.v_right, width_m))
+    # the sources act all along the path, not at the ends of windows alone
+    at = np.union1d(ends.knot_t + delay_s, steps.t)
+    row, share = steps.locate(at)
+    knots, k = len(row), len(parameters)
+    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
+    sums_at_knots(fixed, columns, axes, parameters, steps.held, steps.into, row, share, rate, sums, by)
+    theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
+    s, e = (np.searchsorted(at, ends.knot_t[rows] + delay_s) for rows in (ends.start, ends.end))
+    back = np.exp(-1j * theta[s])
+    went = place[e] - place[s]
+    turned_by = by[:, e, 0] - by[:, s, 0]
+    place_by = by[:, :, 1] + 1j * by[:, :, 2]
+    moved_by = back * (place_by[:, e] - place_by[:, s] - 1j * by[:, s, 0] * went)
+    of_parameters = Spread(
+        *(np.einsum("kw,kl,lw->w", a, covariance, b)[:, None]
+          for a, b in ((turned_by, turned_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
+                       (moved_by.imag, moved_by.imag)))
+    )  # fmt: skip
+    return PathErrors(back * went, theta[e] - theta[s], of_parameters, _source_moments(theta, place, s, e))
+
+
+def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread:
+    """Return the moments (w, `SOURCES`) of a unit variance of each source, by sums between knots."""
+    step = np.diff(place)
+    length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
+    middle_m, middle_rad = (length[1:] + length[:-1]) / 2, (theta[1:] + theta[:-1]) / 2
+    middle = (place[1:] + place[:-1]) / 2
+
+    def between(values: Values) -> Values:
+        sums = np.concatenate([np.zeros(1, values.dtype), np.cumsum(values)])
+        difference: Values = sums[e] - sums[s]
+        return difference
+
+    back, went, driven = np.exp(-1j * theta[s]), place[e] - place[s], length[e] - length[s]
+    by_rate = 1j * back * (between(step * middle_m) - length[s] * went)
+    by_turn = 1j * back * (between(step * middle_rad) - theta[s] * went)
+    constant = [
+        (0.0 * driven, 1j * back * went),
+        (driven, by_rate),
+        (theta[e] - theta[s], by_turn),
+        (0.0 * driven, back * went),
+    ]
+    one, first = np.abs(step), between(np.abs(step) * middle)
+    zero = between(one)
+    # sum of q (S_e - S_u)(S_e - S_u)^T along the path, as squared length and as the square of the complex number
+    size = zero * np.abs(place[e]) ** 2 - 2.0 * (np.conj(place[e]) * first).real + between(one * np.abs(middle) ** 2)
+    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + between(one * middle**2)) * (1j * back) ** 2
+    wander = _from_squares(driven, size, square)
+    along = np.divide(step**2, one, out=np.zeros(len(step), np.complex128), where=one > 0.0)
+    speed = _from_squares(0.0 * driven, zero, between(along) * back**2)
+    moments = [Spread(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
+    ones, none = np.ones(len(s)), np.zeros(len(s))
+    reference = [Spread(ones, none, none, none), Spread(none, ones, none, ones)]
+    ordered = (*moments[:3], wander, moments[3], speed, *reference)
+    return Spread(*(np.column_stack(column) for column in zip(*ordered, strict=True)))
+
+
+def _from_squares(heading: Floats, size: Floats, square: Floats) -> Spread:
+    """Return moments from the sums of |z|^2 and of z^2."""
+    return Spread(heading, (size + square.real) / 2, square.imag / 2, (size - square.real) / 2)
+
+
+def radius(spread: Spread, share: float) -> Floats:
+    """Return the radius (w,) [m] that holds a share of the errors, normal with the moments (w, 1); bisection."""
+    across = _directions(spread)
+    low, high = np.zeros(len(across)), 6.0 * np.sqrt(across.max(axis=1))
+    for _ in range(40):
+        middle = (low + high) / 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside = 1.0 - np.nan_to_num(np.exp(-(middle[:, None] ** 2) / (2.0 * across))).mean(axis=1)
+        low, high = np.where(inside < share, middle, low), np.where(inside < share, high, middle)
+    return np.asarray((low + high) / 2)
+
+
+def mean_error(spread: Spread) -> Floats:
+    """Return the mean length (w,) [m] of errors that are normal with the moments (w, 1)."""
+    return np.asarray(np.sqrt(np.pi / 2.0) * np.sqrt(_directions(spread)).mean(axis=1))
+
+
+def _directions(spread: Spread) -> Floats:
+    """Return the squared length (w, `ANGLES`) of the unit circle's image by the square root of a covariance."""
+    xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
+    middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    large, small = middle + apart, np.maximum(middle - apart, 0.0)
+    angle = np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
+    return np.asarray(large[:, None] * np.cos(angle) ** 2 + small[:, None] * np.sin(angle) ** 2)
+
+
+def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> ErrorSources | None:
+    """Return the sources of error of a held-out table's recommended model, from windows of what it was not fitted to.
+
+    Returns
+    -------
+    None where too few windows were left out.
+
+    Notes
+    -----
+    Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
+    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent.
+    """
+    stretches = 0
+    found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
+    for fold, fit, delay in zip(table.folds, table.without, table.delays_s, strict=True):
+        recording = recordings[fold.recording]
+        try:
+            windows = cut_windows(recording, LENGTHS_M, recordings)
+        except DataError:
+            continue
+        mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
+        ends = Ends(windows.knot_t, windows.start[mine], windows.end[mine])
+        errors = path_errors(
+            windows.steps, ends, fit.model, fit.parameters, fit.covariance, recording.width_m, delay
+        )  # fmt: skip
+        row = np.searchsorted(recording.t_s, windows.knot_t)
+        heading = recording.drive.heading[row]
+        turned = errors.turned - (heading[ends.end] - heading[ends.start])
+        stretches += len(np.unique(np.floor(windows.start_m[mine] / CHOICE_HORIZON_M)))
+        found.append((windows.length_m[mine], errors, turned, errors.moved - windows.reference[mine]))
+    length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
+    if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
+        return None
+    sources = _stacked([one[1].of_sources for one in found])
+    known = _stacked([one[1].of_parameters for one in found])
+    turned, missed = np.concatenate([one[2] for one in found]), np.concatenate([one[3] for one in found])
+    variances = _fit_variances(length, sources, known, turned, missed)
+    spread, far = sources.combined(variances).plus(known), length >= SCALED_FROM_M
+    error = np.abs(missed)
+    level = min(95.0 * (1.0 + 1.0 / stretches), 100.0)
+    share = np.percentile(error[far] / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
+    mean = error[far].mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
+    factors = np.clip([share, mean], [1.0, SMALLEST_FACTOR], LARGEST_FACTOR).tolist()
+    return ErrorSources(*variances.tolist(), *factors)
+
+
+def _stacked(parts: Sequence[Spread]) -> Spread:
+    return Spread(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
+    """Return the variances (`SOURCES`,) that make the squared errors of windows, beside those of the parameters."""
+    matrix, y = np.zeros((SOURCES, SOURCES)), np.zeros(SOURCES)
+    kinds = (
+        (sources.heading, known.heading, turned**2),
+        (sources.xx, known.xx, missed.real**2),
+        (sources.yy, known.yy, missed.imag**2),
+    )
+    for metres in np.unique(length):
+        rows = length == metres
+        for columns, of_parameters, squared in kinds:
+            weight = 1.0 / max(float(squared[rows].mean()), 1e-12)
+            scaled = weight * columns[rows]
+            matrix += scaled.T @ scaled / np.count_nonzero(rows)
+            y += scaled.T @ (weight * (squared[rows] - of_parameters[rows, 0])) / np.count_nonzero(rows)
+    return _nonnegative(matrix, y)
+
+
+def _nonnegative(matrix: Floats, y: Floats) -> Floats:
+    """Return x >= 0 that minimises x matrix x / 2 - y x, by coordinate descent; matrix is positive semidefinite."""
+    x = np.zeros(len(y))
+    for _ in range(DESCENTS):
+        for i in np.flatnonzero(np.diag(matrix) > 0.0):
+            x[i] = max(0.0, x[i] + (y[i] - matrix[i] @ x) / matrix[i, i])
+    return x

@@ -1,0 +1,186 @@
+"""Forecast the error of driving a path without GNSS, from a calibration's covariance and sources of error."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.error_growth import SOURCES, Ends, PathErrors, Spread, mean_error, path_errors, radius
+from icrtool.calibration.record import Calibration
+from icrtool.errors import DataError
+from icrtool.motion.models import MotionModel, model_columns, wheel_motion
+from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
+from icrtool.motion.trials import Trials
+from icrtool.records.tables import Complexes, Floats, Ints
+
+STEP_M = 0.1
+"""A planned path is driven in steps of this length."""
+
+SPEED_MPS = 0.5
+"""Speed of a plan that gives none."""
+
+SLOWEST_MPS = 0.02
+
+INVERSIONS = 8
+
+LONGEST_PATH_M = 100_000.0
+
+
+class Forecast(NamedTuple):
+    """Errors along a path that is driven without GNSS from its start; (m,) each, after each metre.
+
+    Attributes
+    ----------
+    distance_m : driven; east_m, north_m : where the path is then
+    expected_m, p95_m : mean error, and the distance within which 95 % of the errors are
+    std_east_m, std_north_m, heading_std_deg : one standard deviation
+    """
+
+    distance_m: Floats
+    east_m: Floats
+    north_m: Floats
+    expected_m: Floats
+    p95_m: Floats
+    std_east_m: Floats
+    std_north_m: Floats
+    heading_std_deg: Floats
+
+
+def forecast_plan(
+    calibration: Calibration, east_m: Floats, north_m: Floats, speed_mps: Floats | None = None
+) -> Forecast:
+    """Return the errors along a planned path.
+
+    Parameters
+    ----------
+    east_m, north_m : (p,) points of the path, driven in their order, forward
+    speed_mps : (p,) speed from each point on; default `SPEED_MPS`
+
+    Raises
+    ------
+    DataError
+        A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
+    """
+    path, line = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
+    step = np.diff(path)
+    direction = np.unwrap(np.angle(step))
+    # a corner of the plan is turned over the steps around it, not on the spot
+    width = max(round(calibration.width_m / STEP_M), 1)
+    direction = _smoothed(direction, width)
+    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
+    if not (np.isfinite(speed).all() and speed.min() > 0.0):
+        raise DataError("plan", "a speed that is not positive", "give speed_mps in m/s, forward")
+    speed = np.maximum(speed, SLOWEST_MPS)
+    held = np.abs(step) / speed
+    turn = np.append(np.diff(direction), 0.0) / held
+    left, right = wheel_speeds(
+        calibration.fitted.model, calibration.fitted.parameters, calibration.width_m, speed, turn
+    )
+    t = np.concatenate([[0.0], np.cumsum(held)])
+    steps = Steps(t[:-1], held, left, right, np.zeros(len(held)), held / 2.0)
+    length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
+    return _along(calibration, steps, t, path, length, float(direction[0]))
+
+
+def forecast_drive(calibration: Calibration, recording: Recording) -> Forecast:
+    """Return the errors of driving the path of a recording again, with its wheel speeds."""
+    drive = recording.drive
+    steps = joined_steps(recording, samples_a_step(recording))
+    place = drive.north + 1j * drive.east
+    return _along(calibration, steps, recording.t_s, place, drive.distance, float(drive.heading[0]))
+
+
+def forecast_trials(calibration: Calibration, recording: Recording, trials: Trials) -> tuple[Floats, Floats]:
+    """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
+    steps = joined_steps(recording, samples_a_step(recording))
+    some = trials.ends >= 0
+    start, end = np.broadcast_to(trials.starts[:, None], trials.ends.shape)[some], trials.ends[some]
+    rows, places = np.unique(np.concatenate([start, end]), return_inverse=True)
+    ends = Ends(recording.t_s[rows], places[: len(start)], places[len(start) :])
+    _, expected, p95 = _errors(calibration, steps, ends)
+    found = np.full((2, *trials.ends.shape), np.nan)
+    found[0][some], found[1][some] = expected, p95
+    return found[0], found[1]
+
+
+def wheel_speeds(
+    model: MotionModel, parameters: Floats, width_m: float, speed: Floats, turn: Floats
+) -> tuple[Floats, Floats]:
+    """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
+
+    Notes
+    -----
+    The model's matrix from (v, w) to (v_x, omega), its terms that are not linear taken at the last step.
+    """
+    v, w = speed.copy(), turn.copy()
+    for _ in range(INVERSIONS):
+        made = _ahead_and_turn(model, parameters, width_m, v, w)
+        by_v = (_ahead_and_turn(model, parameters, width_m, v + 1e-4, w) - made) / 1e-4
+        by_w = (_ahead_and_turn(model, parameters, width_m, v, w + 1e-4) - made) / 1e-4
+        off = np.array([speed, turn]) - made
+        size = by_v[0] * by_w[1] - by_v[1] * by_w[0]
+        size = np.where(np.abs(size) > 1e-3, size, 1e-3)
+        v = v + (off[0] * by_w[1] - off[1] * by_w[0]) / size
+        w = w + (off[1] * by_v[0] - off[0] * by_v[1]) / size
+    return v + w * width_m / 2.0, v - w * width_m / 2.0
+
+
+def _ahead_and_turn(model: MotionModel, parameters: Floats, width_m: float, v: Floats, w: Floats) -> Floats:
+    motion = wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m)
+    made, axes, columns = model_columns(model, motion)
+    for axis, parameter, column in zip(axes, parameters, columns, strict=True):
+        made[axis] += parameter * column
+    return made[[0, 2]]
+
+
+def _resampled(points: Complexes) -> tuple[Complexes, Ints]:
+    """Return points (n,) a step apart along straight lines between points (p,), and the line (n,) that each lies on."""
+    if not np.isfinite(points).all():
+        raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
+    length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    if not 1.0 <= length[-1] <= LONGEST_PATH_M:
+        raise DataError("plan", f"a path of {length[-1]:.3g} m", f"give 1 m to {LONGEST_PATH_M:g} m")
+    at = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
+    line = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(points) - 2)
+    place: Complexes = np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag)
+    return place, line
+
+
+def _smoothed(values: Floats, width: int) -> Floats:
+    """Return means over `width` values; the first and last are repeated beyond the ends."""
+    padded = np.concatenate([np.full(width // 2, values[0]), values, np.full(width - 1 - width // 2, values[-1])])
+    return np.asarray(np.convolve(padded, np.full(width, 1.0 / width), mode="valid"))
+
+
+def _along(
+    calibration: Calibration, steps: Steps, t: Floats, place: Complexes, length: Floats, heading: float
+) -> Forecast:
+    """Return the forecast after each metre of a path; `t`, `place`, `length` (n,) at its points."""
+    metres = np.arange(1.0, np.floor(length[-1]) + 1.0)
+    if not len(metres):
+        raise DataError("path", f"{length[-1]:.2f} m long", "a forecast needs a metre at least")
+    rows = np.searchsorted(length, metres)
+    ends = Ends(np.concatenate([t[:1], t[rows]]), np.zeros(len(rows), np.int64), np.arange(1, len(rows) + 1))
+    spread, expected, p95 = _errors(calibration, steps, ends)
+    c, s = np.cos(heading), np.sin(heading)
+    xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
+    north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
+    east = np.sqrt(np.maximum(s * s * xx + 2 * c * s * xy + c * c * yy, 0.0))
+    return Forecast(
+        metres, place[rows].imag, place[rows].real, expected, p95, east, north,
+        np.degrees(np.sqrt(spread.heading[:, 0])),
+    )  # fmt: skip
+
+
+def _errors(calibration: Calibration, steps: Steps, ends: Ends) -> tuple[Spread, Floats, Floats]:
+    """Return moments, expected and 95 % error of windows."""
+    sources, fitted = calibration.sources, calibration.fitted
+    if sources is None:
+        why = "its error growth was not measured"
+        raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
+    found: PathErrors = path_errors(
+        steps, ends, fitted.model, fitted.parameters, fitted.covariance, calibration.width_m
+    )  # fmt: skip
+    spread = found.of_sources.combined(np.array(sources[:SOURCES])).plus(found.of_parameters)
+    return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

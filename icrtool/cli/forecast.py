@@ -1,0 +1,77 @@
+"""``icrtool forecast``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from icrtool.cli import options
+from icrtool.cli.json_output import json_option, print_json
+
+if TYPE_CHECKING:
+    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.record import Calibration
+
+
+@click.command("forecast")
+@click.option("--calibration", "calibration_file", metavar="CAL.json", required=True, type=click.Path(path_type=Path),
+              help="File that icrtool calibrate -o wrote.")  # fmt: skip
+@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=click.Path(path_type=Path),
+              help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
+@click.option("--budget", "budgets", metavar="METRES", type=options.POSITIVE, multiple=True, default=(0.5,),
+              show_default=True, help="Report how far 95 % of the errors stay within this; repeatable.")  # fmt: skip
+@click.option("-o", "--output", metavar="FILE.csv", type=click.Path(path_type=Path), help="Write a row for each metre.")
+@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw it: png, svg, pdf.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="Print no results.")
+def command(
+    calibration_file: Path, path: Path, budgets: tuple[float, ...], output: Path | None, plot: Path | None,
+    as_json: bool, quiet: bool,
+) -> None:  # fmt: skip
+    """Forecast the error of driving a path without GNSS, with a calibrated motion model and the wheels alone.
+
+    Expected and 95 % error after each metre from the start of the path, by the covariance of the calibration and the
+    error growth that it measured on distance it was not fitted to.
+
+    \b
+    Example:
+      icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
+      icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
+      icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
+    """  # noqa: D301 - click reads the escape
+    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.calibration_file import open_calibration
+    from icrtool.output.figures.calibration_picture import check_picture, write_forecast_picture
+    from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast
+
+    if output is not None:
+        check_place(output)
+    if plot is not None:
+        check_picture(plot)
+    calibration = open_calibration(calibration_file)
+    forecast = _forecast(calibration, path)
+    if output is not None:
+        with atomic_file(output) as partial:
+            partial.write_text(forecast_csv(forecast), encoding="utf-8")
+    if plot is not None:
+        write_forecast_picture(forecast, path.name, budgets, plot)
+    if as_json:
+        print_json("forecast", forecast_document(forecast, calibration, budgets))
+    elif not quiet:
+        click.echo(format_forecast(forecast, calibration, budgets))
+
+
+def _forecast(calibration: Calibration, path: Path) -> Forecast:
+    """Forecast along a run's path, or along the points of a table."""
+    from icrtool.calibration.forecast import forecast_drive, forecast_plan
+    from icrtool.output.run_directory import is_run_directory
+    from icrtool.output.tables.forecast import read_plan
+
+    if not is_run_directory(path):
+        return forecast_plan(calibration, *read_plan(path))
+    from icrtool.calibration.pooled import recording_of
+    from icrtool.output.stored_run import open_run
+
+    return forecast_drive(calibration, recording_of(open_run(path)))

@@ -1,0 +1,157 @@
+"""Forecasts along a path: coverage on drives that the calibration never saw, closed forms, plans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
+from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
+from icrtool.calibration.measured_errors import ErrorSources
+from icrtool.calibration.pooled import calibrate, predictor
+from icrtool.calibration.record import Calibration, calibration_of
+from icrtool.errors import DataError, RunError
+from icrtool.motion.models import MODELS, twist, wheel_motion
+from icrtool.motion.trials import cut_trials
+from icrtool.output.tables.forecast import forecast_csv, reach, read_plan
+from support.recordings import WIDTH_M, draw_parameters, make_recording
+
+SIX = MODELS["six"]
+SEEDS = range(5)
+HORIZONS_M = (5.0, 10.0, 20.0)
+ROUNDING = 1e-6
+
+
+def calibrated(seed: int) -> Calibration:
+    parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
+    logs = [make_recording(SIX, parameters, 10 * seed + k, 150.0, name=f"log {k}") for k in range(3)]
+    return calibrate(logs).calibration
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated(0)
+
+
+def only(calibration: Calibration, **variances: float) -> Calibration:
+    """Return a calibration with exact parameters and the given sources of error alone."""
+    exact = replace(calibration.fitted, covariance=0.0 * calibration.fitted.covariance)
+    sources = ErrorSources(*np.zeros(SOURCES), 1.0, 1.0)._replace(**variances)
+    return replace(calibration, fitted=exact, sources=sources)
+
+
+def test_the_95_percent_error_holds_on_drives_that_were_not_calibrated_with() -> None:
+    """Six robots drawn from the prior gave 0.98, 0.98 and 0.97 after 5, 10 and 20 m."""
+    inside, ratio = [], []
+    for seed in SEEDS:
+        parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
+        new = make_recording(SIX, parameters, 10 * seed + 9, 300.0, name="new")
+        found, trials = calibrated(seed), cut_trials(new, HORIZONS_M)
+        errors, (expected, p95) = predictor(found, new)(trials), forecast_trials(found, new, trials)
+        inside.append(np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0))
+        ratio.append(np.nanmean(errors, axis=0) / np.nanmean(expected, axis=0))
+    assert np.all(np.mean(inside, axis=0) > 0.90)
+    assert np.all(np.mean(inside, axis=0) < 0.995)
+    assert np.all(np.abs(np.mean(ratio, axis=0) - 1.0) < 0.3)
+
+
+def test_quantiles_and_means_are_those_of_drawn_errors() -> None:
+    rng = np.random.default_rng(1)
+    for covariance in (np.diag([1.0, 1.0]), np.array([[2.0, 0.7], [0.7, 0.5]]), np.diag([1.0, 0.0])):
+        size = np.linalg.norm(rng.multivariate_normal([0.0, 0.0], covariance, 200_000), axis=1)
+        xx, xy, yy = (np.array([[covariance[i, j]]]) for i, j in ((0, 0), (0, 1), (1, 1)))
+        spread = Spread(0 * xx, xx, xy, yy)
+        assert radius(spread, 0.95)[0] == pytest.approx(np.percentile(size, 95.0), rel=0.01)
+        assert mean_error(spread)[0] == pytest.approx(size.mean(), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("source", "error_m"),
+    [
+        ("heading_start_rad2", 10.0),
+        ("heading_rate_rad2pm2", 50.0),
+        ("heading_wander_rad2pm", np.sqrt(1000.0 / 3.0)),
+        ("speed_share", 10.0),
+        ("distance_wander_m2pm", np.sqrt(10.0)),
+    ],
+)
+def test_each_source_grows_on_a_straight_path_as_its_integral_does(
+    calibration: Calibration, source: str, error_m: float
+) -> None:
+    """One standard deviation after 10 m for a unit variance; along or across, 95 % lie within 1.96 of them."""
+    found = forecast_plan(only(calibration, **{source: 1.0}), np.zeros(2), np.array([0.0, 10.0]))
+    assert found.distance_m[-1] == pytest.approx(10.0)
+    assert found.p95_m[-1] == pytest.approx(1.96 * error_m, rel=0.02)
+    aside = source.startswith("heading")
+    assert (found.std_east_m if aside else found.std_north_m)[-1] == pytest.approx(error_m, rel=0.02)
+
+
+def test_a_plan_and_its_turned_and_shifted_copy_have_equal_errors(calibration: Calibration) -> None:
+    bend = np.linspace(0.0, 2.0, 60)
+    path = 8.0 * np.exp(1j * bend)
+    one, other = path, (path + 30.0) * np.exp(1.1j)
+    first, second = (forecast_plan(calibration, p.imag, p.real) for p in (one, other))
+    np.testing.assert_allclose(second.p95_m, first.p95_m, rtol=1e-6)
+    np.testing.assert_allclose(np.hypot(second.std_east_m, second.std_north_m),
+                               np.hypot(first.std_east_m, first.std_north_m), rtol=1e-6)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["icr", "six", "eight"])
+def test_wheel_speeds_make_the_motion_asked_for(name: str) -> None:
+    model = MODELS[name]
+    parameters = draw_parameters(model, np.random.default_rng(4))
+    speed, turn = np.array([0.5, 1.0, 0.8]), np.array([0.3, -0.4, 0.0])
+    v_x, _, omega = twist(
+        model, parameters, wheel_motion(*wheel_speeds(model, parameters, WIDTH_M, speed, turn), WIDTH_M)
+    )
+    np.testing.assert_allclose([v_x, omega], [speed, turn], atol=ROUNDING)
+
+
+def test_a_drive_is_forecast_as_its_trials_from_the_start_are(calibration: Calibration) -> None:
+    recording = make_recording(SIX, SIX.prior_mean, 4, 60.0)
+    trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
+    _, p95 = forecast_trials(calibration, recording, trials)
+    np.testing.assert_allclose(forecast_drive(calibration, recording).p95_m[[4, 9]], p95[0], rtol=1e-9)
+
+
+def test_a_budget_is_reached_between_metres(calibration: Calibration) -> None:
+    found = forecast_plan(only(calibration, speed_share=0.01), np.zeros(2), np.array([0.0, 12.0]))
+    assert reach(found, 1.0) == pytest.approx(1.0 / 0.196, rel=0.01)
+    assert reach(found, 99.0) == 12.0
+
+
+def test_the_sources_come_back_from_a_file_and_an_older_file_has_none(calibration: Calibration) -> None:
+    document = calibration.summary()
+    assert calibration_of(document).sources == calibration.sources
+    older = calibration_of({key: value for key, value in document.items() if key != "error_sources"})
+    with pytest.raises(DataError, match="calibrate again"):
+        forecast_plan(older, np.zeros(2), np.array([0.0, 9.0]))
+
+
+def test_a_plan_is_read_from_a_table(tmp_path: Path, calibration: Calibration) -> None:
+    file = tmp_path / "plan.csv"
+    file.write_text("east_m,north_m,speed_mps\n0,0,0.4\n6,0,0.8\n6,5,0.8\n")
+    found = forecast_plan(calibration, *read_plan(file))
+    assert found.distance_m[-1] == 11.0
+    assert (found.east_m[-1], found.north_m[-1]) == pytest.approx((6.0, 5.0), abs=0.2)
+    assert np.all(np.diff(found.p95_m) > 0.0)
+    assert forecast_csv(found).splitlines()[0].startswith("distance_m,east_m,north_m,expected_error_m,p95_error_m")
+
+
+@pytest.mark.parametrize("text", ["north_m\n1\n", "east_m,north_m\n1,2\n", ""])
+def test_a_table_that_is_no_plan_is_one_error(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "plan.csv"
+    file.write_text(text)
+    with pytest.raises(RunError):
+        read_plan(file)
+
+
+@pytest.mark.parametrize(("north", "speed"), [([0.0, 0.3], None), ([0.0, np.nan], None), ([0.0, 9.0], [0.0, 0.0])])
+def test_a_plan_that_cannot_be_driven_is_one_error(
+    calibration: Calibration, north: list[float], speed: list[float] | None
+) -> None:
+    with pytest.raises(DataError, match="plan"):
+        forecast_plan(calibration, np.zeros(2), np.array(north), None if speed is None else np.array(speed))
