@@ -4,8 +4,8 @@
 
 Physics drives, measured with sensors and troubles drawn at random with fixed seeds. The truth is the same fit to true
 poses and speeds. *Right*: each ICR within 3 stated standard deviations, and within 0.06 m or 10 % of half the ICRs'
-separation. *Hedged*: refused, not usable, an ICR that is not shown, or a warning that sides or senses may be others.
-*Wrong*: anything else.
+separation. *Hedged*: refused, not usable, an ICR that is not shown, an error that is larger but within two stated
+standard deviations, or a warning that sides or senses may be others. *Wrong*: anything else.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from icrtool.errors import IcrToolError
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Floats
 
-SIGMAS, LEAST_M, SHARE = 3.0, 0.06, 0.1
+SIGMAS, HONEST_SIGMAS, LEAST_M, SHARE = 3.0, 2.0, 0.06, 0.1
 HEDGE = "would explain the log as well"
 VERDICTS = ("right", "hedged", "wrong")
 
@@ -84,7 +84,8 @@ def score(drive: TrueDrive, case: Case) -> Score:
         text += f"; {run.summary['unusable_because']}"
     verdict = "hedged" if not usable or not shown.all() else "right"
     if usable and off.any():
-        verdict = "hedged" if any(HEDGE in note for note in run.warnings) else "wrong"
+        honest = bool((np.abs(error[off]) < HONEST_SIGMAS * std[off]).all())
+        verdict = "hedged" if honest or any(HEDGE in note for note in run.warnings) else "wrong"
     return Score(case, verdict, text, error, std, run.warnings)
 
 

@@ -1,7 +1,8 @@
 """Fuzz icrtool with logs of damaged structure: read, align, fit and report each within bounds of time and memory.
 
 ``make fuzz`` runs it; ``python scripts/fuzz.py --help`` lists the options. A finding is a traceback or a limit that
-is exceeded; its log is kept below ``--keep`` with the traceback beside it.
+is exceeded; its log is kept below ``--keep`` with the traceback beside it. Logs are used in worker processes, which
+are killed where a compiled loop does not come back.
 """
 
 from __future__ import annotations
@@ -18,13 +19,18 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+
+import fuzz_structures  # noqa: E402 - beside this script
 
 Random = np.random.Generator
 EXTREMES = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, 1 << 40, (1 << 63) - 1]
@@ -149,27 +155,60 @@ def database(path: Path, rng: Random) -> str:
     return f"SQL {statement.split()[0]}"
 
 
+KINDS = (("mcap", "none"), ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"),
+         ("db3", "zstd"))  # fmt: skip
+
+
+def name_of(kind: int) -> str:
+    """Return the name of a log of a kind."""
+    return "log" + {"mcap": ".mcap", "bag": ".bag", "db3": ""}[KINDS[kind][0]]
+
+
+def write(folder: Path, columns: dict[str, np.ndarray], kind: int, wheels: str) -> Path:
+    """Write a log."""
+    from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+
+    container, compression = KINDS[kind]
+    options = WriteOptions(
+        container=container, compression=compression, wheels=wheels, wheel_radius_m=0.165, track_width_m=0.55
+    )
+    return write_log(folder / name_of(kind), SensorColumns(**columns), options)
+
+
+@cache
+def clean_log(count: int, kind: int, wheels: str) -> Path:
+    """Return a folder with a log that is whole: writing one takes as long as reading it."""
+    from dataclasses import asdict
+
+    from tests.property.test_fuzz_logs import drive
+
+    folder = Path(tempfile.mkdtemp(prefix="clean-", dir=scratch()))
+    write(folder, asdict(drive(count)), kind, wheels)
+    return folder
+
+
+@cache
+def scratch() -> Path:
+    """Return the folder of this run, in memory where that can be."""
+    memory = Path("/dev/shm")  # noqa: S108 - the fastest place for small files
+    return Path(tempfile.mkdtemp(prefix="icrtool-fuzz-", dir=memory if memory.is_dir() else None))
+
+
 def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
     """Write a short drive in a random container and damage it; return it with what was done."""
     from dataclasses import asdict
 
-    from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
     from tests.property.test_fuzz_logs import WHEELS, drive
 
-    columns = asdict(drive(int(rng.choice([2, 30, 100, 100, 400]))))
+    count, kind, wheels = int(rng.choice([2, 30, 100, 100, 400])), int(rng.integers(7)), str(rng.choice(WHEELS))
     done = []
-    if rng.random() < 0.5:
+    if rng.random() < 0.3:
+        columns = asdict(drive(count))
         done = [COLUMN_MUTATIONS[int(rng.integers(3))](columns, rng) for _ in range(int(rng.integers(1, 4)))]
-    container, compression = (
-        ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"), ("db3", "zstd")
-    )[int(rng.integers(6))]  # fmt: skip
-    options = WriteOptions(
-        container=container, compression=compression, wheels=str(rng.choice(WHEELS)),
-        wheel_radius_m=0.165, track_width_m=0.55,
-    )  # fmt: skip
-    path = write_log(
-        folder / ("log" + {"mcap": ".mcap", "bag": ".bag", "db3": ""}[container]), SensorColumns(**columns), options
-    )
+        path = write(folder, columns, kind, wheels)
+    else:
+        path = Path(shutil.copytree(clean_log(count, kind, wheels), folder, dirs_exist_ok=True)) / name_of(kind)
+    container = KINDS[kind][0]
     if not done or rng.random() < 0.3:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
         target = files[int(rng.integers(len(files)))]
@@ -178,7 +217,10 @@ def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
         else:
             content = bytearray(target.read_bytes())
             for _ in range(int(rng.integers(1, 6))):
-                if target.suffix == ".yaml":
+                structure = {".mcap": fuzz_structures.mcap, ".bag": fuzz_structures.bag}.get(target.suffix)
+                if structure is not None and rng.random() < 0.6:
+                    done.append(structure(content, rng))
+                elif target.suffix == ".yaml":
                     at = place(content, rng)
                     content[at:at] = YAML[int(rng.integers(len(YAML)))]
                     done.append("YAML")
@@ -216,10 +258,17 @@ def use(path: Path, *, whole: bool) -> str:
     return stage
 
 
-def work(job: tuple[int, bool, float, int, str, bool]) -> tuple[int, str, list[str], str, float, set[str]]:
-    """Make and use one log in this process; return seed, outcome, mutations, traceback, CPU seconds and functions."""
+Job = tuple[int, bool, float, int, str, bool]
+Result = tuple[int, str, list[str], str, float, set[str]]
+
+
+def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
+    """Make and use one log in this process; return seed, outcome, mutations, traceback, CPU seconds and functions.
+
+    `begun` is called when it is made.
+    """
     seed, whole, seconds, megabytes, keep, measure = job
-    folder = Path(tempfile.mkdtemp(prefix="icrtool-fuzz-"))
+    folder = Path(tempfile.mkdtemp(dir=scratch()))
     reached: set[str] = set()
     done: list[str] = []
     outcome, text = "", ""
@@ -228,6 +277,7 @@ def work(job: tuple[int, bool, float, int, str, bool]) -> tuple[int, str, list[s
         path, done = make_log(folder, np.random.default_rng(seed))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         began = time.process_time()
+        begun()
         signal.signal(signal.SIGPROF, too_long)
         signal.setitimer(signal.ITIMER_PROF, seconds)
         if measure:
@@ -277,9 +327,100 @@ def functions() -> Iterator[str]:
                 yield from (f"{file.relative_to(ROOT)}:{each.co_qualname}" for each in inner if "<" not in each.co_name)
 
 
-def limit(megabytes: int) -> None:
-    """Bound the memory of a worker, beyond what its libraries take."""
+def serve(connection: Connection, megabytes: int) -> None:
+    """Use logs in this process, whose memory is bounded beyond what its libraries take."""
     resource.setrlimit(resource.RLIMIT_AS, ((megabytes + 3000) << 20,) * 2)
+    while (job := connection.recv()) is not None:
+        connection.send(work(job, lambda: connection.send(None)))
+
+
+RENEWED = 500
+"""Logs a worker uses: what leaks is seen, and is not taken for the fault of one log."""
+
+WALL_FACTOR = 20
+
+
+class Worker:
+    """A process that uses logs; where it does not come back or dies, that is a finding of its log."""
+
+    def __init__(self, megabytes: int) -> None:
+        context = get_context("fork")
+        self.connection, theirs = context.Pipe()
+        self.process: BaseProcess = context.Process(target=serve, args=(theirs, megabytes), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.job: Job | None = None
+        self.left = RENEWED
+        self.cpu_s, self.wall_s = 0.0, 0.0
+
+    def give(self, job: Job) -> None:
+        """Have it use a log."""
+        self.job, self.left = job, self.left - 1
+        self.mark()
+        self.connection.send(job)
+
+    def mark(self) -> None:
+        """Count time from here."""
+        self.cpu_s, self.wall_s = self.cpu(), time.monotonic()
+
+    def cpu(self) -> float:
+        """Return the CPU time of the process [s], 0 where it is gone."""
+        try:
+            fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(fields[11]) + int(fields[12])) / 100
+
+    def result(self) -> Result | None:
+        """Return what became of the log; None where nothing is known yet."""
+        if self.job is None:
+            return None
+        seconds = self.job[2]
+        if not self.connection.poll():
+            used = self.cpu() - self.cpu_s
+            if used < 2 * seconds and time.monotonic() - self.wall_s < WALL_FACTOR * seconds:
+                return None
+            self.end()
+            return self.job[0], "FOUND", [], f"killed after {used:.1f} s CPU", used, set()
+        try:
+            answer: Result | None = self.connection.recv()
+        except EOFError:
+            self.process.join()
+            code = self.process.exitcode
+            self.end()
+            return self.job[0], "FOUND", [], f"process died ({code})", 0.0, set()
+        if answer is None:
+            self.mark()
+        return answer
+
+    def end(self) -> None:
+        """End the process."""
+        self.left = 0
+        self.process.kill()
+        self.process.join()
+
+
+def use_all(jobs: Iterator[Job], count: int, megabytes: int) -> Iterator[Result]:
+    """Yield what becomes of logs in `count` processes."""
+    workers = [Worker(megabytes) for _ in range(count)]
+    more = True
+    while more or any(worker.job is not None for worker in workers):
+        for i in range(count):
+            if workers[i].job is None and more:
+                job = next(jobs, None)
+                more = job is not None
+                if job is not None:
+                    if not workers[i].left:
+                        workers[i].end()
+                        workers[i] = Worker(megabytes)
+                    workers[i].give(job)
+        wait([worker.connection for worker in workers if worker.job is not None], 0.2)
+        for worker in workers:
+            if (found := worker.result()) is not None:
+                worker.job = None
+                yield found
+    for worker in workers:
+        worker.end()
 
 
 def main() -> int:
@@ -292,28 +433,37 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=5.0, help="CPU time a log may take")
     parser.add_argument("--megabytes", type=int, default=1000, help="memory a log may take")
     parser.add_argument("--coverage", type=int, default=50, help="functions reached are recorded for one of so many")
+    parser.add_argument("--minutes", type=float, default=0.0, help="stop after this time; default: never")
     parser.add_argument("--keep", default="", help="directory for the logs of findings")
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.logs)
-    jobs = [
+    jobs: Iterator[Job] = (
         (seed, seed % given.fitted == 0, given.seconds, given.megabytes, given.keep, seed % given.coverage == 0)
         for seed in seeds
-    ]
+    )
     # The kernels are loaded once, outside the limits.
     work((0, True, 600.0, 4000, "", False))
     counts: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
     reached: set[str] = set()
     slowest = (0.0, 0)
-    # Forked workers share the kernels that are loaded; each is renewed now and then, so that what leaks is seen.
-    with get_context("fork").Pool(given.jobs, limit, (given.megabytes,), maxtasksperchild=500) as pool:
-        for seed, outcome, done, text, used, names in pool.imap_unordered(work, jobs, chunksize=5):
-            counts[outcome] += 1
-            kinds.update(done)
-            reached |= names
-            slowest = max(slowest, (used, seed))
-            if outcome == "FOUND":
-                print(f"seed {seed}: {done}: {text.strip().splitlines()[-1]}", flush=True)
+    begun = time.monotonic()
+    # Forked workers share the kernels and the clean logs.
+    for seed, outcome, done, text, used, names in use_all(jobs, given.jobs, given.megabytes):
+        counts[outcome] += 1
+        kinds.update(one.split(" ")[0] if len(one) > 30 else one for one in done)
+        reached |= names
+        slowest = max(slowest, (used, seed))
+        if outcome == "FOUND":
+            print(f"seed {seed}: {done}: {text.strip().splitlines()[-1]}", flush=True)
+            if given.keep and not (Path(given.keep) / str(seed)).exists():
+                place = Path(given.keep) / str(seed)
+                place.mkdir(parents=True)
+                make_log(place, np.random.default_rng(seed))
+        if given.minutes and time.monotonic() - begun > 60 * given.minutes:
+            print(f"stopped after {given.minutes:g} minutes; go on with --first {max(seed, given.first) + 1}")
+            break
+    shutil.rmtree(scratch(), ignore_errors=True)
     every = set(functions())
     print("outcomes:", ", ".join(f"{count} {name}" for name, count in counts.most_common()))
     print("mutations:", ", ".join(f"{count} {name}" for name, count in kinds.most_common(30)))

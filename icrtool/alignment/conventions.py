@@ -41,6 +41,8 @@ ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
+CHORD_S, LEAST_CHORD_M, CHORD_IN_POSITION_STD = 2.0, 0.3, 4.0
+"""Without a heading, distances are compared over this time, where the robot moves clearly."""
 
 
 class Convention(NamedTuple):
@@ -141,6 +143,30 @@ def decide_conventions(
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
     return Decision(chosen, named - costs[chosen][0], ranked[1] if close else None)
+
+
+def senses_by_distance(drive: DriveArrays) -> Convention:
+    """Return whether one side counts backwards, by distances alone: for a drive without a heading.
+
+    Of two such sides, that one is reversed with which the robot drives forward.
+    """
+    t = drive.fix_t
+    rows = np.unique(np.floor(t / CHORD_S), return_index=True)[1]
+    chord = np.abs(np.diff(drive.fix[rows]))
+    left, right = (
+        np.diff(np.interp(t[rows], drive.wheel_t, np.concatenate([[0.0], np.cumsum((speed * drive.wheel_dt)[:-1])])))
+        for speed in (drive.v_left, drive.v_right)
+    )
+    moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
+    if np.count_nonzero(moved) < FEWEST_WINDOWS:
+        return AS_NAMED
+    as_named, reversed_ = (
+        float(np.median(np.abs(chord - np.abs(both) / 2)[moved])) for both in (left + right, left - right)
+    )
+    if reversed_ > as_named / 2:
+        return AS_NAMED
+    forward = float((left - right).sum()) > 0.0
+    return AS_NAMED._replace(sign_right=-1) if forward else AS_NAMED._replace(sign_left=-1)
 
 
 TIE = 9.0

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.estimator import SLIPPING, USUAL_APART_S, AlignmentFit
 from icrtool.config import Config
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
-SIGNIFICANT_SIGMAS = 2.5
-SAME_CLOCK_SIGMAS = 2.0
-"""Heading and position whose delays differ by less lag or lead together: it is the wheels' clock then."""
-
-SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.06
+SIGNIFICANT_SIGMAS, APART_SIGMAS = 2.5, 2.0
+SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1
 """A robot follows its wheels by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
 
@@ -25,11 +23,14 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
+    def differs_from(self, usual_s: float, sigmas: float = SIGNIFICANT_SIGMAS) -> bool:
+        """Return whether it is known well, and is not the usual one."""
+        return self.std_s < LARGEST_STD_S and abs(self.value_s - usual_s) > sigmas * self.std_s
+
     @property
     def is_clear(self) -> bool:
-        """Whether it is certain and large enough to be corrected."""
-        certain = self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
-        return certain and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
+        """Whether it is certain and more than a robot's response to its wheels."""
+        return self.differs_from(0.0) and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -86,24 +87,13 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
     topics = {stream.role: stream.topic for stream in log.streams}
     together = "gnss" in topics and topics["gnss"] == topics.get("heading")
     given = {"heading": config.frames.heading_delay_s, "position": config.frames.reference_delay_s}
-    applied, notes = {}, []
-    for what, key in (("heading", "frames.heading_delay_s"), ("position", "frames.reference_delay_s")):
-        setting, delay = given[what], found[what]
-        applied[what] = 0.0
+    applied, notes = {"heading": 0.0, "position": 0.0}, []
+    if field and fit is not None and fit.slip_std <= SLIPPING:
+        applied = _clear_delays(found["heading"], found["position"], apart, together=together)
+        notes = _delay_notes(log.name, applied, {**found, "apart": apart}, given, together=together)
+    for what, setting in given.items():
         if field and setting != "auto":
             applied[what] = setting
-        elif field and what == "position" and applied["heading"] and _on_one_clock(fit, delay):
-            applied[what] = applied["heading"]
-            notes.append(f"{log.name}: the position is corrected alike: nothing shows that its delay differs")
-        elif field and delay.is_clear and (what == "heading" or together or applied["heading"] or _differs(apart)):
-            applied[what] = delay.value_s
-            lags = ("lag" if together else "lags") if delay.value_s > 0 else ("lead" if together else "leads")
-            subject = "the position and its heading" if together else f"the {what}"
-            if not (together and what == "heading"):
-                notes.append(
-                    f"{log.name}: {subject} {lags} the wheels by {abs(delay.value_s):.2f} ± {delay.std_s:.2f} s: "
-                    f"corrected; {key} sets it"
-                )
     if together:
         applied["heading"] = 0.0
     shifted = delayed(log, applied["position"])
@@ -115,11 +105,6 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
         shifted, found["heading"], found["position"], apart, together,
         applied["heading"], applied["position"], tuple(notes),
     )  # fmt: skip
-
-
-def _differs(apart: Delay) -> bool:
-    """Return whether the position has a delay of its own: the heading, which has none, shares a robot's response."""
-    return abs(apart.value_s) > SIGNIFICANT_SIGMAS * apart.std_s
 
 
 def delayed(log: RobotLog, delay_s: float) -> RobotLog:
@@ -138,9 +123,37 @@ def delayed(log: RobotLog, delay_s: float) -> RobotLog:
     return replace(log, gnss=gnss, heading=heading)
 
 
-def _on_one_clock(fit: AlignmentFit | None, position: Delay) -> bool:
-    """Return whether a delay of the heading is one of the wheels: the position shows none of its own."""
-    if fit is None or position.is_clear:
-        return False
-    apart, std = fit.estimate("position_after_heading")
-    return abs(apart) < SAME_CLOCK_SIGMAS * std
+def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> dict[str, float]:
+    """Return the delays to correct: that against the wheels, and that of position and heading against each other.
+
+    Of two streams that are apart, the one that lags the wheels is moved: stamps that lead need a clock that is wrong.
+    """
+    if together:
+        common = position.value_s if position.is_clear else 0.0
+        return {"heading": common, "position": common}
+    is_apart = apart.differs_from(USUAL_APART_S, APART_SIGMAS)
+    if is_apart and apart.value_s < 0.0:
+        late = position.value_s if position.is_clear else 0.0
+        return {"heading": late - apart.value_s, "position": late}
+    late = heading.value_s if heading.is_clear else 0.0
+    return {"heading": late, "position": late + (apart.value_s if is_apart else 0.0)}
+
+
+def _delay_notes(
+    name: str, applied: dict[str, float], found: dict[str, Delay], given: Mapping[str, float | str], *, together: bool
+) -> list[str]:
+    """Return a line for each stream that was moved."""
+    notes = []
+    keys = {"heading": "frames.heading_delay_s", "position": "frames.reference_delay_s"}
+    for what, key in keys.items():
+        value = applied[what]
+        if value == 0.0 or given[what] != "auto" or (together and what == "heading"):
+            continue
+        if not together and what == "position" and value == applied["heading"]:
+            notes.append(f"{name}: the position is corrected alike: nothing shows that its delay differs")
+            continue
+        subject = "the position and its heading" if together else f"the {what}"
+        lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
+        std = (found[what] if found[what].differs_from(0.0) else found["apart"]).std_s
+        notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
+    return notes

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
-from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.estimator import SLIPPING, AlignmentFit
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.tables import RobotLog, WheelSamples
@@ -196,6 +196,9 @@ def find_scales(
     if fit is None:
         return (1.0, 1.0), []
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
+    if fit.slip_std > SLIPPING:
+        slip = f"the wheels slip: their distance differs from that of the positions by {100 * fit.slip_std:.0f} % every"
+        return (1.0, 1.0), [f"{slip} {fit.windows.length_m:.0f} m; no scale and no delay is corrected"]
     may = corrects and sound and not given
     scale, notes = _common_scale(fit, may=may)
     difference, std = _side_difference(fit)

@@ -15,13 +15,19 @@ from icrtool.records.tables import Bools, Floats, Ints, PositionFixes, RobotLog,
 WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
-"""The distance by the position reference is compared with that of the wheels over straight windows of this length."""
+STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
+"""The distance by the position reference is compared with that of the wheels over windows of this length: straight
+ones, in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
 
 FASTEST_MPS = 100.0
 """No robot on wheels or tracks is faster: a number over it is damage, and would make a distance of any length."""
 
 SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
 """A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
+
+PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
+"""A robot stands where 95 % of its positions lie within this, or within so many of their standard deviations, while its
+wheels turn for this share of the time."""
 
 UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
@@ -47,13 +53,17 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     ConfigError
         A radius or resolution that is needed and cannot be found from the log.
     DataError
-        Fewer than two usable samples.
+        Fewer than two usable samples; wheels without a unit that turn while the robot stands.
     """
     wheels = log.wheels
     if wheels.unit == "mps":
         return log
     topic = next((stream.topic for stream in log.streams if stream.role == "wheels"), "wheels")
-    factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+    try:
+        factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+    except ConfigError:
+        refuse_parked(log)
+        raise
     warnings = [f"{log.name}: {note}" for note in estimated]
     with np.errstate(over="ignore"):
         left, right = wheels.left * factor, wheels.right * factor
@@ -80,6 +90,33 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     return replace(log, wheels=samples, streams=streams, warnings=(*log.warnings, *warnings))
 
 
+def refuse_parked(log: RobotLog) -> None:
+    """Raise where the wheels turn and the positions stay within their noise: a robot on a stand.
+
+    For logs that show no heading or no unit, which a robot on a stand shows neither; one that spins on the spot may.
+
+    Raises
+    ------
+    DataError
+        It stands.
+    """
+    turns = (log.wheels.left != 0.0) | (log.wheels.right != 0.0)
+    place = log.gnss.north_m + 1j * log.gnss.east_m
+    if not len(place) or float(np.mean(turns)) < TURNING_SHARE:
+        return
+    variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
+    known = variance[np.isfinite(variance)]
+    noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+    away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
+    reach_m = float(np.percentile(away, 95))
+    if reach_m < max(PARKED_M, PARKED_SIGMAS * noise_m):
+        raise DataError(
+            log.name,
+            "the wheels turn and the robot does not move",
+            f"95 % of the positions lie within {reach_m:.2f} m: is it on a stand?",
+        )
+
+
 def _spikes(speed: Floats) -> Bools:
     """Mark single samples (n,) far faster than those before and after them, and than almost all others."""
     size = np.abs(speed)
@@ -92,7 +129,13 @@ def _spikes(speed: Floats) -> Bools:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over straight windows; None where too few are straight."""
+    """Compare distances by reference and wheels over windows; None where too few windows show one.
+
+    Notes
+    -----
+    Straight windows where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
+    before and after. Senses of the wheels do not matter.
+    """
     if len(gnss.stamp_ns) < 2:
         return None
     begin, end, window = max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9)
@@ -108,14 +151,23 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     sides = []
     for speed in (left, right):
         travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])
-        sides.append(np.diff(np.interp(moments, stamps, travelled)))
+        sides.append(np.abs(np.diff(np.interp(moments, stamps, travelled))))
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
-    chord = np.hypot(np.diff(gnss.north_m[places]), np.diff(gnss.east_m[places]))
+    step = np.diff(gnss.north_m[places]) + 1j * np.diff(gnss.east_m[places])
+    chord = np.abs(step)
     whole = np.abs(np.diff(moments) / 1e9 - WINDOW_S) < WINDOW_S / 4
-    straight = whole & (turn < 0.1 * np.abs(distance)) & (chord > LEAST_MOVE_M) & (np.abs(distance) > 0)
+    usable = whole & (chord > LEAST_MOVE_M) & (distance > 0)
+    straight = usable & (turn < STRAIGHT * distance)
+    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+        bend = np.full(len(step), np.inf)
+        bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
+        beside = usable.copy()
+        beside[1:-1] &= usable[2:] & usable[:-2]
+        straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
+        chord[straight] /= np.sinc(bend[straight] / 2 / math.pi)
     if np.count_nonzero(straight) < FEWEST_WINDOWS:
         return None
-    ratio = chord[straight] / np.abs(distance[straight])
+    ratio = chord[straight] / distance[straight]
     centre = float(np.median(ratio))
     return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)), len(ratio))
 
@@ -141,15 +193,15 @@ def _metres_per_unit(
     if scale is None and unit == "unknown":
         raise ConfigError(
             "wheels.quantity",
-            f"{topic} names no unit, and the log has no straight driving to find it from",
-            "drive straight for some metres; where they are ticks, give --set wheels.quantity=counts",
+            f"{topic} names no unit, and the log has too little driving to find it from",
+            "drive for half a minute; where they are ticks, give --set wheels.quantity=counts",
         )
     lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
     if scale is None:
         raise ConfigError(
             lacking,
             f"needed to read {topic}, which is in {unit}",
-            f"give it with --set {lacking}=…; the log has no straight driving to find the scale from",
+            f"give it with --set {lacking}=…; the log has too little driving to find the scale from",
         )
     how = f"{_SCALE_WORDS.get(unit, 'travel of a unit of the wheels')} {_with_std(scale)} m"
     how += " (estimated from the position reference)"

@@ -23,6 +23,9 @@ TWIST_OVER_M = 1.0
 SMALLEST_VARIANCE = 1e-6
 FEWEST_WINDOWS = 10
 
+LARGEST_SHARE = 0.5
+"""A calibration whose 95 % error is more than this share of the distance is not fit for use."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExportNumbers:
@@ -33,6 +36,8 @@ class ExportNumbers:
     log : what it was fitted to; begin_ns : stamp of the first state; way_m : driven
     model, created : what is recommended, and when it was fitted
     separation_multiplier : (y_r - y_l) / b of the recommended model
+    twist_width_m : separation with which the log's odometry was made, its multiplier included; None where it is not
+        known
     left_radius_multiplier, right_radius_multiplier : radius over the configured one, configured scales included
     icrs_m, icr_std_m : y_icr_right, y_icr_left, x_icr
     pose_variance : (3,) after `POSE_AFTER_M` [m^2, m^2, rad^2], held out
@@ -66,6 +71,28 @@ class ExportNumbers:
     p95_m: float
     full_p95_m: float
     doubts: tuple[str, ...]
+    twist_width_m: float | None = None
+
+    @property
+    def factor_to_old(self) -> float | None:
+        """The multiplier over the one that the log's odometry was made with, None where that is not known."""
+        if self.twist_width_m is None:
+            return None
+        return self.separation_multiplier * self.track_width_m / self.twist_width_m
+
+
+def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
+    """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
+    reasons = [one for one in calibration.warnings if one.startswith("not usable")]
+    p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
+    _, without = calibration.held_out_m("no_slip", POSE_AFTER_M)
+    if p95 > LARGEST_SHARE * POSE_AFTER_M:
+        reasons.append(f"95 % of the held-out errors after {POSE_AFTER_M:g} m lie within {p95:.1f} m only")
+    if expected >= without:
+        reasons.append(f"held out it is no better than no slip: {expected:.2f} m and {without:.2f} m expected")
+    if "omega_w" in calibration.fitted.not_shown:
+        reasons.append("the driving did not show how the robot turns (omega_w)")
+    return tuple(reasons)
 
 
 def export_numbers(calibration: Calibration) -> ExportNumbers:
@@ -83,7 +110,8 @@ def export_numbers(calibration: Calibration) -> ExportNumbers:
         raise DataError(calibration.name or names, "too short to measure the error growth", advice)
     numbers = calibration.controller_numbers()
     geometry, covariance = calibration.geometry()
-    doubts = [
+    doubts = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
+    doubts += [
         f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
         for name in calibration.fitted.not_shown
     ]
@@ -109,6 +137,7 @@ def export_numbers(calibration: Calibration) -> ExportNumbers:
         p95_m=errors.p95_m,
         full_p95_m=errors.full_p95_m,
         doubts=(*calibration.warnings, *doubts),
+        twist_width_m=calibration.robot.get("twist_width_m"),
     )
 
 

@@ -45,7 +45,16 @@ def calibrate_runs(runs: Sequence[Run]) -> CalibrationResult:
 
 def robot_of(run: Run) -> dict[str, Any]:
     """Return what a calibration holds of the robot of a run, but for its track width."""
-    return {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
+    robot: dict[str, Any] = {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
+    if run.config.wheels.twist_width_m is not None and _from_twists(run):
+        robot["twist_width_m"] = run.config.wheels.twist_width_m
+    return robot
+
+
+def _from_twists(run: Run) -> bool:
+    """Return whether the wheels were read from the twists of an odometry."""
+    stream = next((one for one in run.summary["streams"] if one["role"] == "wheels"), None)
+    return stream is not None and "Odometry" in stream["message_type"]
 
 
 def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
@@ -54,8 +63,7 @@ def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
     if alone:
         warnings += [] if run.usable else [f"not usable: {run.summary['unusable_because']}"]
         warnings += run.summary["excitation"]["sentences"]
-    stream = next((one for one in run.summary["streams"] if one["role"] == "wheels"), None)
-    if stream is not None and "Odometry" in stream["message_type"]:
+    if _from_twists(run) and run.config.wheels.twist_width_m is None:
         warnings.append(
             "the wheels were read from odometry twists, which hold the controller's own multipliers: "
             "these numbers are right only where b and radius are those the twists were made with"

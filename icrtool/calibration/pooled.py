@@ -274,18 +274,22 @@ def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
         errors: Floats = np.full(trials.ends.shape, np.nan)
         distance = recording.drive.distance
         first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
-        # a trial that ends where a block does touches no more of it
-        last = np.maximum(np.searchsorted(edges, distance[np.maximum(trials.ends, 0)], side="left") - 1, first[:, None])
-        some = trials.ends >= 0
-        for a, b in np.unique(np.column_stack([np.broadcast_to(first[:, None], last.shape)[some], last[some]]), axis=0):
-            key = (int(a), int(b))
-            if key not in found:
-                found[key] = rates_without(*key)
-            if (known := found[key]) is not None:
-                mine = (first[:, None] == a) & (last == b) & some
-                rows = mine.any(axis=1)
-                part = Trials(trials.starts[rows], np.where(mine[rows], trials.ends[rows], -1))
-                errors[rows] = np.where(mine[rows], trial_errors(recording, part, *known), errors[rows])
+        # Block by block of the start: tables of all trials would need more memory than their errors.
+        for a in np.flatnonzero(np.bincount(first)).tolist():
+            mine = np.flatnonzero(first == a)
+            ends = trials.ends[mine]
+            # a trial that ends where a block does touches no more of it
+            last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
+            last[ends < 0] = -1
+            for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
+                if (a, b) not in found:
+                    found[a, b] = rates_without(a, b)
+                if (known := found[a, b]) is not None:
+                    of_pair = last == b
+                    kept = of_pair.any(axis=1)
+                    rows, there = mine[kept], of_pair[kept]
+                    part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
+                    errors[rows] = np.where(there, trial_errors(recording, part, *known), errors[rows])
         return errors
 
     return errors_of

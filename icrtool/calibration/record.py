@@ -16,14 +16,11 @@ import numpy as np
 from icrtool.calibration.measured_errors import (
     ControllerErrors,
     ErrorSources,
-    controller_errors_of,
-    error_sources_of,
 )
 from icrtool.motion.models import (
     MotionModel,
     TrackGeometry,
     TypicalDrive,
-    find_model,
     track_geometry,
     twist,
     wheel_motion,
@@ -316,45 +313,3 @@ def _plain(one: FittedModel) -> dict[str, Any]:
         },
         "covariance": one.covariance.tolist(),
     }
-
-
-def calibration_of(document: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that a file's plain data hold.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        They are not what `Calibration.summary` gives.
-    """
-    if document["schema"] != CALIBRATION_SCHEMA:
-        raise ValueError(f"schema {document['schema']!r}")
-    gyro = document["gyro"]
-    if not float(document["robot"]["track_width_m"]) > 0.0:
-        raise ValueError("track width")
-    return Calibration(
-        robot=dict(document["robot"]),
-        fitted=_fitted(document["model"], document),
-        others={name: _fitted(name, one) for name, one in document["models"].items()},
-        gyro=None if gyro is None else _fitted(gyro["model"], gyro),
-        typical=TypicalDrive(**document["typical"]),
-        why=str(document["why"]),
-        logs=tuple(CalibrationLog(**log) for log in document["logs"]),
-        held_out=tuple(HeldOutScore(**score) for score in document["held_out"]),
-        controller=controller_errors_of(document["controller"]),
-        warnings=tuple(str(warning) for warning in document["warnings"]),
-        created=str(document["created"]),
-        tool_version=str(document["tool_version"]),
-        sources=error_sources_of(document.get("error_sources")),
-    )
-
-
-def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:
-    model = find_model(name)
-    k = len(model.terms)
-    if tuple(document["terms"]) != model.terms:
-        raise ValueError(f"terms of {name}")
-    parameters = np.array([document["parameters"][term]["value"] for term in model.terms], np.float64)
-    covariance = np.array(document["covariance"], np.float64).reshape(k, k)
-    if not (np.isfinite(parameters).all() and np.isfinite(covariance).all()):
-        raise ValueError(f"parameters of {name}")
-    return FittedModel(model, parameters, covariance)

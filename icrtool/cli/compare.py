@@ -9,6 +9,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -71,7 +72,7 @@ def command(
         click.echo(format_transfer(transfer))
 
 
-def _groups(sources: tuple[str, ...]) -> dict[str, list[Path]]:
+def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
     """Return the places of each group.
 
     Raises
@@ -81,7 +82,7 @@ def _groups(sources: tuple[str, ...]) -> dict[str, list[Path]]:
     """
     from icrtool.errors import ConfigError
 
-    places: dict[str, list[Path]] = {}
+    places: dict[LogText, list[Path]] = {}
     for source in sources:
         name, path = _named(source)
         places.setdefault(name, []).append(path)
@@ -90,12 +91,12 @@ def _groups(sources: tuple[str, ...]) -> dict[str, list[Path]]:
     return places
 
 
-def _named(source: str) -> tuple[str, Path]:
+def _named(source: str) -> tuple[LogText, Path]:
     """Return the group's name and the place of one argument."""
     name, sign, place = source.partition("=")
     if sign and name and place and not Path(source).exists():
-        return name, Path(place)
-    return Path(source).name or source, Path(source)
+        return LogText(name), Path(place)
+    return LogText(Path(source).name or source), Path(source)
 
 
 def _expand(place: Path) -> list[Path]:

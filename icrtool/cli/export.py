@@ -21,12 +21,15 @@ TRAJECTORIES = ("evo", "kitti")
 TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 
+ALL_THE_SAME = "--force exports it all the same"
+
+
 @click.command("export")
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=click.Path(path_type=Path))
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
               help="Write it here. For evo and kitti, DIR: a file for each path of the run.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Also a calibration of a run whose ICRs are not usable.")
+@click.option("--force", is_flag=True, help="Also a calibration that is not fit for use.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
 
@@ -141,18 +144,28 @@ def _run(source: Path | None) -> Run:
 
 
 def _calibration(source: Path | None, *, force: bool) -> Calibration:
-    """Read a calibration file, or calibrate from a run that is usable."""
+    """Read a calibration file, or calibrate from a run; one that is not fit for use is refused without `force`."""
+    from icrtool.calibration.controller_numbers import unfit_reasons
+    from icrtool.errors import DataError
+
+    name, found = _read_calibration(source, force=force)
+    if (reasons := unfit_reasons(found)) and not force:
+        raise DataError(name, f"not fit for use: {reasons[0]}", f"calibrate with other logs; {ALL_THE_SAME}")
+    return found
+
+
+def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibration]:
     from icrtool.output.stored_run import newest_run, open_run
 
     if source is not None and source.is_file() and source.suffix == ".json":
         from icrtool.output.calibration_file import open_calibration
 
-        return open_calibration(source)
+        return source.name, open_calibration(source)
     from icrtool.calibration.from_runs import calibrate
     from icrtool.errors import DataError
 
     run = open_run(source if source is not None else newest_run(RUNS))
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.summary['unusable_because']}"
-        raise DataError(run.name, why, "drive again, with turns to both sides; --force exports it all the same")
-    return calibrate(run)
+        raise DataError(run.name, why, f"drive again, with turns to both sides; {ALL_THE_SAME}")
+    return run.name, calibrate(run)

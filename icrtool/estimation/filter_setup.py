@@ -36,6 +36,9 @@ PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
 PAPER_INITIAL_ICR_STD_M = 1.0
 """Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
 
+FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
+"""Bounds of a warm start: those that a configured start has."""
+
 GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
 """How the pose may move through a gap in the wheel data, as a random walk over one second."""
@@ -214,8 +217,20 @@ def _start_state(
     x0 = np.array([north, east, psi, *icrs[0]])
     P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], *(icrs[1] ** 2)])
     if warm_start is not None:
+        _check_warm_start(warm_start)
         x0[3:], P0[3:, 3:] = warm_start.icrs_m, warm_start.covariance_m2
     return x0, P0
+
+
+def _check_warm_start(start: WarmStart) -> None:
+    """Refuse ICRs and a covariance that no run ends with."""
+    icrs, covariance = np.asarray(start.icrs_m, np.float64), np.asarray(start.covariance_m2, np.float64)
+    if icrs.shape != (3,) or not (np.abs(icrs) <= FARTHEST_START_M).all():
+        found = ", ".join(f"{value:.4g}" for value in icrs.ravel()[:3])
+        raise ConfigError("warm start", f"its ICRs are {found} m", f"each lies within {FARTHEST_START_M:g} m")
+    sound = covariance.shape == (3, 3) and bool((np.abs(covariance) <= LARGEST_START_STD_M**2).all())
+    if not sound or np.linalg.eigvalsh(covariance).min() < -1e-9 * max(1.0, float(np.abs(covariance).max())):
+        raise ConfigError("warm start", "its covariance is none", "fit the log that it comes from again")
 
 
 def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Floats]:

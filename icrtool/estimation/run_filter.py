@@ -85,6 +85,9 @@ def run_filter(
     adapted = run_adaptively(sensors, config, warm_start, changes_s)
     sensors, setup, output = adapted.sensors, adapted.setup, adapted.output
     table = _states(sensors.wheels, output)
+    if table.fault:
+        advice = "check warm start and configuration, or cut the log there (--from, --to)"
+        raise DataError(sensors.name, f"the filter broke down: {table.fault}", advice)
     gnss = _outcome(
         sensors.fixes.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code,
         np.hypot(*output.gnss_residual.T),

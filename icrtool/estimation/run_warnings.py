@@ -8,6 +8,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
+from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
 from icrtool.estimation.observability import WORDS, Excitation
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
@@ -29,7 +30,9 @@ UNUSABLE_SHARE = 0.3
 """With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
 
 
-def unusable_reasons(excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome) -> list[str]:
+def unusable_reasons(
+    excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome, noise: ProcessNoise
+) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be."""
     hidden = [WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
@@ -37,6 +40,8 @@ def unusable_reasons(excitation: Excitation, gnss: MeasurementOutcome, heading: 
         share = rejected_share(outcome)
         if share > UNUSABLE_SHARE:
             reasons.append(f"{100 * share:.0f} % of the {word} rejected")
+    if noise.position_mps * STEP > LARGEST_POSITION_MPS:
+        reasons.append("the wheels explain next to nothing of the motion")
     return reasons
 
 

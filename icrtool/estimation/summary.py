@@ -51,9 +51,10 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    covariance, excitation = learned(filtered, config)
+    apart = measurements.findings.get("position_delay_against_heading_s")
+    covariance, excitation = learned(filtered, config, 0.0 if apart is None or apart.std is None else apart.std)
     multiplier = separation_multiplier(table, width) if width is not None else None
-    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading)
+    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
     warnings = [
         *measurements.warnings,
         *run_warnings(log.name, table, filtered.gnss, filtered.heading, multiplier),
@@ -118,8 +119,13 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     return document if config.filter.preset == "paper" else without_unlearned(document)
 
 
-def learned(filtered: Filtered, config: Config) -> tuple[Floats, Excitation]:
+def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation]:
     """Return the covariance (3, 3) of the final ICRs [m^2], and which of them the drive showed.
+
+    Parameters
+    ----------
+    clock_std_s : of the time between position and heading: at one speed, positions that lag look like an x_icr
+        further back
 
     Preset ``paper``: the filter's own covariance, and what the drive could show.
     """
@@ -133,13 +139,16 @@ def learned(filtered: Filtered, config: Config) -> tuple[Floats, Excitation]:
     covariance = final_covariance(
         windows, own, width_m=float(p[0] - p[1]), process_icr_mps=config.filter.process_icr_mps
     )
-    return covariance, withhold_unlearned(
+    excitation = withhold_unlearned(
         excitation,
         table,
         std_m=np.sqrt(np.diag(covariance)),
         start_std_m=filtered.start_std_m,
         least_icr_m=filtered.least_icr_m,
     )
+    turning = drive.dt_s * (drive.v_left - drive.v_right) ** 2
+    speed = float((turning * (drive.v_left + drive.v_right)).sum() / 2 / max(float(turning.sum()), 1e-12))
+    return covariance + np.diag([0.0, 0.0, (speed * clock_std_s) ** 2]), excitation
 
 
 def without_unlearned(document: dict[str, Any]) -> dict[str, Any]:

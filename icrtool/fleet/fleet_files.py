@@ -16,6 +16,7 @@ from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
 from icrtool.fleet.row import Row, columns_of
 from icrtool.output.atomic_file import atomic_file
 from icrtool.output.run_directory import json_bytes
+from icrtool.records.text import table_cell
 
 FLEET_SCHEMA = "icrtool/fleet/1"
 
@@ -120,8 +121,14 @@ def _csv(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([["" if cell is None else cell for cell in row] for row in rows])
+    writer.writerows([[_cell(cell) for cell in row] for row in rows])
     return text.getvalue().encode("utf-8", errors="backslashreplace")
+
+
+def _cell(value: Any) -> Any:  # noqa: ANN401 - text or a number
+    if isinstance(value, str):
+        return table_cell(value)
+    return "" if value is None else value
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:

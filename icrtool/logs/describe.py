@@ -67,7 +67,7 @@ def describe_log(log: RobotLog) -> str:
 
 def _topics(survey: Survey, *, everything: bool) -> list[str]:
     tables = {table.topic: table for table in survey.tables}
-    lines, width = [], max((len(channel.topic) for channel in survey.channels), default=0)
+    lines, width = [], max((len(str(channel.topic)) for channel in survey.channels), default=0)
     unused = 0
     for topic, channel in {channel.topic: channel for channel in survey.channels}.items():
         table = tables.get(topic)

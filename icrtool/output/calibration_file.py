@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration, calibration_of
+from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration
+from icrtool.calibration.stored import calibration_of
 from icrtool.errors import OutputError, RunError
 from icrtool.output.atomic_file import atomic_file
 from icrtool.output.run_directory import json_bytes
@@ -33,7 +34,7 @@ def open_calibration(file: Path | str) -> Calibration:
         return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as err:
         why = "not a calibration with a motion model"
         raise RunError(path, why, "make one with icrtool calibrate -o") from err
 
@@ -76,5 +77,5 @@ def calibration_file(place: Path) -> Path:
 def _is_ours(file: Path) -> bool:
     try:
         return bool(json.loads(file.read_bytes())["schema"] == CALIBRATION_SCHEMA)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False

@@ -105,7 +105,7 @@ def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours, of whatever version."""
     try:
         schema = json.loads((directory / REPORT_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
 

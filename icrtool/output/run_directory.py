@@ -20,6 +20,7 @@ from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
 from icrtool.records.events import EVENT_COLUMNS
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
+from icrtool.records.text import LogText
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -161,7 +162,7 @@ def is_run_directory(directory: Path) -> bool:
     """Return whether a directory is a run of ours, of whatever version."""
     try:
         schema = json.loads((directory / RUN_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
 
@@ -174,9 +175,18 @@ def events_csv(events: list[dict[str, Any]]) -> str:
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:
     """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
-    text = json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
     return (text + "\n").encode("utf-8", errors="backslashreplace")
+
+
+def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
+    if isinstance(value, dict):
+        return {key: _as_in_the_log(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_as_in_the_log(item) for item in value]
+    return value.raw if isinstance(value, LogText) else value
 
 
 def load_figures() -> None:

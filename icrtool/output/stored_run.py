@@ -28,9 +28,12 @@ from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.tables import Ints, States
-from icrtool.records.text import escaped
+from icrtool.records.text import LogText, escaped
 
 FIT_AGAIN = "fit the log again"
+
+NAMES = ("topic", "message_type")
+"""Keys of run.json whose texts stand there as in the log."""
 
 
 def open_run(path: str | Path) -> Run:
@@ -55,9 +58,14 @@ def open_run(path: str | Path) -> Run:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
         check_run_document(document)
+        config = _config(document["config"], directory)
+        # Keys that somebody removed have their defaults.
+        document["config"] = config.effective()
         table = _read_states(directory, STATES_FILES, sums)
         if table is None:
             raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
+        if table.fault:
+            raise ValueError(table.fault)
         losses = _spans(document["rtk_losses_ns"])
         facts = document["filter"]
         forward, right = facts["antenna_m"]
@@ -75,7 +83,7 @@ def open_run(path: str | Path) -> Run:
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
         run = Run(
             name=document["log"],
-            config=_config(document["config"], directory),
+            config=config,
             table=table,
             in_gap=np.isin(table.stamp_ns, _spans(document["wheel_gaps_ns"])[:, 0]),
             outages_ns=_spans(document["outages_ns"]),
@@ -161,7 +169,10 @@ def _read_document(directory: Path) -> dict[str, Any]:
 def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return plain data with all its texts escaped."""
     if isinstance(value, dict):
-        return {escaped(key): _escaped(item) for key, item in value.items()}
+        return {
+            escaped(key): LogText(item) if key in NAMES and isinstance(item, str) else _escaped(item)
+            for key, item in value.items()
+        }
     if isinstance(value, list):
         return [_escaped(item) for item in value]
     return escaped(value) if isinstance(value, str) else value

@@ -58,7 +58,7 @@ def is_study_directory(directory: Path) -> bool:
     """Return whether a directory is a study of ours, of whatever version."""
     try:
         schema = json.loads((directory / STUDY_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return False
     return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
 

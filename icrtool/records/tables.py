@@ -170,5 +170,19 @@ class States:
 
         return pd.DataFrame(self.columns())
 
+    @property
+    def fault(self) -> str:
+        """What no filter's states can be: none, not in the order of time, not finite; empty where nothing is wrong."""
+        import numpy as np
+
+        if not len(self):
+            return "there are no states"
+        if np.any(self.stamp_ns[1:] <= self.stamp_ns[:-1]):
+            return "its states are not in the order of time"
+        for name, values in self.columns().items():
+            if not np.isfinite(values).all():
+                return f"row {np.isfinite(values).argmin()} of its states has {name} that is not a finite number"
+        return ""
+
     def __len__(self) -> int:
         return len(self.stamp_ns)

@@ -67,6 +67,15 @@ def escaped(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+def table_cell(text: str) -> str:
+    """Return a text as a cell of a CSV table: escaped, and nothing that a spreadsheet takes for a formula.
+
+    A text that begins with ``=``, ``+``, ``-`` or ``@`` gets an apostrophe before it (OWASP, CSV injection).
+    """
+    shown = escaped(text)
+    return f"'{shown}" if shown.startswith(("=", "+", "-", "@")) else shown
+
+
 def shortened(text: str, longest: int) -> str:
     """Return a text of at most `longest` characters: where it is longer, an ellipsis replaces its middle."""
     if len(text) <= longest:

@@ -117,3 +117,17 @@ def test_a_calibration_file_has_no_paths(icrtool, tmp_path: Path) -> None:
     status, out, err = icrtool("export", "--for", "qgis", tmp_path / "season.json")
     assert (status, out) == (1, "")
     assert "icrtool fit" in err
+
+
+def test_a_calibration_that_is_not_fit_for_use_is_exported_by_force_only(icrtool, runs: Path) -> None:
+    from dataclasses import replace
+
+    import icrtool as library
+
+    good = library.calibrate(library.open_run(runs / "icrtool-runs" / "mower"))
+    bad = tuple(one._replace(p95_m=14.8) if one.model == "recommended" else one for one in good.held_out)
+    file = replace(good, held_out=bad).write(runs / "bad.json")
+    status, out, err = icrtool("export", "--for", "clearpath", file)
+    assert (status, out) == (1, "")
+    assert "not fit for use: 95 % of the held-out errors" in err
+    assert icrtool("export", "--for", "clearpath", "--force", file)[0] == 0

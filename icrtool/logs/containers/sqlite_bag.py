@@ -6,6 +6,7 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -178,17 +179,19 @@ class SqliteBag:
             raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(map(str, tables))) or 'none'}")
         definitions = self._read_definitions() if "message_definitions" in tables else {}
         channels = []
+        # A log may declare any number of topics; types and encodings are few.
+        type_named, text = cache(ros_type_name), cache(LogText)
         for number, topic, name, encoding in self._query(
             "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer' ORDER BY id"
         ).fetchmany(_MOST_TOPICS):
-            written, text = definitions.get(name, ("", ""))
+            written, definition = definitions.get(name, ("", ""))
             channels.append(
                 Channel(
                     id=number,
                     topic=LogText(str(topic)),
-                    message_type=ros_type_name(str(name)),
-                    encoding=LogText(str(encoding)),
-                    definition=text if written in ("ros2msg", "ros2idl") else "",
+                    message_type=type_named(str(name)),
+                    encoding=text(str(encoding)),
+                    definition=definition if written in ("ros2msg", "ros2idl") else "",
                     definition_format="idl" if written == "ros2idl" else "msg",
                 )
             )

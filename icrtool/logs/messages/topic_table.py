@@ -310,7 +310,8 @@ def _merged(group: list[TopicTable]) -> TopicTable:
         parts = [table.columns[path] for table in group]
         if path in group[0].texts:
             texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))
-            renumber = [np.array([*(texts[path].index(t) for t in table.texts[path]), -1]) for table in group]
+            places = {text: place for place, text in enumerate(texts[path])}
+            renumber = [np.array([*(places[text] for text in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
         columns[path] = _joined(parts, -1 if path in texts else 0)[order]
     return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)

@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.channel import Channel, some_of
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource, no_heading
@@ -97,7 +97,7 @@ def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
         return set()
     if topics.wheel_left is not None and topics.wheel_right is not None:
         return {topics.wheel_left, topics.wheel_right}
-    names = [channel.topic for channel in channels if channel.message_type in PAIR_TYPES]
+    names = dict.fromkeys(channel.topic for channel in channels if channel.message_type in PAIR_TYPES)
     found: set[str] = set()
     for left in names:
         right = right_twin(left, names)
@@ -338,7 +338,7 @@ def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> 
     if configured is not None:
         return f"{best.why}; configured"
     rest = [source.topic for source in sources if source is not best]
-    return f"{best.why}; chosen over {', '.join(rest[:3])}" if rest else best.why
+    return f"{best.why}; chosen over {some_of(rest[:3])}" if rest else best.why
 
 
 def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:

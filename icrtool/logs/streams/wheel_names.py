@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 
 _WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
 _OTHER_JOINTS = re.compile(
@@ -47,7 +48,7 @@ def _belongs_elsewhere(name: str) -> bool:
 
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
     """Return the topic whose name is `left_topic` with left replaced by right; None when there is none."""
-    existing = set(topics)
+    existing = topics if isinstance(topics, AbstractSet | Mapping) else set(topics)
     for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
         if old in left_topic:
             twin = left_topic.replace(old, new)

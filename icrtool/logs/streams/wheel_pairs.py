@@ -14,6 +14,7 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_sources import COMMANDED, Unit, WheelMotion, motion_of
 from icrtool.records.tables import Bools, Floats
+from icrtool.records.text import LogText
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
 """Message types that hold one number of one side."""
@@ -30,8 +31,8 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
 
     Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
     """
-    kind = " + ".join(dict.fromkeys((left.message_type, right.message_type)))
-    topic = left.topic + " + " + right.topic  # not shortened: it is compared with the configuration
+    kind = LogText(" + ".join(dict.fromkeys((left.message_type.raw, right.message_type.raw))))
+    topic = LogText(f"{left.topic.raw} + {right.topic.raw}")
     commanded = bool(COMMANDED.search(left.topic))
     score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
 

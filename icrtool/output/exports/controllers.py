@@ -144,7 +144,14 @@ def _header(numbers: ExportNumbers) -> list[str]:
         f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
     )
-    sentences = [origin, icrs, held_out, lost, *(f"WARNING: {_one_line(warning)}" for warning in numbers.doubts)]
+    sentences = [origin, icrs, held_out, lost]
+    if numbers.factor_to_old is not None and numbers.twist_width_m is not None:
+        old = numbers.twist_width_m / numbers.track_width_m
+        sentences.append(
+            f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
+            f"{numbers.factor_to_old:.4f} times the old"
+        )
+    sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.doubts]
     return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
 
 

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
-from icrtool.calibration.record import Calibration, calibration_of
+from icrtool.calibration.record import Calibration
+from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import metres_text, reach_text

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.calibration.pooled import recorded_rates, recording_of
-from icrtool.calibration.record import Calibration, calibration_of
+from icrtool.calibration.record import Calibration
+from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
 from icrtool.kernels.filter_records import GATED, UNSEEN

@@ -11,6 +11,7 @@ from typing import Any
 from icrtool.calibration.transfer import Cell, Pair, Transfer
 from icrtool.output.text_format import TABLE_WIDTH
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.text import table_cell
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
 
@@ -48,7 +49,7 @@ def transfer_csv(transfer: Transfer) -> bytes:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(Cell._fields)
     writer.writerows(
-        ["" if isinstance(value, float) and not math.isfinite(value) else value for value in cell]
+        [table_cell(value) if isinstance(value, str) else value if math.isfinite(value) else "" for value in cell]
         for cell in transfer.cells
     )
     return text.getvalue().encode()

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions
+from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
 from icrtool.alignment.drive_windows import DriveArrays, cut_windows, drive_arrays
 from support.exact_drives import simulate
 
@@ -93,3 +93,8 @@ def test_a_straight_drive_decides_nothing() -> None:
     drive = drive_arrays(simulate(1, path="straight", seconds=80.0))
     swapped = spoilt(drive, AS_NAMED._replace(swapped=True))
     assert decide_conventions(swapped, cut_windows(swapped), metric=True).convention == AS_NAMED
+
+
+@pytest.mark.parametrize("one", [AS_NAMED, AS_NAMED._replace(sign_left=-1), AS_NAMED._replace(sign_right=-1)])
+def test_a_reversed_side_shows_without_a_heading(drive: DriveArrays, one: Convention) -> None:
+    assert senses_by_distance(spoilt(drive, one)) == one

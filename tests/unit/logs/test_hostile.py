@@ -255,3 +255,27 @@ def test_a_configuration_that_is_a_pipe_or_a_device_is_refused(tmp_path: Path) -
     for place in (tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(ConfigError, match="not a file"):
             load_config(place)
+
+
+def test_thousands_of_pairs_of_topics_and_of_frames_take_no_quadratic_time(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        number = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data")
+        for i in range(2000):
+            for side in ("left", "right"):
+                writer.register_channel(f"/r{i}/{side}_wheel/velocity", "cdr", number)
+        imu = writer.register_schema("sensor_msgs/msg/Imu", "ros2msg", b"")
+        for publisher in range(2):
+            channel = writer.register_channel("/imu", "cdr", imu, metadata={"publisher": str(publisher)})
+            for i in range(10_000):
+                frame = f"f{publisher}_{i:06d}".encode() + b"\0"
+                head = bytes(8) + len(frame).to_bytes(4, "little") + frame
+                data = b"\0\1\0\0" + head + bytes(-len(head) % 8 + 37 * 8)
+                writer.add_message(channel, START_NS + i, data, START_NS + i)
+        writer.finish()
+    begin = time.process_time()
+    survey = survey_log(path)
+    assert time.process_time() - begin < LONGEST_S
+    assert len(next(table for table in survey.tables if table.topic == "/imu").texts["header.frame_id"]) == 20_000

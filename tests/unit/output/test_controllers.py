@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.calibration.controller_numbers import export_numbers
+from icrtool.calibration.controller_numbers import export_numbers, unfit_reasons
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.record import Calibration, FittedModel
 from icrtool.errors import ConfigError, DataError
@@ -134,3 +134,22 @@ def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
     assert twist(CONTROLLER, controller_parameters(geometry), motion)[:, 0] == pytest.approx(expected)
+
+
+def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:
+    assert unfit_reasons(calibration) == ()
+    far = tuple(one._replace(p95_m=14.8) if one.model == "recommended" else one for one in calibration.held_out)
+    worse = tuple(one._replace(expected_m=99.0) if one.model == "recommended" else one for one in calibration.held_out)
+    for held_out, word in ((far, "14.8 m"), (worse, "no slip")):
+        spoilt = replace(calibration, held_out=held_out)
+        (reason,) = unfit_reasons(spoilt)
+        assert word in reason
+        assert f"WARNING: {reason.split(':')[0]}" in " ".join(format_export(spoilt, "clearpath").split("\n# "))
+
+
+def test_the_factor_to_the_multiplier_that_made_the_odometry_is_given(calibration: Calibration) -> None:
+    made = replace(calibration, robot={**calibration.robot, "twist_width_m": 1.5 * calibration.width_m})
+    numbers = export_numbers(made)
+    assert numbers.factor_to_old == pytest.approx(numbers.separation_multiplier / 1.5)
+    assert "wheel_separation_multiplier 1.5000" in " ".join(format_export(made, "clearpath").split("\n# "))
+    assert export_numbers(calibration).factor_to_old is None

@@ -1,0 +1,113 @@
+"""A calibration from the plain data of its file: every value is checked, so that nothing later meets a wrong one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, TypedDict, TypeVar
+
+import msgspec
+import numpy as np
+
+from icrtool.calibration.measured_errors import controller_errors_of, error_sources_of
+from icrtool.calibration.record import (
+    CALIBRATION_SCHEMA,
+    Calibration,
+    CalibrationLog,
+    FittedModel,
+    HeldOutScore,
+)
+from icrtool.motion.models import TypicalDrive, find_model
+from icrtool.records.text import escaped
+
+WIDEST_M = 20.0
+"""Bound of `robot.track_width_m` in a configuration."""
+
+LARGEST = 1e6
+"""Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
+
+Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore)
+Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+
+
+class RobotDocument(TypedDict):
+    """The robot of a calibration; radius and scales may be missing."""
+
+    name: str | None
+    track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
+
+
+class ScalesDocument(TypedDict, total=False):
+    """What else is known of the robot."""
+
+    wheel_radius_m: Scale | None
+    left_scale: Scale
+    right_scale: Scale
+
+
+def calibration_of(document: Mapping[str, Any]) -> Calibration:
+    """Return the calibration that a file's plain data hold.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        They are not what `Calibration.summary` gives.
+    """
+    if document["schema"] != CALIBRATION_SCHEMA:
+        raise ValueError(f"schema {document['schema']!r}")
+    gyro = document["gyro"]
+    try:
+        found = Calibration(
+            robot=_robot(document["robot"]),
+            fitted=_fitted(document["model"], document),
+            others={name: _fitted(name, one) for name, one in document["models"].items()},
+            gyro=None if gyro is None else _fitted(gyro["model"], gyro),
+            typical=_record(TypicalDrive, document["typical"]),
+            why=_text(document["why"]),
+            logs=tuple(_record(CalibrationLog, log) for log in document["logs"]),
+            held_out=tuple(_record(HeldOutScore, score) for score in document["held_out"]),
+            controller=controller_errors_of(document["controller"]),
+            warnings=tuple(map(_text, document["warnings"])),
+            created=_text(document["created"]),
+            tool_version=_text(document["tool_version"]),
+            sources=error_sources_of(document.get("error_sources")),
+        )
+    except msgspec.ValidationError as err:
+        raise ValueError(str(err)) from err
+    if not np.isfinite(list(found.typical)).all():
+        raise ValueError("typical")
+    with np.errstate(all="ignore"):
+        geometry, covariance = found.geometry()
+        if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
+            raise ValueError("its parameters give no geometry of the tracks")
+    return found
+
+
+def _text(value: object) -> str:
+    return escaped(msgspec.convert(value, str))
+
+
+def _robot(document: Mapping[str, Any]) -> dict[str, Any]:
+    msgspec.convert(document, RobotDocument)
+    msgspec.convert(document, ScalesDocument)
+    return {name: escaped(value) if isinstance(value, str) else value for name, value in document.items()}
+
+
+def _record(kind: type[Record], document: Mapping[str, Any]) -> Record:
+    """Return a record of plain data; null is a number that is not known."""
+    given: tuple[Any, ...] = kind(**document)
+    values = [float("nan") if value is None else escaped(value) if isinstance(value, str) else value for value in given]
+    return msgspec.convert(values, kind)
+
+
+def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:
+    model = find_model(name)
+    k = len(model.terms)
+    if tuple(document["terms"]) != model.terms:
+        raise ValueError(f"terms of {name}")
+    parameters = np.array([document["parameters"][term]["value"] for term in model.terms], np.float64)
+    covariance = np.array(document["covariance"], np.float64).reshape(k, k)
+    if (np.diag(covariance) < 0).any():
+        raise ValueError(f"variances of {name}")
+    if not (np.abs(parameters).max(initial=0) < LARGEST and np.abs(covariance).max(initial=0) < LARGEST):
+        raise ValueError(f"parameters of {name}")
+    return FittedModel(model, parameters, covariance)

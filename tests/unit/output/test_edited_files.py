@@ -1,0 +1,137 @@
+"""Runs and calibrations whose JSON somebody edited: one line, or an object that can be used; never a traceback."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import icrtool
+from icrtool.errors import IcrToolError
+from icrtool.output.calibration_file import open_calibration
+from icrtool.output.run_directory import events_csv, json_bytes
+from icrtool.output.stored_run import log_of
+from icrtool.output.tables.run import format_run
+
+LOG = Path(__file__).parents[3] / "sample_logs" / "tracked_curved.bag"
+WRONG: list[Any] = [None, -1, 1e300, float("nan"), 10**30, "\x1b[2J", [], {"a": 1}, [[None]]]
+LONGEST_LINE = 1000
+
+
+@pytest.fixture(scope="module")
+def run_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = icrtool.load_config(sets=["robot.track_width_m=0.52"])
+    place = tmp_path_factory.mktemp("edited") / "run"
+    icrtool.fit(icrtool.read_log(LOG, config), config).write(place, plots=())
+    return place
+
+
+def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Every place in plain data; of a list its first element."""
+    if here:
+        yield here
+    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, item in items:
+        yield from places(item, (*here, key))
+
+
+def edited(document: dict[str, Any], every: int = 1) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The document with one place removed or replaced; which of both, and by what, differs from place to place."""
+    for number, place in list(enumerate(places(document)))[::every]:
+        for wrong in (WRONG[number % len(WRONG)], ("removed", WRONG[(7 * number + 3) % len(WRONG)])[number % 2]):
+            changed = copy.deepcopy(document)
+            outer: Any = changed
+            for key in place[:-1]:
+                outer = outer[key]
+            if wrong == "removed":
+                del outer[place[-1]]
+            else:
+                outer[place[-1]] = copy.deepcopy(wrong)
+            yield f"{place}: {wrong!r}", changed
+
+
+def write_run(place: Path, document: object) -> None:
+    """Write run.json, and checksums that fit it."""
+    content = document if isinstance(document, bytes) else json.dumps(document).encode()
+    (place / "run.json").write_bytes(content)
+    lines = (place / "B2SUMS").read_text().splitlines()
+    names = [line.partition("  ")[2] for line in lines]
+    sums = [hashlib.blake2b((place / name).read_bytes()).hexdigest() for name in names]
+    (place / "B2SUMS").write_text("".join(f"{one}  {name}\n" for one, name in zip(sums, names, strict=True)))
+
+
+def use_run(place: Path) -> None:
+    run = icrtool.open_run(place)
+    assert format_run(run).replace("\n", "").isprintable()
+    json_bytes(run.summary)
+    events_csv(run.summary["events"])
+    log_of(run)
+
+
+def use_calibration(file: Path) -> None:
+    found = open_calibration(file)
+    assert repr(found).isprintable()
+    json_bytes(found.summary())
+    found.twist(1.0, 0.5)
+    found.warm_start()
+
+
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.stress), 23])
+def test_an_edited_run_is_refused_in_one_line_or_can_be_used(run_place: Path, tmp_path: Path, every: int) -> None:
+    document = json.loads((run_place / "run.json").read_text())
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    used, refusals = 0, {}
+    for what, changed in edited(document, every):
+        write_run(place, changed)
+        try:
+            use_run(place)
+            used += 1
+        except IcrToolError as err:
+            refusals[what] = str(err)
+    assert used
+    assert not [what for what, text in refusals.items() if not text.isprintable() or len(text) > LONGEST_LINE]
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"schema": ' * 50_000, b"", b"\xff\xfe", b"1" * 10_000, b"[]"])
+def test_what_is_no_document_is_refused_everywhere(run_place: Path, tmp_path: Path, content: bytes) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    write_run(place, content)
+    with pytest.raises(IcrToolError):
+        icrtool.open_run(place)
+    icrtool.open_run(run_place).write(place, plots=())  # its list of files shows that it was ours
+    (tmp_path / "calibration.json").write_bytes(content)
+    with pytest.raises(IcrToolError):
+        open_calibration(tmp_path / "calibration.json")
+
+
+def test_states_that_no_filter_made_are_refused(run_place: Path, tmp_path: Path) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    head, first, *others = (run_place / "states.csv").read_text().splitlines(keepends=True)
+    bad = first.split(",")
+    bad[2] = "nan"
+    for rows in ([], [",".join(bad), *others], [*others[:5], first, *others[5:]], [first, first, *others]):
+        (place / "states.csv").write_text("".join([head, *rows]))
+        write_run(place, (place / "run.json").read_bytes())
+        with pytest.raises(IcrToolError):
+            icrtool.open_run(place)
+
+
+def test_an_edited_calibration_is_refused_in_one_line_or_can_be_used(run_place: Path, tmp_path: Path) -> None:
+    file = icrtool.calibrate([icrtool.open_run(run_place)]).write(tmp_path / "calibration.json")
+    document = json.loads(file.read_text())
+    used, refusals = 0, {}
+    for what, changed in edited(document):
+        file.write_text(json.dumps(changed))
+        try:
+            use_calibration(file)
+            used += 1
+        except IcrToolError as err:
+            refusals[what] = str(err)
+    assert used
+    assert not [what for what, text in refusals.items() if not text.isprintable() or len(text) > LONGEST_LINE]
