@@ -165,15 +165,16 @@ class HeadingAlignment:
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str, *, mirrored: bool
-) -> HeadingAlignment:
+    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str,
+    *, mirrored: bool, pose_mirrored: bool = False,
+) -> HeadingAlignment:  # fmt: skip
     """Return offset and noise of a stated heading, and what is applied.
 
     Parameters
     ----------
     fit : of this heading; None where the drive is too short
     source : kind of sensor
-    mirrored : its handedness is the other one
+    mirrored : its handedness is the other one; pose_mirrored : it is of the position's poses, and so is theirs
     """
     given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
     fixed = -math.radians(given) if given != "auto" and corrects else 0.0
@@ -188,11 +189,14 @@ def align_heading(
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
     scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
-    text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
+    text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
     significant = _significant(offset - fixed, std)
     applied, notes = fixed, []
     if mirrored and not corrects:
         notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+    elif mirrored and pose_mirrored:
+        applied = offset if given == "auto" else fixed
+        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
     elif mirrored:
         applied = offset if given == "auto" else fixed
         notes.append(
