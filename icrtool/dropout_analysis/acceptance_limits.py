@@ -46,7 +46,8 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
                 _budget_distance(report.horizons_m, p95, budget_m)
                 for p95 in (result.intervals.p95_high, result.intervals.p95_low)
             )
-            low, high = (end[0] if end is not None else math.nan for end in ends)
+            # An end that stays within the budget as far as there are intervals has no such distance.
+            low, high = (math.nan if end is None or end[1] else end[0] for end in ends)
             found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high))
     return tuple(found)
 

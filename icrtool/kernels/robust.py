@@ -175,11 +175,13 @@ def scale_by_kind(residuals: Floats, kind: Ints) -> Floats:
 
 def normal_equations(residuals: Floats, jacobian: Floats, scale: Floats, overlap: float) -> tuple[Floats, Floats]:
     """Return the data's part of the information matrix (k, k) and of the gradient (k,), soft-L1 weighted."""
-    z = residuals / scale
-    weights = soft_l1_weights(z) / overlap
-    scaled = jacobian / scale[:, None]
-    pulled = scaled * weights[:, None]
-    return pulled.T @ scaled, pulled.T @ z
+    from icrtool.kernels.sparse_normal import weighted_products
+
+    weights = soft_l1_weights(residuals / scale) / overlap / scale**2
+    k = jacobian.shape[1]
+    matrix, vector = np.empty((k, k)), np.empty(k)
+    weighted_products(np.ascontiguousarray(jacobian), weights, residuals, matrix, vector)
+    return matrix, vector
 
 
 def sandwich_covariance(
@@ -199,7 +201,7 @@ def sandwich_covariance(
     """
     z, scaled = residuals / scale, jacobian / scale[:, None]
     influence = soft_l1_weights(z) / overlap
-    information: Floats = (scaled * influence[:, None]).T @ scaled + np.diag(pull)
+    information = normal_equations(residuals, jacobian, scale, overlap)[0] + np.diag(pull)
     order = np.argsort(group, kind="stable")
     first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
     gradients = np.add.reduceat((scaled * (influence * z)[:, None])[order], first)

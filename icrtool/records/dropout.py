@@ -176,7 +176,8 @@ class BudgetDistance(NamedTuple):
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : the error is within the budget at `distance_m`, the last horizon with trials
     between_m : horizons interpolated between
-    low_m, high_m : distances at which the interval of p95 leaves the budget; NaN where there is no interval
+    low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; NaN where
+        they stay within it, and where there is no interval
     """
 
     model: str
@@ -187,6 +188,13 @@ class BudgetDistance(NamedTuple):
     between_m: tuple[float, float]
     low_m: float = math.nan
     high_m: float = math.nan
+
+    @property
+    def interval_text(self) -> str:
+        """``13.2-15.0 m`` or ``at least 13.2 m``; empty where the interval leaves the budget nowhere."""
+        if not math.isfinite(self.low_m):
+            return ""
+        return f"{self.low_m:.1f}-{self.high_m:.1f} m" if math.isfinite(self.high_m) else f"at least {self.low_m:.1f} m"
 
 
 @dataclass(frozen=True, slots=True)

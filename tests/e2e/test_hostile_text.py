@@ -131,8 +131,8 @@ def check_files(folder: Path) -> None:
         elif path.suffix in (".html", ".md"):
             text = path.read_text()
             assert "<script>alert" not in text, path
-            assert "](javascript:" not in text, path
             if path.suffix == ".md":
+                assert "](javascript:" not in text, path
                 check_printed(text, str(path))
 
 

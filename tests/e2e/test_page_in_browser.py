@@ -19,6 +19,7 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
 from icrtool.motion.trials import Trials
 from icrtool.output.dropout_directory import report_document
+from icrtool.output.page import drive_data
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
@@ -85,6 +86,13 @@ def test_a_page_loads_without_complaint_and_asks_for_nothing(page: Page) -> None
     assert page.requests() == []
     assert page.evaluate("document.querySelectorAll('.chart canvas').length") == 5
     assert page.evaluate("document.querySelectorAll('#map path').length") > 5
+
+
+def test_nothing_is_wider_than_a_phone(chrome: Browser, file: Path) -> None:
+    page = chrome.page(width=360, height=780)
+    page.open(file)
+    page.evaluate("document.getElementById('go').click()")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
 def test_the_policy_stops_what_a_page_would_load(chrome: Browser, file: Path) -> None:
@@ -163,6 +171,33 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
                 # Micrometres of rounding in each column, seven digits in the first heading.
                 assert errors[name][h] == pytest.approx(error, abs=1e-4), (name, start, h)
         assert errors["recommended"] == pytest.approx(recommended[number].tolist(), abs=1e-4)
+
+
+def test_paths_of_joined_samples_are_close_to_those_of_the_library(
+    chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drive_data, "MOST_STEPS", 1000)
+    file = tmp_path / "joined.html"
+    file.write_text(run_page(run, report_document(report), {}), encoding="utf-8")
+    page = chrome.page()
+    page.open(file)
+    joined = page.evaluate("icrtoolPage.data.steps.joined")
+    assert joined == 3
+    drive, table = drive_of(run), run.table
+    ends = trial_ends(drive, np.array(LENGTHS_M))
+    for step in (50, 150, 300):
+        start = step * joined
+        found = page.evaluate(f"icrtoolPage.openLoop(icrtoolPage.data.series.step.indexOf({step})).models")
+        errors = {one["name"]: one["errors"] for one in found}
+        icrs = (table.y_icr_right_m[start], table.y_icr_left_m[start], table.x_icr_m[start])
+        for h, end in enumerate(ends[start].tolist()):
+            if end < 0:
+                assert errors["icr"][h] is None
+                continue
+            path = open_loop_path(drive, *icrs, start, end)
+            error = np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end])
+            # The trial ends up to two samples later, some centimetres on.
+            assert errors["icr"][h] == pytest.approx(error, abs=0.01 + 0.02 * error), (start, h)
 
 
 @pytest.mark.parametrize("scale", [0.0, 3.7e-4, 0.0954, 0.3, 1.0, 13.0, 950.0])

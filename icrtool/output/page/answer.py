@@ -112,10 +112,9 @@ def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
         return math.nan if value is None else value
 
     def interval_text(one: BudgetDistance) -> str:
-        if one.beyond:
+        if one.beyond and not one.interval_text:
             return f"no trial is longer than {one.distance_m:g} m"
-        known = math.isfinite(one.low_m + one.high_m)
-        return f"{one.low_m:.1f} to {one.high_m:.1f} m" if known else "too few trials for an interval"
+        return one.interval_text or "too few trials for an interval"
 
     known = [
         BudgetDistance(**{**one, "between_m": tuple(one["between_m"]), "low_m": number(one["low_m"]),

@@ -89,8 +89,8 @@ def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:
 def _columns(budgets: Sequence[str]) -> list[str]:
     within = [f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for" for name in budgets]
     errors = [f"95 % after {HORIZON_M:g} m, {label}" for label in MODELS.values()]
-    fixed = ["start", "duration", "distance", "ICR y right", "ICR y left", "ICR x", "multiplier"]
-    return [*fixed, *within, *errors, "events", "warnings", "gates failed"]
+    found = ["multiplier", "ICR y right", "ICR y left", "ICR x", "distance", "duration", "start"]
+    return [*within, *errors, *found, "events", "warnings", "gates failed"]
 
 
 def _line(log: Mapping[str, Any], budgets: Sequence[str], folder: Path) -> Line:
@@ -103,14 +103,14 @@ def _line(log: Mapping[str, Any], budgets: Sequence[str], folder: Path) -> Line:
 
 def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
     icr, errors = log["icr"], log["errors"]
-    yield Cell(log["start_utc"].replace("T", " ").removesuffix("Z"), log["start_utc"] or None)
-    yield _cell(log["duration_s"], duration_text)
-    yield _cell(log["distance_m"], distance_text)
-    for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
-        yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
-    yield _with_std(log["multiplier"], log["multiplier_std"], "")
     for name in (*budgets, *(f"{model}_p95_{HORIZON_M:g}m_m" for model in MODELS)):
         yield _cell(errors.get(name), metres_text)
+    yield _with_std(log["multiplier"], log["multiplier_std"], "")
+    for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
+        yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
+    yield _cell(log["distance_m"], distance_text)
+    yield _cell(log["duration_s"], duration_text)
+    yield Cell(log["start_utc"].replace("T", " ").removesuffix("Z"), log["start_utc"] or None)
     gates = sum(not verdict["passed"] for verdict in log["verdicts"])
     for count in (log["events"], log["warnings"], gates):
         yield Cell("" if count is None else f"{count}", count)

@@ -97,7 +97,7 @@ def headline(report: DropoutReport) -> list[str]:
     if calibration is None or (best := reached.get("recommended")) is None:
         return []
     fitted, numbers = calibration.fitted, calibration.controller_numbers()
-    interval = f" ({best.low_m:.1f}-{best.high_m:.1f})" if math.isfinite(best.low_m + best.high_m) else ""
+    interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
     return [

@@ -139,3 +139,21 @@ def test_a_budget_without_trials_is_left_out_and_no_length_is_refused(report: Dr
     for budget in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ConfigError, match="budget"):
             budget_distances(report, budget)
+
+
+@pytest.mark.parametrize(
+    ("high", "low", "text"),
+    [
+        ((0.2, 0.5, 2.5), (0.05, 0.2, 1.0), "1.5-3.4 m"),
+        ((0.2, 0.5, math.nan), (0.05, 0.2, math.nan), "at least 1.5 m"),
+        ((0.2, math.nan, math.nan), (0.05, math.nan, math.nan), ""),
+    ],
+)
+def test_an_interval_of_a_budget_ends_where_its_knowledge_ends(
+    report: DropoutReport, high: tuple[float, ...], low: tuple[float, ...], text: str
+) -> None:
+    one = with_p95(report, 0.1, 0.4, 2.0)
+    intervals = one.results[0].intervals._replace(p95_low=np.array(low), p95_high=np.array(high))
+    (found,) = budget_distances(replace(one, results=(one.results[0]._replace(intervals=intervals),)), 0.3)
+    assert found.distance_m == pytest.approx(1.0 + 1.5 * 0.2 / 0.3)
+    assert found.interval_text == text

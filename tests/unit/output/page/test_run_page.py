@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.estimation.fit import fit
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.records.run import Run
+from support.barn import configured, simulate
 
 HOSTILE_PART = "window.hostile=1"
 VENDOR = Path(__file__).resolve().parents[4] / "icrtool" / "output" / "page" / "static" / "vendor"
@@ -112,6 +115,15 @@ def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -
     np.testing.assert_allclose(numbers(data["steps"]["left"]), driven, atol=1e-5)
 
 
+def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
+    smoothed = fit(simulate(), configured(), smooth=True)
+    assert smoothed.smoothed is not None
+    found = dropout_report(smoothed, reference="smoothed", comparison=False)
+    data = data_of(run_page(smoothed, report_document(found), {}))
+    north = numbers(data["steps"]["north"]) + data["steps"]["first_north"] + data["origin"][0]
+    np.testing.assert_allclose(north, smoothed.smoothed.north_m, atol=1e-5)
+
+
 def test_running_sums_do_not_gather_errors() -> None:
     rng = np.random.default_rng(16)
     column = np.cumsum(rng.normal(0.02, 0.01, 200_000))
@@ -191,8 +203,6 @@ def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(ru
 
 
 def test_a_run_without_track_width_and_a_short_one_have_pages(make_run: Any) -> None:
-    from icrtool.dropout_analysis.dropout_report import dropout_report
-
     narrow = make_run(track_width_m=None)
     page = run_page(narrow, report_document(dropout_report(narrow)), {})
     assert "robot.track_width_m is not known" in unescape(page)
