@@ -44,6 +44,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     wheels, heading, delays = found.wheels, found.heading, found.delays
     quality = judge_fixes(found.log, config, heading)
     aligned = sensors_as_sent(quality.log, config)
+    sense, offset = heading.remaining
     sensors = replace(
         aligned,
         fixes=replace(
@@ -54,11 +55,14 @@ def align(log: RobotLog, config: Config) -> Measurements:
         ),
         headings=replace(
             aligned.headings,
-            heading_rad=(-1.0 if heading.applied_mirror else 1.0) * aligned.headings.heading_rad
-            - heading.applied_offset_rad,
-            var_rad2=heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
+            heading_rad=sense * aligned.headings.heading_rad - offset,
+            var_rad2=quality.log.heading.var_rad2
+            if heading.is_estimated
+            else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
         ),
         heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
+        heading_is_estimated=heading.is_estimated,
+        attitude=None if found.derived is None else found.derived.attitude,
         losses_ns=quality.losses_ns,
         icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
     )
@@ -74,7 +78,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         findings=alignment_findings(found, aligned.antenna_m),
         sections={
             "wheels": wheels.summary() | window_summary(found.fit),
-            "heading": heading.summary() | delays.heading_summary() | {"source": found.source},
+            "heading": heading.summary() | delays.heading_summary(),
             "gnss": delays.gnss_summary(),
         },
         streams=found.log.streams,

@@ -10,8 +10,6 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,
@@ -22,17 +20,19 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.course_over_ground import FEWEST_WINDOWS, Course, measure_course
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
 from icrtool.alignment.heading_alignment import (
-    NOISY_SCATTER_RAD,
-    HeadingCheck,
+    FEWEST_WINDOWS,
+    OPPOSITE_SENSE,
+    HeadingAlignment,
+    align_estimated_heading,
+    align_heading,
+    compare_with_course,
     refuse_stuck,
     refuse_unexplained,
 )
-from icrtool.alignment.heading_choice import CORRELATION_S, DerivedHeading, as_turn_rate, derive_heading
-from icrtool.alignment.heading_offset_cause import NO_NAME, name_offset
+from icrtool.alignment.heading_choice import DerivedHeading, as_turn_rate, derive_heading, fuse_heading, stated_source
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import StreamDelays, find_delays
 from icrtool.alignment.wheel_alignment import (
@@ -52,12 +52,8 @@ from icrtool.errors import DataError
 from icrtool.records.run import half_width_m
 from icrtool.records.tables import RobotLog
 
-SIGNIFICANT_SIGMAS = 4.0
 FAR_IN_POSITION_STD, SHORT_DRIVE_M = 30.0, 0.3
 """A drive of so many standard deviations of the fixes, at least of this each, is no short one."""
-
-SMALLEST_OFFSET_RAD = math.radians(1.0)
-OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
 
 
 class AlignedStreams(NamedTuple):
@@ -72,7 +68,7 @@ class AlignedStreams(NamedTuple):
 
     log: RobotLog
     wheels: WheelAlignment
-    heading: HeadingCheck
+    heading: HeadingAlignment
     delays: StreamDelays
     fit: AlignmentFit | None
     derived: DerivedHeading | None
@@ -88,13 +84,8 @@ class AlignedStreams(NamedTuple):
         """The log with sides, handedness and scale corrected, offset and delays not."""
         return _turned_over(self.wheels.log) if self.heading.applied_mirror else self.wheels.log
 
-    @property
-    def source(self) -> str:
-        """What the heading was made of."""
-        return "orientation" if self.derived is None else self.derived.source
 
-
-def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
+def align_streams(log: RobotLog, config: Config) -> AlignedStreams:  # noqa: PLR0915 - the order of the steps, in one place
     """Estimate what relates wheels, heading and positions, and correct what is significant.
 
     Raises
@@ -128,7 +119,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if free_hand.convention.heading < 0:
             notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
     refuse_standing(log, drive, windows)
-    course = measure_course(_turned_over(log) if mirrored else log)
+    course = compare_with_course(drive, windows)
     free = config.frames.heading_offset_deg == "auto" and corrects
     fit = estimate_alignment(drive, windows, width)
     if free and derived is None:
@@ -137,6 +128,19 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
             return align_streams(bare, config)
         refuse_unexplained(log, course)
+    if derived is None:
+        heading = align_heading(
+            log, config, fit, course, stated_source(log), mirrored=mirrored, pose_mirrored=pose_mirrored
+        )
+        if free and config.frames.heading == "auto":
+            derived = fuse_heading(log, drive, mirrored=mirrored)
+        if derived is not None:
+            log = derived.apply(log)
+            drive = drive_arrays(log, derived.smoothed)
+            fit = estimate_alignment(drive, cut_windows(drive), width)
+            heading = align_estimated_heading(log, derived, heading)
+    else:
+        heading = align_estimated_heading(log, derived, None)
     applied, scale_notes = find_scales(fit, config, sound=sound, corrects=corrects)
     notes += scale_notes
     log = scaled(log, *applied)
@@ -147,9 +151,8 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         configured = configured[::-1]
     wheels = WheelAlignment(
         log, a, a_std, applied, (abs(configured[0]), abs(configured[1])), share,
-        tuple(f"{log.name}: {note}" for note in notes), course,
+        tuple(f"{log.name}: {note}" for note in notes),
     )  # fmt: skip
-    heading = _heading_check(log, config, fit, course, derived, mirrored=mirrored, pose_mirrored=pose_mirrored)
     delays = find_delays(log, config, fit)
     return AlignedStreams(
         delays.log, wheels, heading, delays, fit, derived,
@@ -207,76 +210,3 @@ def _apply(log: RobotLog, convention: Convention) -> RobotLog:
 
 def _turned_over(log: RobotLog) -> RobotLog:
     return replace(log, heading=replace(log.heading, heading_rad=-log.heading.heading_rad))
-
-
-def _heading_check(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: Course, derived: DerivedHeading | None,
-    *, mirrored: bool, pose_mirrored: bool,
-) -> HeadingCheck:  # fmt: skip
-    """Return the heading's offset and noise, and what is applied.
-
-    `pose_mirrored`: position and heading are fields of the same poses, both mirrored.
-    """
-    given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
-    fixed = -math.radians(given) if given != "auto" and corrects else 0.0
-    nothing = (math.nan,) * 5
-    if derived is not None:
-        return HeadingCheck(
-            len(course.angle), 0.0, float(np.median(np.sqrt(derived.smoothed.var_rad2))), *nothing[:3],
-            applied_mirror=False, applied_offset_rad=0.0, applied_std_rad=0.0, applied_correlation_s=CORRELATION_S,
-            name=NO_NAME, warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
-        )  # fmt: skip
-    if fit is None:
-        return HeadingCheck(
-            len(course.angle), *nothing, applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
-            applied_std_rad=0.0,
-            applied_correlation_s=0.0, name=NO_NAME, warnings=(),
-        )  # fmt: skip
-    turn, std = fit.estimate("offset")
-    offset = math.remainder(-turn, 2 * math.pi)
-    scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
-    rest = offset + math.pi / 2 if mirrored and not pose_mirrored else offset
-    significant = _significant(offset - fixed, std)
-    begin = int(log.wheels.stamp_ns[0])
-    name = name_offset(rest, std, log.datum, begin) if _significant(rest, std) else NO_NAME
-    cause = f" ({name.text})" if name.text else ""
-    text = f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(std):.1f}°"
-    applied, notes = fixed, []
-    if mirrored and not corrects:
-        notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
-    elif mirrored and pose_mirrored:
-        applied = offset if given == "auto" else fixed
-        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
-    elif mirrored:
-        applied = offset if given == "auto" else fixed
-        notes.append(
-            f"{OPPOSITE_SENSE}: its yaw is of the other convention (ENU/NED), "
-            f"offset {text}{cause}: applied; frames.heading sets it"
-        )
-    elif significant and given == "auto" and corrects:
-        applied = offset
-        notes.append(
-            f"heading is {text} off the course over ground{cause}: {-math.degrees(applied):+.1f}° is applied; "
-            "frames.heading_offset_deg sets it"
-        )
-    elif significant:
-        notes.append(f"heading is {text} off the course over ground{cause}; {-math.degrees(fixed):+.1f}° is applied")
-    noisy = corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
-    if noisy:
-        notes.append(
-            f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground, over whole windows: "
-            "its noise is raised accordingly"
-        )
-    return HeadingCheck(
-        windows=len(course.angle), offset_rad=offset, offset_std_rad=std, scatter_rad=scatter,
-        agreement=course.agreement if len(course.angle) else math.nan,
-        mirrored_agreement=course.mirrored_agreement if len(course.angle) else math.nan,
-        applied_mirror=mirrored and corrects,
-        applied_offset_rad=applied, applied_std_rad=scatter if noisy else 0.0,
-        applied_correlation_s=course.duration_s if noisy else 0.0, name=name,
-        warnings=tuple(f"{log.name}: {note}" for note in notes),
-    )  # fmt: skip
-
-
-def _significant(offset: float, std: float) -> bool:
-    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icrtool.alignment.gnss_steps import FixSteps, measure_steps
-from icrtool.alignment.heading_alignment import HeadingCheck
+from icrtool.alignment.heading_alignment import HeadingAlignment
 from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
 from icrtool.records.tables import (
@@ -82,7 +82,7 @@ class FixQuality:
     warnings: tuple[str, ...]
 
 
-def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQuality:
+def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> FixQuality:
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
@@ -91,7 +91,8 @@ def judge_fixes(log: RobotLog, config: Config, check: HeadingCheck) -> FixQualit
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
     """
     gnss, changes = log.gnss, config.filter.preset != "paper"
-    steps = measure_steps(log, mirrored=check.applied_mirror, offset_rad=check.applied_offset_rad)
+    sense, offset = heading.remaining
+    steps = measure_steps(log, mirrored=sense < 0, offset_rad=offset)
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     kinds, misreported = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}

@@ -1,85 +1,88 @@
-"""Heading from turn rates and positions: course over ground, rate bias and scale, in a Kalman filter and smoother.
+"""Heading from turn rates, courses over ground and absolute headings, in a Kalman filter and smoother.
 
-Over windows of driven distance the fixes p_i are regressed on the wheels' speed laid along the integrated turn rate,
-S_i = ∫ v e^{jG}: the angle of sum p_i S_i* (about the means) is the heading at the window's end, G being 0 there, plus
-
-    x_icr Im(sum -e^{jG_i} S_i*)/sum |S_i|^2 + tau Im(sum -v_i e^{jG_i} S_i*)/sum |S_i|^2
-
-for ICRs ahead of the antenna and positions that lag. Wheels that run backwards turn S round. While the robot
-stands, the rate is its own bias. Absolute headings (an attitude sensor, the bearing between two antennas) enter with an
-offset that wanders slowly. What varies in time has a causal estimate (the past alone) and a smoothed one.
+Each source has an error model whose sizes the likelihood of the log chooses: a turn rate has a random walk of its
+integral and of its bias; a course has the noise of the fixes and an ICR that varies from window to window; an absolute
+heading (attitude sensor, bearing between two antennas) has a constant offset, an error that wanders slowly, white
+noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale, delays, ICR) come from
+the whole log; what varies in time has a causal estimate (the past alone, constants excepted) and a smoothed one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.courses import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.alignment.drive_windows import DriveArrays
-from icrtool.alignment.estimator import ATTITUDE_STD_RAD, ATTITUDE_TIME_S
-from icrtool.kernels.robust import huber_weights, long_run_factor, mad_std
-from icrtool.records.tables import Complexes, Floats, Ints
+from icrtool.kernels.robust import long_run_factor, mad_std
+from icrtool.records.tables import Floats, Ints
 
 if TYPE_CHECKING:
-    from icrtool.kernels.heading_kalman import HeadingEvents, HeadingPasses
+    from icrtool.kernels.heading_kalman import HeadingEvents, HeadingModel, HeadingPasses
 
-PSI, BIAS, SCALE, X, DELAY, OFFSET = range(6)
-COURSE, STANDING, ATTITUDE = range(3)
-HUBER_SIGMAS = 2.5
-SPIKE_SIGMAS = 8.0
+PSI, BIAS, SCALE, X, DELAY = range(5)
+OFFSET, WANDER, LAG = 5, 6, 7
+"""States of the first absolute heading; those of the next one follow."""
+STATES, STATES_OF_A_SOURCE = 5, 3
+COURSE, STANDING, NOTHING, ABSOLUTE = range(4)
+
 SETTLED_SIGMAS = 3.0
+LEAST_OFFSET_SIGMAS = 4.0
+LARGEST_RATE_HZ = 20.0
 
-COURSE_WINDOW_M, COURSE_IN_POSITION_STD = 1.0, 12.0
-LONGEST_COURSE_S = 10.0
 STANDING_S = 0.6
-FEWEST_COURSES = 8
-
-SLIP_STD_RAD = math.radians(0.3)
-"""What wheels and ground turn a course by, whatever the fixes' noise."""
-
-ANGLE_WALKS = tuple(math.radians(rate) ** 2 for rate in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
-BIAS_WALKS = tuple(math.radians(rate) ** 2 for rate in (0.001, 0.01, 0.03, 0.1, 0.3))
-"""Random walks of the integrated rate [rad^2/s] and of its bias [(rad/s)^2/s]: the likelihood chooses."""
-
-PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1, math.pi])
 STANDING_RATE_STD = math.radians(0.05)
-ATTITUDE_WALK = 2 * ATTITUDE_STD_RAD**2 / ATTITUDE_TIME_S
-DELAY_ROUNDS, LONG_DELAY_S = 3, 0.15
-"""A delay of the fixes up to this is linear, and partly a robot's response to its wheels; a longer one takes rounds."""
+FEWEST_COURSES = 8
+PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
+ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
+LONGEST_STEP_S = 1.0
+"""A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
+
+LEAST_COURSE_STD_RAD = math.radians(0.05)
+ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
+MOST_SWEEPS = 3
+"""A delay of the fixes up to this, and a bias that turns a window by this, are linear; larger ones take rounds."""
+
+MOST_EVENTS = 2000
+"""The likelihood looks at so many events."""
+
+NOISES = {
+    "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
+    "bias": np.radians([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0]),
+    "course": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
+    "slip": np.array([0.003, 0.01, 0.02, 0.04, 0.08, 0.16]),
+}
+"""Random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)]; noise of a course in that of the
+fixes; standard deviation of the ICR from window to window [m]."""
+
+NOISES_OF_A_SOURCE = {
+    "white": np.array([0.25, 0.5, 1.0, 2.0, 4.0]),
+    "rate": np.radians([0.01, 0.03, 0.1, 0.2, 0.4, 1.0]),
+    "size": np.radians([0.03, 0.1, 0.3, 0.6, 1.2, 2.5, 5.0]),
+}
+"""White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
 
 
-class TurnRate(NamedTuple):
-    """A turn rate, clockwise: t (n,) [s], rate (n,) [rad/s]; deviations of its scale and bias before the log."""
-
-    t: Floats
-    rate: Floats
-    scale_std: float = 0.02
-    bias_std: float = math.radians(2.0)
-
-    def integrated(self) -> Floats:
-        """Return the turn since the first sample (n,) [rad], by trapezoids."""
-        return np.concatenate([[0.0], np.cumsum(np.diff(self.t) * (self.rate[:-1] + self.rate[1:]) / 2)])
-
-
-class Courses(NamedTuple):
-    """Windows of driven distance.
+class AbsoluteHeading(NamedTuple):
+    """Headings with an offset, thinned to independent ones.
 
     Attributes
     ----------
-    begin, end : (w,) [s]; angle : (w,) of the displacement against what was laid along the rate [rad]
-    of_x, of_delay : (w,) derivatives by x_icr and by the delay of the positions; std : (w,) [rad]
+    t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
+    rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
+    offset_std : of the offset, about zero [rad]; aligned_std : the same where no offset is significant
     """
 
-    begin: Floats
-    end: Floats
-    angle: Floats
-    of_x: Floats
-    of_delay: Floats
+    t: Floats
+    heading: Floats
     std: Floats
+    rate: Floats
+    offset_std: float = math.inf
+    aligned_std: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +92,10 @@ class HeadingEstimate:
     Attributes
     ----------
     causal, causal_std : (n,) from the past alone, constants excepted; smoothed, smoothed_std : (n,) from all
-    constants, constants_std : (6,) bias at the end, scale error, x [m], delay [s], offset [rad]; the first is unused
-    walks : random walks that the likelihood chose, of the angle and of the bias
+    constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
+        error at the end, delay of each absolute heading
+    noises : what the likelihood chose; those of an absolute heading have its number in front
+    spread : robust standard deviation of the courses' innovations, in theirs
     """
 
     t: Floats
@@ -100,59 +105,58 @@ class HeadingEstimate:
     smoothed_std: Floats
     constants: Floats
     constants_std: Floats
-    walks: tuple[float, float]
+    noises: dict[str, float]
+    spread: float
+
+    @property
+    def has_offset(self) -> bool:
+        """Whether the offset of the first absolute heading is significant."""
+        offset = math.remainder(float(self.constants[OFFSET]), 2.0 * math.pi)
+        return abs(offset) > LEAST_OFFSET_SIGMAS * float(self.constants_std[OFFSET])
+
+    @property
+    def median_std(self) -> float:
+        """Median standard deviation of the smoothed heading [rad]."""
+        return float(np.median(self.smoothed_std))
 
 
-def measure_courses(drive: DriveArrays, turn: TurnRate) -> Courses:
-    """Cut the drive into windows of distance that follow one another, and measure the course in each."""
-    angle_at = turn.integrated()
-    v = (drive.v_left + drive.v_right) / 2
-    psi = np.interp(drive.wheel_t + drive.wheel_dt / 2, turn.t, angle_at)
-    nose = np.exp(1j * psi)
-    laid = np.concatenate([[0.0], np.cumsum((v * nose * drive.wheel_dt)[:-1])])
-    gone = np.concatenate([[0.0], np.cumsum((np.abs(v) * drive.wheel_dt)[:-1])])
-    length = max(COURSE_WINDOW_M, COURSE_IN_POSITION_STD * min(drive.fix_std_m, 10.0))
-    t, place = _without_spikes(drive, max(drive.wheel_t[0], turn.t[0]), min(drive.wheel_t[-1], turn.t[-1]))
-    cell = np.floor(np.interp(t, drive.wheel_t, gone) / length)
-    edge = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0)
-    begin, end = edge[:-1], edge[1:]
-    G = np.interp(t, turn.t, angle_at)
-    path, swing = np.interp(t, drive.wheel_t, laid), np.exp(1j * G)
-    speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
+def estimate_heading(
+    drive: DriveArrays, turn: TurnRate, absolute: Sequence[AbsoluteHeading] = (), *, stands: bool = True
+) -> HeadingEstimate | None:
+    """Estimate the heading; None with too few courses.
 
-    def product(values: Complexes, others: Complexes) -> Complexes:
-        """Return the sums of values times conjugate others about their means, both ends of a window included."""
-        sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (values * np.conj(others), values, others)]
-        both, first, second = (one[end + 1] - one[begin] for one in sums)
-        return np.asarray(both - first * np.conj(second) / (end + 1 - begin), np.complex128)
-
-    square = product(path, path).real
-    seen = product(place - place.mean() if len(place) else place, path)
-    kept = (t[end] - t[begin] < LONGEST_COURSE_S) & (np.abs(path[end] - path[begin]) > 0.5 * length)
-    kept &= np.abs(seen) > 0.3 * square
-    gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
-    kept &= np.searchsorted(gap, t[begin]) == np.searchsorted(gap, t[end])
-    of_x = product(-swing, path).imag
-    of_delay = product(-speed * swing, path).imag
-    size = np.maximum(square, 1e-12)
-    return Courses(
-        t[begin][kept], t[end][kept], np.angle(seen * np.exp(1j * G[end]))[kept],
-        (of_x / size)[kept], (of_delay / size)[kept], (drive.fix_std_m / np.sqrt(size))[kept],
-    )  # fmt: skip
-
-
-def _without_spikes(drive: DriveArrays, first: float, last: float) -> tuple[Floats, Complexes]:
-    """Return times and places of the fixes in a span, without those that lie far from both neighbours."""
-    rows = np.flatnonzero((drive.fix_t >= first) & (drive.fix_t <= last))
-    t, place = drive.fix_t[rows], drive.fix[rows]
-    if len(rows) < 3:
-        return t, place
-    bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
-    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), drive.fix_std_m)
-    # the neighbours of a spike bend by half as much
-    spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
-    kept = np.concatenate([[True], ~spike, [True]])
-    return t[kept], place[kept]
+    Parameters
+    ----------
+    turn : of a gyro, or of the wheels with a wide prior of its scale
+    absolute : further headings
+    stands : whether the rate is zero while the wheels stand
+    """
+    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t))), (), stands=stands)
+    if problem.courses < FEWEST_COURSES:
+        return None
+    noises = problem.usual()
+    guess = problem.guess(noises)
+    for _ in range(ROUNDS):
+        problem = _Problem(drive, turn, guess, (), stands=stands)
+        if problem.courses < FEWEST_COURSES:
+            return None
+        # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
+        noises = problem.choose(NOISES, noises)
+        better = problem.guess(noises)
+        turned = float(np.abs(better.bias - guess.bias).max()) * problem.window_s
+        if turned < LARGE_BIAS_RAD and abs(better.late - guess.late) < LONG_DELAY_S:
+            break
+        guess = better
+    if absolute:
+        problem = _Problem(drive, turn, guess, absolute, stands=stands)
+        grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
+        noises = problem.choose(grids, problem.usual() | noises)
+    found = problem.solve(noises)
+    if absolute and math.isfinite(absolute[0].aligned_std) and not found.has_offset:
+        # not significant: that of a sensor mounted along the robot
+        problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
+        found = problem.solve(noises)
+    return found
 
 
 def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
@@ -167,147 +171,194 @@ def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
     return end[still], rate[still]
 
 
-def estimate_heading(
-    drive: DriveArrays,
-    turn: TurnRate,
-    absolute: tuple[Floats, Floats, Floats] | None = None,
-    *,
-    absolute_walk: float = ATTITUDE_WALK,
-    stands: bool = True,
-) -> HeadingEstimate | None:
-    """Estimate the heading; None with too few courses.
+class _Problem:
+    """The events of a log, in order, and what is not known of their noise."""
 
-    Parameters
-    ----------
-    turn : of a gyro, or of the wheels with a wide prior of its scale
-    absolute : t, heading, std (m,) of headings with an unknown offset, already thinned to independent ones
-    absolute_walk : random walk of that offset [rad^2/s]
-    stands : whether the rate is zero while the wheels stand
-    """
-    late, found = 0.0, None
-    for _ in range(DELAY_ROUNDS):
-        found = _estimate(drive, late, turn, absolute, absolute_walk, stands=stands)
-        if found is None:
-            return None
-        step = float(found.constants[DELAY]) - late
-        late += step
-        if abs(step) < max(3.0 * float(found.constants_std[DELAY]), LONG_DELAY_S):
-            break
-    return found
-
-
-def _estimate(
-    drive: DriveArrays, late: float, turn: TurnRate, absolute: tuple[Floats, Floats, Floats] | None,
-    absolute_walk: float, *, stands: bool,
-) -> HeadingEstimate | None:  # fmt: skip
-    """Run filter and smoother once about a delay of the fixes of `late` [s]: it is linear here, and takes rounds."""
-    from icrtool.kernels.heading_kalman import HeadingEvents, filter_headings, smooth_headings
-
-    courses = measure_courses(drive._replace(fix_t=drive.fix_t - late), turn)
-    courses = courses._replace(angle=courses.angle + late * courses.of_delay)
-    if len(courses.end) < FEWEST_COURSES:
-        return None
-    still_t, still_rate = _standing(drive, turn) if stands else (np.empty(0), np.empty(0))
-    attitude = absolute if absolute is not None else (np.empty(0),) * 3
-    t = np.concatenate([courses.end, still_t, attitude[0]])
-    kind = np.repeat([COURSE, STANDING, ATTITUDE], [len(courses.end), len(still_t), len(attitude[0])])
-    order = np.lexsort((kind, t))
-    h = np.zeros((len(t), 6))
-    h[kind != STANDING, PSI] = 1.0
-    h[kind == STANDING, BIAS] = 1.0
-    h[kind == ATTITUDE, OFFSET] = 1.0
-    h[kind == COURSE, X], h[kind == COURSE, DELAY] = courses.of_x, courses.of_delay
-    # the angle is that of the window's middle, carried to its end by a rate with bias and scale error
-    G = turn.integrated()
-    middle = (courses.begin + courses.end) / 2
-    h[kind == COURSE, BIAS] = courses.end - middle
-    h[kind == COURSE, SCALE] = np.interp(middle, turn.t, G) - np.interp(courses.end, turn.t, G)
-    z = np.concatenate([courses.angle, still_rate, attitude[1]])
-    r = np.concatenate(
-        [courses.std**2 + SLIP_STD_RAD**2, np.full(len(still_t), STANDING_RATE_STD**2), attitude[2] ** 2]
-    )
-    t, kind, h, z, r = t[order], kind[order], h[order], z[order], r[order]
-    at = np.interp(t, turn.t, G)
-    events = HeadingEvents(np.diff(t, prepend=t[:1]), np.diff(at, prepend=at[:1]), z, h, r, kind != STANDING)
-    std = PRIOR_STD.copy()
-    std[SCALE], std[BIAS] = turn.scale_std, turn.bias_std
-    x0, P0 = np.zeros(6), np.diag(std**2)
-    first = int(np.argmax(kind == COURSE))
-    x0[PSI] = z[first] - (at[first] - at[0])
-    if absolute is None:
-        P0[OFFSET, OFFSET] = 1e-12
-    else:
-        one = int(np.argmax(kind == ATTITUDE))
-        x0[OFFSET] = math.remainder(z[one] - x0[PSI] - (at[one] - at[0]), 2 * math.pi)
-    wander = absolute_walk if absolute is not None else 0.0
-
-    def q(walks: tuple[float, float]) -> Floats:
-        return np.array([*walks, 0.0, 0.0, 0.0, wander])
-
-    events, walks = _choose(events, kind, lambda one, w: filter_headings(one, x0, P0, q(w)))
-    passes = filter_headings(events, x0, P0, q(walks))
-    states, covariances = smooth_headings(events, passes)
-    constants, variances = states[-1], np.diagonal(covariances[-1])
-    known = np.array([SCALE, X, DELAY])
-    x1, P1 = x0.copy(), P0.copy()
-    x1[known] = constants[known]
-    P1[known, known] = variances[known]
-    causal = filter_headings(events, x1, P1, q(walks))
-    return _at_rate_samples(turn, G, _Passes(t, causal.x, causal.P, states, covariances, walks))
-
-
-def _choose(
-    events: HeadingEvents, kind: Ints, run: Callable[[HeadingEvents, tuple[float, float]], HeadingPasses]
-) -> tuple[HeadingEvents, tuple[float, float]]:
-    """Return events with robust variances of the courses, and the random walks with the largest likelihood."""
-    course = kind == COURSE
-    nominal, walks = events.r, (ANGLE_WALKS[1], BIAS_WALKS[1])
-    for _ in range(3):
-        passes = run(events, walks)
-        z = passes.innovation[course] / np.sqrt(passes.variance[course])
-        settled = z[len(z) // 20 + 2 :]
-        spread = float(np.clip(mad_std(settled, 0.0), 0.7, 10.0)) if len(settled) >= FEWEST_COURSES else 1.0
-        nominal = np.where(course, nominal * spread**2, nominal)
-        weights = np.ones(len(nominal))
-        weights[course] = huber_weights(z / spread, HUBER_SIGMAS)
-        events = events._replace(r=nominal / np.maximum(weights, 0.02) ** 2)
-        walks = max(
-            ((angle, bias) for angle in ANGLE_WALKS for bias in BIAS_WALKS),
-            key=lambda one: run(events, one).log_likelihood(),
+    def __init__(
+        self, drive: DriveArrays, turn: TurnRate, guess: Guess, absolute: Sequence[AbsoluteHeading], *, stands: bool
+    ) -> None:
+        """Measure the courses about a guess."""
+        self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
+        courses = measure_courses(drive, turn, guess)
+        self.courses = len(courses.end)
+        if self.courses < FEWEST_COURSES:
+            return
+        self.middle = fit_middle(courses, guess)
+        self.window_s = float(np.median(courses.end - courses.begin))
+        still_t, still_rate = _standing(drive, turn) if stands else (np.empty(0), np.empty(0))
+        t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
+        kind = np.repeat(
+            [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute))],
+            [len(courses.end), len(still_t), *(len(one.t) for one in absolute)],
         )
-    # courses of windows that follow one another err alike, by slip that the model lacks
-    passes = run(events, walks)
-    z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
-    alike = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
-    return events._replace(r=np.where(course, events.r * alike, events.r)), walks
+        k = STATES + STATES_OF_A_SOURCE * len(absolute)
+        h = np.zeros((len(t), k))
+        h[kind != STANDING, PSI] = 1.0
+        h[kind == STANDING, BIAS] = 1.0
+        rows = kind == COURSE
+        h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
+            courses.of_bias, courses.of_scale, courses.of_x, courses.of_delay,
+        )  # fmt: skip
+        for i, one in enumerate(absolute):
+            rows, first = kind == ABSOLUTE + i, STATES_OF_A_SOURCE * i
+            h[rows, first + OFFSET] = h[rows, first + WANDER] = 1.0
+            h[rows, first + LAG] = -one.rate
+        z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute)])
+        std = np.concatenate([courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute)])
+        of_x = np.concatenate([courses.of_x, np.zeros(len(t) - len(courses.of_x))])
+        self._order(t, kind, h, z, std, of_x)
 
+    def _order(self, t: Floats, kind: Ints, h: Floats, z: Floats, std: Floats, of_x: Floats) -> None:
+        """Sort the events by time, with steps that measure nothing between those far apart."""
+        sorted_t = np.sort(t)
+        gap = np.flatnonzero(np.diff(sorted_t) > 2.0 * LONGEST_STEP_S)
+        fill = [
+            np.arange(sorted_t[i] + LONGEST_STEP_S, sorted_t[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in gap
+        ]
+        extra = np.concatenate([*fill, np.empty(0)])
+        n = len(extra)
+        t, kind = np.concatenate([t, extra]), np.concatenate([kind, np.full(n, NOTHING)])
+        order = np.lexsort((kind, t))
+        self.t, self.kind = t[order], kind[order]
+        self.h = np.concatenate([h, np.zeros((n, h.shape[1]))])[order]
+        self.z, self.of_x = np.concatenate([z, np.zeros(n)])[order], np.concatenate([of_x, np.zeros(n)])[order]
+        self.std = np.concatenate([std, np.ones(n)])[order]
+        self.at = np.interp(self.t, self.turn.t, self.G)
+        self.holes = np.diff(self.turn.hole_variance(self.t), prepend=0.0)
 
-class _Passes(NamedTuple):
-    """Events (n,) [s] with the causal filter's states (n, 6) and covariances, the smoother's, and their walks."""
+    def events(self, noises: dict[str, float], alike: float = 1.0) -> HeadingEvents:
+        """Return the events with the variances of some noises."""
+        from icrtool.kernels.heading_kalman import HeadingEvents
 
-    t: Floats
-    x: Floats
-    P: Floats
-    states: Floats
-    covariances: Floats
-    walks: tuple[float, float]
+        r = self.std**2
+        course = self.kind == COURSE
+        r[course] = alike * (
+            (noises["course"] * self.std[course]) ** 2
+            + (noises["slip"] * self.of_x[course]) ** 2
+            + LEAST_COURSE_STD_RAD**2
+        )
+        for i in range(len(self.absolute)):
+            r[self.kind == ABSOLUTE + i] *= noises[f"{i} white"] ** 2
+        angle = (self.kind == COURSE) | (self.kind >= ABSOLUTE)
+        return HeadingEvents(
+            np.diff(self.t, prepend=self.t[:1]),
+            np.diff(self.at, prepend=self.at[:1]),
+            self.holes,
+            self.z,
+            self.h,
+            r,
+            angle,
+        )
 
+    def model(self, noises: dict[str, float]) -> HeadingModel:
+        """Return start and process of the states."""
+        from icrtool.kernels.heading_kalman import HeadingModel
 
-def _at_rate_samples(turn: TurnRate, G: Floats, passes: _Passes) -> HeadingEstimate:
-    """Return the estimates at the rate's samples: carried on by the rate from the last event, or between events."""
-    t, x, P, states, covariances, walks = passes
-    constants, variances = states[-1], np.diagonal(covariances[-1])
-    rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))
-    s = turn.t[rows]
-    last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
-    dt, dG = s - t[last], G[rows] - np.interp(t, turn.t, G)[last]
-    causal = x[last, PSI] + (1 + x[last, SCALE]) * dG - x[last, BIAS] * dt
-    f = np.zeros((len(rows), 6))
-    f[:, PSI], f[:, BIAS], f[:, SCALE] = 1.0, -dt, dG
-    variance = np.einsum("ni,nij,nj->n", f, P[last], f) + walks[0] * dt
-    scaled = (1 + constants[SCALE]) * G
-    smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))
-    smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]))
-    return HeadingEstimate(
-        s, causal, np.sqrt(np.maximum(variance, 0.0)), smoothed, smoothed_std, constants, np.sqrt(variances), walks
-    )
+        count = len(self.absolute)
+        std = np.concatenate([PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
+        std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
+        x, q, decay = np.zeros(len(std)), np.zeros(len(std)), np.zeros(len(std))
+        first = int(np.argmax(self.kind == COURSE))
+        x[PSI] = self.z[first] - (self.at[first] - self.at[0])
+        q[PSI], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
+        for i in range(count):
+            one = int(np.argmax(self.kind == ABSOLUTE + i))
+            at = STATES_OF_A_SOURCE * i
+            x[at + OFFSET] = math.remainder(self.z[one] - x[PSI] - (self.at[one] - self.at[0]), 2 * math.pi)
+            growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
+            std[at + OFFSET] = self.absolute[i].offset_std
+            x[at + OFFSET] *= math.isinf(std[at + OFFSET])
+            std[at + OFFSET] = min(std[at + OFFSET], math.pi)
+            std[at + WANDER], decay[at + WANDER], q[at + WANDER] = size, growth / (2.0 * size**2), growth
+        return HeadingModel(x, np.diag(std**2), q, decay, np.zeros(len(std), np.bool_))
+
+    def guess(self, noises: dict[str, float]) -> Guess:
+        """Return where to measure the courses next."""
+        from icrtool.kernels.heading_kalman import filter_headings, smooth_headings
+
+        events, model = self.events(noises), self.model(noises)
+        states, _ = smooth_headings(events, model, filter_headings(events, model))
+        bias = np.interp(self.turn.t, self.t, states[:, BIAS])
+        return Guess(bias, float(states[-1, X]), float(states[-1, DELAY]), self.middle)
+
+    def solve(self, noises: dict[str, float]) -> HeadingEstimate:
+        """Return the estimate with some noises."""
+        from icrtool.kernels.heading_kalman import filter_headings, smooth_headings
+
+        events, model = self.events(noises), self.model(noises)
+        passes = filter_headings(events, model)
+        alike = self._alike(passes)
+        if alike > 1.0:
+            events = self.events(noises, alike)
+            passes = filter_headings(events, model)
+        states, covariances = smooth_headings(events, model, passes)
+        fixed = np.ones(len(model.x), np.bool_)
+        fixed[[PSI, BIAS]] = False
+        fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
+        x, P = model.x.copy(), model.P.copy()
+        x[fixed] = states[-1][fixed]
+        P[np.ix_(fixed, fixed)] = covariances[-1][np.ix_(fixed, fixed)]
+        causal = filter_headings(events, model._replace(x=x, P=P, fixed=fixed))
+        return self._at_rate_samples(causal, states, covariances, noises, mad_std(self._settled(causal), 0.0))
+
+    def _settled(self, passes: HeadingPasses) -> Floats:
+        """Return the courses' innovations in standard deviations, but for the first ones."""
+        course = self.kind == COURSE
+        z = passes.innovation[course] / np.sqrt(passes.variance[course])
+        settled: Floats = z[len(z) // 20 + 2 :]
+        return settled
+
+    def _alike(self, passes: HeadingPasses) -> float:
+        """Return by how much courses of windows that follow one another err alike, by slip that the model lacks."""
+        z = np.clip(self._settled(passes), -SETTLED_SIGMAS, SETTLED_SIGMAS)
+        return float(long_run_factor(z[:, None])[0])
+
+    def usual(self) -> dict[str, float]:
+        """Return noises to start from."""
+        grids = dict(NOISES)
+        for i in range(len(self.absolute)):
+            grids |= {f"{i} {name}": values for name, values in NOISES_OF_A_SOURCE.items()}
+        return {name: float(values[len(values) // 2]) for name, values in grids.items()}
+
+    def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
+        """Return the noises with those of the grids that have the largest likelihood, one after the other."""
+        from icrtool.kernels.heading_kalman import heading_log_likelihood
+
+        def likelihood(name: str, value: float) -> float:
+            tried = noises | {name: value}
+            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
+
+        for _ in range(MOST_SWEEPS):
+            before = dict(noises)
+            for name, values in grids.items():
+                costs = [likelihood(name, float(value)) for value in values]
+                noises = noises | {name: float(values[int(np.argmax(costs))])}
+            if noises == before:
+                break
+        return noises
+
+    def _at_rate_samples(
+        self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float], spread: float
+    ) -> HeadingEstimate:
+        """Return the estimates at samples of the rate: carried on from the last event, or between events."""
+        t, turn, G = self.t, self.turn, self.G
+        constants, variances = states[-1].copy(), np.diagonal(covariances[-1])
+        every = max(1, round(1.0 / (LARGEST_RATE_HZ * float(np.median(np.diff(turn.t))))))
+        rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
+        s = turn.t[rows]
+        last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
+        dt, dG = s - t[last], G[rows] - self.at[last]
+        x, P = causal.x[last], causal.P[last]
+        carried = x[:, PSI] + (1 + x[:, SCALE]) * dG - x[:, BIAS] * dt
+        f = np.zeros((len(rows), x.shape[1]))
+        f[:, PSI], f[:, BIAS], f[:, SCALE] = 1.0, -dt, dG
+        variance = np.einsum("ni,nij,nj->n", f, P, f) + noises["angle"] ** 2 * dt
+        variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
+        scaled = (1 + constants[SCALE]) * G
+        smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))
+        stamp = turn.stamp_std()[rows] ** 2
+        smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
+        return HeadingEstimate(
+            s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
+            constants, np.sqrt(variances), noises, spread,
+        )  # fmt: skip

@@ -50,8 +50,8 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
 
     Parameters
     ----------
-    offset_rad : heading minus course; a heading from magnetic north is less than the course by the declination
-    datum : where; None: a metric reference, of which no north is known
+    offset_rad : heading minus course over ground; a heading from magnetic north is less by the declination
+    datum : where; None: a metric reference without a known north
     stamp_ns : when, Unix time
     """
     if not sigma_rad <= LIKE_RAD:
@@ -91,7 +91,7 @@ def utm_convergence_deg(datum: Datum) -> float | None:
 
 
 def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
-    """Return the declination of the World Magnetic Model; None where it says nothing of the date."""
+    """Return the declination of the World Magnetic Model; None where it does not cover the date."""
     from pygeomag import GeoMag
 
     day = datetime.fromtimestamp(stamp_ns / 1e9, UTC)

@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.alignment.course_over_ground import (
-    FEWEST_WINDOWS,
-    Course,
-)
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.alignment.estimator import SLIPPING, AlignmentFit
 from icrtool.config import Config
@@ -21,6 +17,7 @@ from icrtool.records.tables import RobotLog, WheelSamples
 SMALLEST_TURN_RAD = math.radians(20.0)
 
 NEVER_MOVES_SHARE = 0.02
+FEWEST_WINDOWS = 8
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 
@@ -63,7 +60,6 @@ class WheelAlignment:
     configured: tuple[float, float]
     held_share: float
     warnings: tuple[str, ...]
-    course: Course | None
 
     @property
     def applied_scale(self) -> float:

@@ -13,18 +13,21 @@ LONGEST_HOLE_S = 1.0
 
 
 def measured_headings(run: Run) -> tuple[MeasuredHeading, ...]:
-    """Return the headings measured apart from the position reference, a gyro's before an attitude's.
+    """Return the headings measured apart from the position reference, a gyro's before an attitude sensor's.
 
-    A heading read from the same topic as the position is the reference's own and is left out, like one that does not
-    cover the run.
+    A heading that needs positions is left out (estimated, or a field of the position's messages), like one that does
+    not cover the run.
     """
     found, sensors = [], run.sensors
     stamps = run.table.stamp_ns
     if sensors.gyro is not None and _covers(sensors.gyro.stamp_ns, stamps):
         found.append(MeasuredHeading("gyro", _integrate(sensors.gyro.stamp_ns, sensors.gyro.rate_radps, stamps)))
-    if not sensors.heading_from_position and _covers(sensors.headings.stamp_ns, stamps):
-        turned = np.unwrap(sensors.headings.heading_rad)
-        angle = np.interp(_since(stamps, stamps), _since(sensors.headings.stamp_ns, stamps), turned)
+    needs_positions = sensors.heading_from_position or sensors.heading_is_estimated
+    attitude = None if needs_positions else sensors.headings
+    attitude = sensors.attitude if sensors.attitude is not None else attitude
+    if attitude is not None and _covers(attitude.stamp_ns, stamps):
+        turned = np.unwrap(attitude.heading_rad)
+        angle = np.interp(_since(stamps, stamps), _since(attitude.stamp_ns, stamps), turned)
         found.append(MeasuredHeading("heading", angle))
     return tuple(found)
 
@@ -35,7 +38,7 @@ def _since(stamp_ns: Ints, epoch_ns: Ints) -> Floats:
 
 
 def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
-    """Say whether measurements reach from the first state to the last without a long hole."""
+    """Return whether measurements reach from the first state to the last without a long hole."""
     hole = LONGEST_HOLE_S * 1e9
     within = measured_ns[(measured_ns > states_ns[0]) & (measured_ns < states_ns[-1])]
     return bool(np.max(np.diff(np.concatenate([states_ns[:1], within, states_ns[-1:]]))) < hole)

@@ -105,6 +105,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
                 "reference_delay_s": measurements.position_delay_s,
                 "heading_correlation_s": sensors.heading_correlation_s,
                 "heading_from_position": sensors.heading_from_position,
+                "heading_is_estimated": sensors.heading_is_estimated,
                 "antenna_m": sensors.antenna_m,
                 "antenna_is_known": measurements.antenna_is_known,
                 "states": len(table),

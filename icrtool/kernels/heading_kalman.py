@@ -1,8 +1,10 @@
-"""Kalman filter and smoother of a heading with linear constants beside it, event by event.
+"""Kalman filter and smoother of a heading with linear constants and slowly varying errors beside it, event by event.
 
-State x = (heading, bias, scale error, further constants). Between events it grows by (1 + scale) turn - bias dt,
-with turn the integrated rate. Every event measures one number: z = h x + noise, wrapped where it is an angle.
-Filter: Kalman 1960. Smoother: Rauch, Tung, Striebel 1965.
+State x = (heading, bias, scale error, further ones). Between events the heading grows by (1 + scale) turn - bias dt,
+with turn the integrated rate; further states stay, or decay to zero. Every event measures one number: z = h x + noise,
+wrapped where it is an angle. An innovation beyond `HUBER_SIGMAS` counts as one of that size.
+Filter: Kalman 1960; bounded influence: Masreliez and Martin 1977; states that are uncertain, but not estimated:
+Schmidt 1966. Smoother: Rauch, Tung, Striebel 1965.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ from icrtool.kernels.compiled import njit
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+HUBER_SIGMAS = 2.5
+
 
 class HeadingEvents(NamedTuple):
     """What is measured, in order of time; (n, ...) each.
@@ -25,15 +29,41 @@ class HeadingEvents(NamedTuple):
     Attributes
     ----------
     dt : seconds since the event before; turn : integrated turn rate over them [rad]
+    extra : further variance of that turn [rad^2]
     z : measured; h : (n, k) its derivative by the state; r : variance; angle : whether z is one
     """
 
     dt: Floats
     turn: Floats
+    extra: Floats
     z: Floats
     h: Floats
     r: Floats
     angle: Bools
+
+    def cut(self, count: int) -> HeadingEvents:
+        """Return the first events."""
+        return HeadingEvents(
+            self.dt[:count], self.turn[:count], self.extra[:count], self.z[:count], self.h[:count], self.r[:count],
+            self.angle[:count],
+        )  # fmt: skip
+
+
+class HeadingModel(NamedTuple):
+    """Start and process of the states.
+
+    Attributes
+    ----------
+    x : (k,), P : (k, k) at the first event
+    q : (k,) process variance per second; decay : (k,) [1/s], 0 for a state that stays
+    fixed : (k,) states whose values are kept: their uncertainty counts, they are not estimated
+    """
+
+    x: Floats
+    P: Floats
+    q: Floats
+    decay: Floats
+    fixed: Bools
 
 
 class HeadingPasses(NamedTuple):
@@ -46,40 +76,49 @@ class HeadingPasses(NamedTuple):
     innovation: Floats
     variance: Floats
 
-    def log_likelihood(self) -> float:
-        """Return the log likelihood of the innovations, each counted up to 3 standard deviations."""
-        nis = np.minimum(self.innovation**2 / self.variance, 9.0)
-        return float(-0.5 * (nis + np.log(self.variance)).sum())
 
-
-def filter_headings(events: HeadingEvents, x0: Floats, P0: Floats, q: Floats) -> HeadingPasses:
-    """Run the filter; `q` (k,) is the process variance per second of each state."""
+def filter_headings(events: HeadingEvents, model: HeadingModel) -> HeadingPasses:
+    """Run the filter."""
     n, k = events.h.shape
     out = HeadingPasses(
         np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n)
     )
-    _forward(events, np.array(x0, np.float64), np.array(P0, np.float64), q, out)
+    _forward(events, model._replace(x=model.x.copy(), P=model.P.copy()), out)
     return out
 
 
+def heading_log_likelihood(events: HeadingEvents, model: HeadingModel) -> float:
+    """Return the log likelihood of the innovations under Huber's density."""
+    none = HeadingPasses(*(np.empty(shape) for shape in ((0, 0), (0, 0, 0), (0, 0), (0, 0, 0), 0, 0)))
+    return float(_forward(events, model._replace(x=model.x.copy(), P=model.P.copy()), none))
+
+
 @njit
-def _forward(events: HeadingEvents, x: Floats, P: Floats, q: Floats, out: HeadingPasses) -> None:
+def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:  # noqa: C901, PLR0912 - one event, in one place
     n, k = events.h.shape
-    T, Ph = np.empty((k, k)), np.empty(k)
+    x, P = model.x, model.P
+    T, Ph, phi = np.empty((k, k)), np.empty(k), np.ones(k)
+    stored, likelihood = len(out.innovation) > 0, 0.0
     for i in range(n):
         dt, turn = events.dt[i], events.turn[i]
+        # F is diag(phi) but for its first row (1, -dt, turn, 0, ...)
         x[0] += (1.0 + x[2]) * turn - x[1] * dt
-        # F is the identity but for its first row (1, -dt, turn, 0, ...)
+        for a in range(k):
+            if model.decay[a] > 0.0:
+                phi[a] = math.exp(-model.decay[a] * dt)
+                x[a] *= phi[a]
         for b in range(k):
             for a in range(k):
-                T[a, b] = P[a, b]
+                T[a, b] = phi[a] * P[a, b]
             T[0, b] = P[0, b] - dt * P[1, b] + turn * P[2, b]
         for a in range(k):
             for b in range(k):
-                P[a, b] = T[a, b]
+                P[a, b] = T[a, b] * phi[b]
             P[a, 0] = T[a, 0] - dt * T[a, 1] + turn * T[a, 2]
-            P[a, a] += q[a] * dt
-        out.x_predicted[i], out.P_predicted[i] = x, P
+            P[a, a] += model.q[a] * (dt if model.decay[a] == 0.0 else (1.0 - phi[a] ** 2) / (2.0 * model.decay[a]))
+        P[0, 0] += events.extra[i]
+        if stored:
+            out.x_predicted[i], out.P_predicted[i] = x, P
         S, y = events.r[i], events.z[i]
         for a in range(k):
             y -= events.h[i, a] * x[a]
@@ -90,18 +129,29 @@ def _forward(events: HeadingEvents, x: Floats, P: Floats, q: Floats, out: Headin
             S += events.h[i, a] * Ph[a]
         if events.angle[i]:
             y -= 2.0 * math.pi * round(y / (2.0 * math.pi))
-        out.innovation[i], out.variance[i] = y, S
+        size = abs(y) / math.sqrt(S)
+        likelihood -= 0.5 * (
+            math.log(S) + (size**2 if size < HUBER_SIGMAS else HUBER_SIGMAS * (2.0 * size - HUBER_SIGMAS))
+        )
+        if stored:
+            out.innovation[i], out.variance[i] = y, S
+        S *= max(size / HUBER_SIGMAS, 1.0)
         for a in range(k):
-            x[a] += Ph[a] / S * y
+            if not model.fixed[a]:
+                x[a] += Ph[a] / S * y
             for b in range(k):
-                P[a, b] -= Ph[a] * Ph[b] / S
-        out.x[i], out.P[i] = x, P
+                if not (model.fixed[a] and model.fixed[b]):
+                    P[a, b] -= Ph[a] * Ph[b] / S
+        if stored:
+            out.x[i], out.P[i] = x, P
+    return likelihood
 
 
-def smooth_headings(events: HeadingEvents, passes: HeadingPasses) -> tuple[Floats, Floats]:
+def smooth_headings(events: HeadingEvents, model: HeadingModel, passes: HeadingPasses) -> tuple[Floats, Floats]:
     """Return smoothed states (n, k) and their covariances (n, k, k)."""
-    k = events.h.shape[1]
-    F = np.tile(np.eye(k), (len(events.z) - 1, 1, 1))
+    n, k = events.h.shape
+    F = np.zeros((n - 1, k, k))
+    F[:, np.arange(k), np.arange(k)] = np.exp(-model.decay * events.dt[1:, None])
     F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.turn[1:]
     solved = np.asarray(np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]), np.float64)
     gains = np.ascontiguousarray(solved.transpose(0, 2, 1))

@@ -41,6 +41,7 @@ class FilterInputs(NamedTuple):
 
     name: str
     heading_from_position: bool
+    heading_is_estimated: bool
     heading_correlation_s: float
     antenna_m: tuple[float, float]
     losses_ns: Ints
@@ -67,6 +68,8 @@ def write_measurements(run: Run, path: Path) -> None:
     if sensors.gyro is not None:
         columns["gyro_topic"] = np.frombuffer(sensors.gyro.topic.encode("utf-8", "surrogatepass"), np.uint8)
         columns |= {"gyro_stamp_ns": sensors.gyro.stamp_ns, "gyro_rate_radps": sensors.gyro.rate_radps}
+    if sensors.attitude is not None:
+        columns |= {f"attitude_{name}": getattr(sensors.attitude, name) for name in _names(HeadingSamples)}
     with path.open("xb") as file:
         np.savez(file, **columns)  # type: ignore[arg-type]  # numpy's stub takes the columns for its own flag
 
@@ -102,6 +105,10 @@ def read_measurements(
             losses_ns=inputs.losses_ns,
             events=inputs.events,
             icr_start=inputs.icr_start,
+            heading_is_estimated=inputs.heading_is_estimated,
+            attitude=HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
+            if "attitude_stamp_ns" in columns
+            else None,
         )
         outcomes = [
             _outcome(columns, group, stamps_ns, table)

@@ -148,8 +148,15 @@ class GnssDocument(TypedDict):
 
 
 class HeadingDocument(TypedDict):
-    """The heading."""
+    """The heading.
 
+    `source`: orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused; `parts`: of an
+    estimated one, with its standard deviation `std_deg` (null for a stated one).
+    """
+
+    source: str
+    parts: str | None
+    std_deg: float | None
     offset_deg: float | None
     offset_std_deg: float | None
     offset_name: str | None
@@ -183,6 +190,7 @@ class FilterDocument(TypedDict):
     reference_delay_s: float
     heading_correlation_s: float
     heading_from_position: bool
+    heading_is_estimated: bool
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
     icr_start: IcrStartDocument | None

@@ -71,7 +71,8 @@ def open_run(path: str | Path) -> Run:
         forward, right = facts["antenna_m"]
         start = facts["icr_start"]
         inputs = FilterInputs(
-            document["log"], facts["heading_from_position"], facts["heading_correlation_s"], (forward, right), losses,
+            document["log"], facts["heading_from_position"], facts["heading_is_estimated"],
+            facts["heading_correlation_s"], (forward, right), losses,
             tuple(SlipEvent(**{name: event[name] for name in SlipEvent._fields}) for event in document["events"]),
             None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
         )  # fmt: skip

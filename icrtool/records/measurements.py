@@ -77,6 +77,8 @@ class SensorData:
     gyro : not used by the filter; None without one
     heading_from_position : heading and position are fields of the same messages: they have the same delay
     heading_correlation_s : the errors of headings closer together than this are correlated
+    heading_is_estimated : `headings` are estimated, with the positions; they do not exist without them
+    attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
@@ -94,6 +96,8 @@ class SensorData:
     losses_ns: Ints
     events: tuple[SlipEvent, ...] = ()
     icr_start: IcrStart | None = None
+    heading_is_estimated: bool = False
+    attitude: HeadingSamples | None = None
 
     def earlier(self, delay_s: float) -> SensorData:
         """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""

@@ -221,16 +221,19 @@ def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
 
 def _heading_lines(run: Run) -> list[str]:
     heading = run.summary["heading"]
-    if heading["offset_deg"] is None:
-        said = "could not be compared with the course: too little straight driving"
-        return [_line("heading", said), *_heading_counts(heading)]
-    # Adding zero takes the sign off a rounded -0.0.
-    offset = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg off the course"
-    if heading["offset_name"]:
-        offset += f" ({heading['offset_name']})"
-    applied = heading["applied_offset_deg"]
-    said = f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected"
-    return [_line("heading", said), *_heading_counts(heading)]
+    source = heading.get("source")
+    lines = [f"{source.replace('_', ' ')}: {heading['parts']}"] if heading.get("parts") else []
+    if heading["offset_deg"] is not None:
+        # Adding zero takes the sign off a rounded -0.0.
+        offset = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg off the course"
+        if heading["offset_name"]:
+            offset += f" ({heading['offset_name']})"
+        applied = heading["applied_offset_deg"]
+        lines.append(f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")
+    elif not lines:
+        lines = ["could not be compared with the course: too little straight driving"]
+    named = [_line("" if number else "heading", line) for number, line in enumerate(lines)]
+    return [*named, *_heading_counts(heading)]
 
 
 def _heading_counts(heading: Mapping[str, Any]) -> list[str]:

@@ -119,7 +119,7 @@ def constant(log: RobotLog) -> Floats:
     ("make", "why"),
     [
         (random, "scatters so much"),
-        (wandering, "has nothing to do with the course; ENU, NED and every offset tried in"),
+        (wandering, "points nowhere"),
         (frozen, "stays the same while the wheels turn the robot"),
         (constant, "stays the same"),
     ],
