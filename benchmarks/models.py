@@ -17,7 +17,7 @@ from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.estimation.fit import fit
 from icrtool.fleet.recordings import find_recordings
-from icrtool.logs import read_log
+from icrtool.logs.read_log import read_log
 from icrtool.motion.models import CONTROLLER, MODELS
 from icrtool.motion.recording import Recording
 from icrtool.output.run_directory import RUN_FILE, is_run_directory

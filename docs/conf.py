@@ -23,4 +23,4 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 
 # Pages link to files outside docs/ (README, CHANGELOG, sample logs): right in the repository, absent from the site.
-suppress_warnings = ["myst.xref_missing", "toc.not_included"]
+suppress_warnings = ["myst.xref_missing"]

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
     from icrtool.output.calibration_file import open_calibration
     from icrtool.output.page.run_page import write_page
     from icrtool.output.stored_run import open_run
@@ -83,7 +83,7 @@ _HOMES = {
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.calibration_file",
     "open_run": "icrtool.output.stored_run",
-    "read_log": "icrtool.logs",
+    "read_log": "icrtool.logs.read_log",
     "write_page": "icrtool.output.page.run_page",
 }
 

@@ -118,7 +118,7 @@ def _run(source: Path, config: Config) -> Run:
 
         return open_run(source)
     from icrtool.estimation.fit import fit
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
 
     return fit(read_log(source, config), config)
 
@@ -139,7 +139,7 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.alignment.corrections import align_streams
     from icrtool.alignment.estimator import window_residuals
     from icrtool.alignment.wheel_units import with_wheel_speeds
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibration_picture import write_picture
     from icrtool.output.stored_run import log_of
 

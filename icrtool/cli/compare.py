@@ -121,6 +121,6 @@ def _run(path: Path, config: Config, *, verbose: bool) -> Run:
 
         return open_run(path)
     from icrtool.estimation.fit import fit
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
 
     return fit(read_log(path, config), config)

@@ -303,7 +303,7 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     check_target(directory, log, overwrite=request.overwrite)
     notes: list[str] = []
     with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        from icrtool.logs import read_log
+        from icrtool.logs.read_log import read_log
 
         stages.begin("reading")
         measured = read_log(log, request.config, stages.share)

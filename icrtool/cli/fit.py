@@ -193,7 +193,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     start = _warm_start(request.warm_start) if request.warm_start is not None else None
     notes: list[str] = []
     with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        from icrtool.logs import read_log
+        from icrtool.logs.read_log import read_log
 
         stages.begin("reading")
         options.load_ahead("pymap3d", "icrtool.calibration.fit")

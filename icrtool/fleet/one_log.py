@@ -122,7 +122,7 @@ def _results(request: Request, stage: Stage) -> Row:
     """Fit and analyse a log, write run and report."""
     from icrtool.calibration.fit import fit
     from icrtool.dropout_analysis.dropout_report import dropout_report
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
     from icrtool.output.baseline_file import open_baseline
     from icrtool.output.run_directory import PAGE_FILE, check_target
 

@@ -101,7 +101,7 @@ def test_quiet_prints_nothing(icrtool) -> None:
 def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> None:
     status, out, err = icrtool("info", LOG, *ROBOT)
     assert (status, err) == (0, "")
-    assert "excitation  enough to show all three ICRs; turned 972° right, 844° left" in out
+    assert "excitation  enough to show all three ICRs; turned 970° right, 842° left" in out
     assert "gyro:\n  -> /imu/data: 20000 turn rates" in out
     icrtool("simulate", "-o", "straight.mcap", "--path", "straight", "--duration", "60", "-q")
     status, out, err = icrtool("info", "straight.mcap", *ROBOT)

@@ -17,7 +17,7 @@ LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from icrtool.estimation.fit import fit
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
     from icrtool.output.run_directory import write_run
 
     config = __import__("icrtool").load_config(robot="segway-rmp400")

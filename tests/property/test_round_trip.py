@@ -14,7 +14,7 @@ from icrtool.cli.drive_options import PATHS
 from icrtool.cli.simulate import WHEEL_MESSAGES, command
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
-from icrtool.logs import read_log
+from icrtool.logs.read_log import read_log
 from icrtool.records.run import Run
 
 SIGMAS = 3.0

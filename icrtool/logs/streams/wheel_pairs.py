@@ -31,8 +31,8 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
 
     Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
     """
-    kind = LogText(" + ".join(dict.fromkeys((left.message_type.raw, right.message_type.raw))))
-    topic = LogText(f"{left.topic.raw} + {right.topic.raw}")
+    kind = LogText(" + ".join(dict.fromkeys(LogText(side.message_type).raw for side in (left, right))))
+    topic = LogText(f"{LogText(left.topic).raw} + {LogText(right.topic).raw}")
     commanded = bool(COMMANDED.search(left.topic))
     score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
 

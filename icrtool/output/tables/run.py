@@ -229,9 +229,10 @@ def _heading_lines(run: Run) -> list[str]:
         if heading["offset_name"]:
             offset += f" ({heading['offset_name']})"
         applied = heading["applied_offset_deg"]
-        lines.append(f"{offset}; corrected by {-applied:+.1f} deg" if applied else f"{offset}; not corrected")
+        lines.append(f"{offset}; corrected by {0.0 - applied:+.1f} deg" if applied else f"{offset}; not corrected")
     elif not lines:
         lines = ["could not be compared with the course: too little straight driving"]
+    lines = [part for line in lines for part in wrap(line, TABLE_WIDTH - LABEL)]
     named = [_line("" if number else "heading", line) for number, line in enumerate(lines)]
     return [*named, *_heading_counts(heading)]
 

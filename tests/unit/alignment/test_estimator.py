@@ -100,9 +100,9 @@ def test_the_jacobian_equals_differences() -> None:
     found = estimate(2)
     model = _Model(found.drive, found.windows, WIDTH_M)
     # with x_icr, the share of the asymmetry in its sideways motion is left out of the slopes
-    x = np.array([1.01, 0.02, 0.0, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02])
+    x = np.array([1.01, 0.02, 0.0, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02, 0.04])
     residuals, slopes = model.evaluate(x)
-    for column, step in enumerate([1e-6] * 8 + [0.02, 0.02]):
+    for column, step in enumerate([1e-6] * 8 + [0.02, 0.02, 1e-6]):
         sides = []
         for sign in (1, -1):
             moved = x.copy()

@@ -47,15 +47,19 @@ def verdicts(calibration: LogCalibration) -> dict[str, str]:
 def test_a_varied_drive_shows_all_but_what_no_drive_can() -> None:
     found = verdicts(calibrate(simulate(0)))
     assert found.pop("antenna_forward_m") == found.pop("x_icr_m") == "not separable"
-    assert set(found.values()) == {"shown"}
+    # no drive shows the time between two clocks better than 0.08 s: what it moves is weak
+    weak = {key for key, verdict in found.items() if verdict == "weak"}
+    assert weak == {"gnss_delay_s", "gnss_delay_against_heading_s", "antenna_forward_minus_x_icr_m"}
+    assert set(found.values()) <= {"shown", "weak"}
 
 
 def test_a_straight_drive_shows_no_antenna_and_reports_why() -> None:
     found = calibrate(simulate(0, path="straight"))
-    for key in ("antenna_forward_minus_x_icr_m", "antenna_right_minus_icr_middle_m", "icr_separation_m"):
+    assert found.parameter("antenna_right_minus_icr_middle_m").verdict != "shown"
+    for key in ("antenna_forward_minus_x_icr_m", "icr_separation_m"):
         assert found.parameter(key).verdict == "not shown"
         assert "hardly any turns" in found.parameter(key).note
-    assert found.parameter("gnss_delay_s").verdict == "not shown"
+    assert found.parameter("gnss_delay_s").verdict != "shown"
     assert "speed hardly changes" in found.parameter("gnss_delay_s").note
 
 
@@ -72,14 +76,15 @@ def test_a_known_antenna_resolves_the_icrs() -> None:
     found = calibrate(simulate(3), config)
     for key, truth in zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), ICRS, strict=True):
         one = found.parameter(key)
-        assert one.verdict == "shown"
+        assert one.verdict == ("weak" if key == "x_icr_m" else "shown")
         assert abs(one.value - truth) < max(3 * one.std, 0.02)
 
 
 def test_a_known_x_icr_gives_the_antenna() -> None:
     found = calibrate(simulate(3), x_icr_m=ICRS[2])
     assert found.parameter("antenna_forward_m").value == pytest.approx(0.3, abs=0.02)
-    assert "frames.antenna_forward_m" in {setting.key for setting in found.settings}
+    assert found.parameter("antenna_forward_m").verdict == "weak"
+    assert "frames.antenna_right_m" in {setting.key for setting in found.settings}
 
 
 def test_settings_put_back_what_was_wrong() -> None:
@@ -121,7 +126,7 @@ def test_too_short_a_drive_is_refused() -> None:
 
 def test_trouble_log_gives_its_antenna_and_offset(shared_logs) -> None:
     from icrtool.config import load_config
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
 
     config = load_config(robot="pentzer-tracked")
     found = calibrate(read_log(shared_logs / "simulated" / "tracked_trouble", config), config, x_icr_m=0.115)

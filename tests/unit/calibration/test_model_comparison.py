@@ -115,7 +115,7 @@ def test_too_short_a_drive_is_refused() -> None:
 def test_window_fit_beats_momentary_icrs_on_the_shared_logs(shared_logs) -> None:
     """The goal of issue 5: p95 at 10 m, held out, 1.5 times better, median over simulated logs."""
     from icrtool.config import load_config
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
 
     robots = {
         "tracked_curved.bag": "pentzer-tracked",

@@ -16,7 +16,7 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED, RECOVERED, USED
-from icrtool.logs import read_log
+from icrtool.logs.read_log import read_log
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, drive_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate
 from support.matrix_filter import step_state

@@ -136,7 +136,7 @@ def twice(log: RobotLog) -> RobotLog:
 
 
 def late_fixes(log: RobotLog) -> RobotLog:
-    return replace(log, gnss=replace(log.gnss, stamp_ns=log.gnss.stamp_ns + 200_000_000))
+    return replace(log, gnss=replace(log.gnss, stamp_ns=log.gnss.stamp_ns + 300_000_000))
 
 
 def late_heading(log: RobotLog) -> RobotLog:

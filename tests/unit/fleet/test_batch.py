@@ -102,10 +102,10 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
     requests = plan([season], season.parent / "out", BatchOptions())
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
-        rows = list(run_batch(requests, executor, BatchOptions(timeout_s=1.5)))
+        rows = list(run_batch(requests, executor, BatchOptions(timeout_s=4.0)))
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
-    assert any("longer than 1.5 s" in row.reason for row in rows)
+    assert any("longer than 4 s" in row.reason for row in rows)
 
 
 def test_what_is_done_is_skipped_until_input_configuration_or_request_change(season: Path) -> None:

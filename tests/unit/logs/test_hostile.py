@@ -13,7 +13,6 @@ from mcap.writer import Writer
 
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError, LogError
-from icrtool.logs import survey_log
 from icrtool.logs.containers.channel import Channel, Cut
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.open_log import open_log
@@ -21,6 +20,7 @@ from icrtool.logs.cut import moment
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.dynamic_joints import collector_for
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
+from icrtool.logs.read_log import survey_log
 from icrtool.records.text import LogText
 
 SEPARATOR = "=" * 80 + "\n"

@@ -26,9 +26,9 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from icrtool.logs import Survey, survey_log
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.read_log import Survey, survey_log
 from icrtool.logs.streams.heading_sources import HEADING_TYPES
 from icrtool.logs.streams.position_sources import POSITION_TYPES
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES

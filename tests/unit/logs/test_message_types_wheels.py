@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from icrtool.config import load_config
 from icrtool.errors import ConfigError
-from icrtool.logs import survey_log
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.wheel_pairs import pair_motion
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
 
@@ -383,7 +383,7 @@ def test_publishers_of_different_versions_of_a_type_are_joined(tmp_path: Path) -
 
 
 def test_a_configured_topic_that_tells_nothing_is_an_error(tmp_path: Path) -> None:
-    from icrtool.logs import read_log
+    from icrtool.logs.read_log import read_log
 
     messages = [joint_state(ROS2, START_NS, ["a", "b"], [1.0, 2.0], []) for _ in range(3)]
     path = write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState")

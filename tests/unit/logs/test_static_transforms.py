@@ -9,7 +9,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from icrtool.logs import survey_log
+from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.static_transforms import antenna_place
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -105,6 +105,7 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
     assert document["trials"][1]["no_trial"].keys() == {
         "too_little_way_left",
         "across_wheel_gap",
+        "across_slip_event",
         "ends_in_gnss_outage",
         "from_standstill",
     }
