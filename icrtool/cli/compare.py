@@ -31,7 +31,7 @@ def command(
     """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
 
     Each argument is a group: a run, a log, or a folder of runs or logs; arguments of one NAME are one group. The first
-    group is compared with each of the others.
+    group is compared with each of the others. The folder of a batch, given alone, stands for its robots and groups.
 
     \b
     Example:
@@ -73,19 +73,25 @@ def command(
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
-    """Return the places of each group.
+    """Return the places of each group; the only argument may be the folder of a batch, which has groups of its own.
 
     Raises
     ------
     ConfigError
         There is only one group.
+    LogError
+        The table of the batch cannot be read.
     """
     from icrtool.errors import ConfigError
+    from icrtool.fleet.roll_up import is_fleet, runs_of_fleet
 
     places: dict[LogText, list[Path]] = {}
     for source in sources:
         name, path = _named(source)
-        places.setdefault(name, []).append(path)
+        if len(sources) == 1 and is_fleet(path):
+            places = {LogText(group): runs for group, runs in runs_of_fleet(path).items()}
+        else:
+            places.setdefault(name, []).append(path)
     if len(places) < 2:
         raise ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
     return places

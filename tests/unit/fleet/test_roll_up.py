@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from icrtool.cli.compare import _groups
 from icrtool.errors import LogError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
@@ -58,7 +59,8 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
 def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     logs = [*rows("a"), *rows("b", "copy", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
-    assert runs_of_fleet(place) == {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
+    groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
+    assert runs_of_fleet(place) == _groups((str(place),)) == groups
     write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice")], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
     with pytest.raises(LogError):
