@@ -45,7 +45,7 @@ class ExportNumbers:
     turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
     p95_m, full_p95_m : 95th percentile of the error after `POSE_AFTER_M`, held out, of what a controller can express
         and of the recommended model
-    doubts : sentences
+    warnings : sentences
     """
 
     log: str
@@ -70,7 +70,7 @@ class ExportNumbers:
     way_noise: tuple[float, float]
     p95_m: float
     full_p95_m: float
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     twist_width_m: float | None = None
 
     @property
@@ -110,14 +110,14 @@ def export_numbers(calibration: Calibration) -> ExportNumbers:
         raise DataError(calibration.name or names, "too short to measure the error growth", advice)
     numbers = calibration.controller_numbers()
     geometry, covariance = calibration.geometry()
-    doubts = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
-    doubts += [
+    warnings = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
+    warnings += [
         f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
         for name in calibration.fitted.not_shown
     ]
     if numbers.multiplier < 1.0:
         why = "a skid-steer robot turns less than its wheels, not more"
-        doubts.append(f"a multiplier of {numbers.multiplier:.2f} is below 1: {why}")
+        warnings.append(f"a multiplier of {numbers.multiplier:.2f} is below 1: {why}")
     return ExportNumbers(
         names if len(logs) == 1 else f"{len(logs)} logs ({names})",
         min(log.begin_ns for log in logs),
@@ -136,7 +136,7 @@ def export_numbers(calibration: Calibration) -> ExportNumbers:
         way_noise=errors.way_noise,
         p95_m=errors.p95_m,
         full_p95_m=errors.full_p95_m,
-        doubts=(*calibration.warnings, *doubts),
+        warnings=(*calibration.warnings, *warnings),
         twist_width_m=calibration.robot.get("twist_width_m"),
     )
 

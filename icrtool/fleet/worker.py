@@ -198,7 +198,7 @@ def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:
     def read() -> None:
         for line in stream:
             lines.put(line)
-        # Whoever asked is gone, or ends this process.
+        # The process that asked has ended, or ends this one.
         remove_unfinished()
         os._exit(1)
 

@@ -279,8 +279,3 @@ def find_model(name: str) -> MotionModel:
     """
     base = name.removesuffix("_gyro")
     return MODELS[base].with_gyro() if base != name else MODELS[base]
-
-
-def wheels_models() -> Sequence[MotionModel]:
-    """Return every model of the family, for wheels alone, simplest first."""
-    return tuple(MODELS.values())

@@ -18,6 +18,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
+from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.figures.drawing_process import Drawer, DrawingHere
 from icrtool.output.figures.dropout_figures import ReportFigures
@@ -272,12 +273,7 @@ def _event_document(report: DropoutReport) -> dict[str, Any] | None:
     cost = report.event_cost
     if cost is None:
         return None
-    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
-    with_events = {
-        model: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
-        for model, summary in cost.with_events.items()
-    }
-    return {"events": cost.events, "with_events": with_events}
+    return {"events": cost.events, "with_events": _summary_documents(report, cost.with_events)}
 
 
 def _reference_documents(report: DropoutReport) -> list[dict[str, Any]]:
@@ -294,12 +290,17 @@ def _learned_document(report: DropoutReport) -> dict[str, Any] | None:
     split = report.by_learning
     if split is None:
         return None
-    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
-    parts = {
-        part: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
-        for part, summary in (("before", split.before), ("after", split.after))
-    }
+    parts = _summary_documents(report, {"before": split.before, "after": split.after})
     return {"model": "icr", "learned_s": split.learned_s, "learned_at_distance_m": split.distance_m, **parts}
+
+
+def _summary_documents(report: DropoutReport, summaries: Mapping[str, Summary]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each summary, one a horizon."""
+    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
+    return {
+        name: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
+        for name, summary in summaries.items()
+    }
 
 
 def _drive_document(drive: ExampleTrial) -> dict[str, Any]:

@@ -151,7 +151,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{numbers.factor_to_old:.4f} times the old"
         )
-    sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.doubts]
+    sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.warnings]
     return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
 
 

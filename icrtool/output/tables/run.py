@@ -141,9 +141,9 @@ def _multiplier_lines(run: Run) -> list[str]:
         return [_line("multiplier", "not shown: it is made of y right and y left")]
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
-    doubt = "" if shown else ": not shown well enough to be used"
-    said = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
-    return [_line("multiplier", f"{said} = (y right - y left) / b of these, with b = {width:g} m{doubt}")]
+    note = "" if shown else ": not shown well enough to be used"
+    value = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
+    return [_line("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
 
 
 def _recommended_lines(run: Run) -> list[str]:
