@@ -11,7 +11,6 @@ import numpy as np
 from icrtool.estimation.icr_uncertainty import DriveWindows, cut_drive, prior_std
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL
 from icrtool.records.run import ICR_COLUMNS, half_width_m
 from icrtool.records.tables import Floats, States
 
@@ -85,7 +84,7 @@ def find_excitation(
     table : the recorded states
     drive : the same for the kernels
     track_width_m : b, None where not known
-    windows : of the drive, with `nominal_parameters`, where they are there already
+    windows : of the drive, with `nominal_icrs`, where they are there already
 
     Returns
     -------
@@ -97,7 +96,7 @@ def find_excitation(
     own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are marginalised. It
     says what a drive could tell at best, not what the filter made of it.
     """
-    p = nominal_parameters(table, track_width_m)
+    p = nominal_icrs(table, track_width_m)
     width = float(p[0] - p[1])
     windows = cut_drive(table, drive, p) if windows is None else windows
     std = _posterior(
@@ -160,13 +159,13 @@ def withhold_unlearned(
     return replace(found, verdicts=verdicts, sentences=tuple(sentences))
 
 
-def nominal_parameters(table: States, track_width_m: float | None) -> Floats:
-    """Return parameters (7,) near which to ask: the run's final ICRs where they can be, else those of the width."""
+def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
+    """Return ICRs (3,) [m] near which to ask: the run's final ones where they can be, else those of the width."""
     right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     half = half_width_m(track_width_m)
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
-    return np.array([right, left, x, *NEUTRAL[3:]])
+    return np.array([right, left, x])
 
 
 def _posterior(windows: DriveWindows, *, position_std: float, heading_std: float, width: float) -> Floats:

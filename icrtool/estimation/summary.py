@@ -12,7 +12,7 @@ from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
-from icrtool.estimation.observability import Excitation, find_excitation, nominal_parameters, withhold_unlearned
+from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
@@ -131,7 +131,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     """
     table, width = filtered.table, config.robot.track_width_m
     drive = make_drive(table, filtered.in_gap, filtered.outages_ns)
-    p = nominal_parameters(table, width)
+    p = nominal_icrs(table, width)
     windows, own = cut_drive(table, drive, p), filtered.covariance[3:, 3:]
     excitation = find_excitation(table, drive, width, windows)
     if config.filter.preset == "paper":
