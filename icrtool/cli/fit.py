@@ -11,6 +11,7 @@ import click
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def command(
         if not (quiet or as_json):
             from icrtool.output.tables.run import format_run
 
-            click.echo(format_run(run))
+            show(format_run(run))
             click.echo(f"\nwritten to {place}{_beside(request)}")
     if as_json:
         print_json("fit", {"logs": documents})
