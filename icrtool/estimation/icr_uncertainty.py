@@ -65,13 +65,22 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     sums_at_knots(fixed, columns, axes, parameters, dt, none, rows, np.zeros(knots), rate, sums, by)
     place, heading = (table.north_m + 1j * table.east_m)[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
-    missed, slopes = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
+    missed, jacobian = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
     window_residuals(
-        rate, sums, by, start, end, np.column_stack([moved.real, moved.imag]), 0.0, np.ones(len(start)), missed, slopes
+        rate,
+        sums,
+        by,
+        start,
+        end,
+        np.column_stack([moved.real, moved.imag]),
+        0.0,
+        np.ones(len(start)),
+        missed,
+        jacobian,
     )
     turned = np.diff(sums[:, 0])
-    by_offset = np.concatenate([slopes[:, terms], np.zeros(len(turned))])
-    by_terms = np.concatenate([slopes[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
+    by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
+    by_terms = np.concatenate([jacobian[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
     return DriveWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
@@ -106,7 +115,7 @@ def final_covariance(
     heading offset and a wrong wheel scale are not in it. They are in the sandwich covariance (Liang and Zeger 1986) of
     a fit over the windows, clustered by stretches of `STRETCH_M`, heading offset and wheel scales marginalised. Its
     residuals are those of the final ICRs, so that a fit that would end elsewhere counts too. A window weighs
-    exp(-age / T): T = P / q is what a Kalman filter with variance P and random walk q remembers.
+    exp(-age / T): T = P / q is the memory of a Kalman filter with variance P and process noise q.
 
     Coverage of 2 standard deviations of the difference, per ICR. Four recorded Warthog drives on grass, wheel scale
     corrected: 18 of 18 pairs of logs (61 % with the filter's own), 88 % of 72 pairs of halves of different logs (58 %).
