@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icrtool.calibration.held_out import HeldOut
-from icrtool.calibration.measured_errors import ErrorSources
+from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import sums_at_knots
 from icrtool.motion.models import MotionModel, model_columns, wheel_motion
@@ -27,7 +27,7 @@ LENGTHS_M = (2.0, 5.0, 10.0, 20.0)
 """Held-out windows of these lengths are compared."""
 
 SCALED_FROM_M = 5.0
-"""Shorter windows say more of the reference's noise than of the model; they do not scale the quantiles."""
+"""Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
 
 FEWEST_WINDOWS = 20
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
 GYRO_PRIOR_STD = np.array([10.0, 0.02])
-"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this tells one from the other."""
+"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this separates the two."""
 
 GYRO_SCALE_RANGE = 0.1
 """A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
@@ -239,36 +240,31 @@ def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro:
     return twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2])), float(own[1])
 
 
-def fixed_predictor(recording: Recording, fit: PooledFit) -> ErrorsOf:
-    """Return what gives the errors of a fit to other recordings, with the delay of this recording's own wheels."""
-    own = Pool([cut_windows(recording)], [recording.width_m], fit.model).own_constants(0, fit.parameters)
-    rates = twist_rates(recording, fit.model, fit.parameters)
-    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
-
-
-def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
-    """Return what gives the errors of the recommended model, each trial predicted without the blocks that it touches.
+def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
+    """Return what gives the errors of the recommended model in recording i, predicted without what a trial touches.
 
     Notes
     -----
-    The parameters, and the delay of the wheels, are fitted to windows that share no distance with any block from a
-    trial's start to its end; the model is the one chosen without the block of the start. Trials for which too little
-    is left to fit to have no error.
+    The parameters are fitted to windows that share no distance with any fold, recording or block, from a trial's start
+    to its end; the model is the one chosen without the fold of the start. Trials for which too little is left to fit to
+    have no error.
     """
-    windows = [cut_windows(recording)]
-    edges = np.array([fold.begin_m for fold in table.folds])
-    pools = {name: Pool(windows, [recording.width_m], table.fits[name].model) for name in set(table.chosen)}
-    found: dict[tuple[int, int], tuple[Floats, float] | None] = {}
+    recording = recordings[i]
+    mine = [f for f, fold in enumerate(table.folds) if fold.recording == i]
+    edges = np.array([table.folds[f].begin_m for f in mine])
 
+    @cache
     def rates_without(first: int, last: int) -> tuple[Floats, float] | None:
-        fit = table.without[first]
+        fit, delay_s = table.without[mine[first]], table.delays_s[mine[first]]
         if first != last:
-            fold = Fold("", 0, table.folds[first].begin_m, table.folds[last].end_m)
+            windows = [cut_windows(recording)]
+            fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
             (kept,), _ = mask_windows(windows, [fold])
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 return None
-            fit = pools[table.chosen[first]].fit(kept, fit.solution.x)
-        return twist_rates(recording, fit.model, fit.parameters), float(fit.constants[0, 1])
+            fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
+            delay_s = float(fit.constants[0, 1])
+        return twist_rates(recording, fit.model, fit.parameters), delay_s
 
     def errors_of(trials: Trials) -> Floats:
         errors: Floats = np.full(trials.ends.shape, np.nan)
@@ -276,18 +272,16 @@ def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
         first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
         # Block by block of the start: tables of all trials would need more memory than their errors.
         for a in np.flatnonzero(np.bincount(first)).tolist():
-            mine = np.flatnonzero(first == a)
-            ends = trials.ends[mine]
+            begun = np.flatnonzero(first == a)
+            ends = trials.ends[begun]
             # a trial that ends where a block does touches no more of it
             last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
             last[ends < 0] = -1
             for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
-                if (a, b) not in found:
-                    found[a, b] = rates_without(a, b)
-                if (known := found[a, b]) is not None:
+                if (known := rates_without(a, b)) is not None:
                     of_pair = last == b
                     kept = of_pair.any(axis=1)
-                    rows, there = mine[kept], of_pair[kept]
+                    rows, there = begun[kept], of_pair[kept]
                     part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
                     errors[rows] = np.where(there, trial_errors(recording, part, *known), errors[rows])
         return errors

@@ -10,9 +10,8 @@ import pytest
 
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
-from icrtool.calibration.measured_errors import ErrorSources
 from icrtool.calibration.pooled import calibrate, predictor
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, RunError
 from icrtool.motion.models import MODELS, twist, wheel_motion

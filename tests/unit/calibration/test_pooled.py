@@ -12,7 +12,7 @@ import pytest
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, plan_folds
 from icrtool.calibration.model_choice import choose
-from icrtool.calibration.pooled import CalibrationResult, block_predictor, calibrate, predictor, recording_of
+from icrtool.calibration.pooled import CalibrationResult, calibrate, held_out_predictor, predictor, recording_of
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
@@ -150,7 +150,7 @@ def test_a_trial_is_predicted_without_the_blocks_that_it_touches() -> None:
     edges = [fold.begin_m for fold in table.folds][1:]
     distance = recording.drive.distance
     trials = cut_trials(recording, (20.0, 90.0), all_starts=True)
-    errors = block_predictor(recording, table)(trials)
+    errors = held_out_predictor([recording], table, 0)(trials)
     windows = cut_windows(recording)
     for first, last in ((1, 1), (1, 2)):
         begin, end = table.folds[first].begin_m, table.folds[last].end_m
@@ -175,7 +175,7 @@ def test_a_trial_across_all_blocks_has_no_error() -> None:
     recording = make_recording(SIX, TRUTH, 1, 60.0)
     table, _ = hold_out([recording], SOME, (5.0, 10.0))
     trials = cut_trials(recording, (5.0, 30.0), all_starts=True)
-    errors = block_predictor(recording, table)(trials)
+    errors = held_out_predictor([recording], table, 0)(trials)
     assert len(table.folds) == 2
     assert np.isfinite(errors[:, 0]).any()
     assert not np.isfinite(errors[:, 1]).any() or len(table.folds) > 2
