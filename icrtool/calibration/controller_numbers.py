@@ -11,7 +11,7 @@ from icrtool.calibration.held_out import Fold, HeldOut
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
 from icrtool.motion.fit import PooledFit
-from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_parameters, track_geometry
+from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_model, track_geometry
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import drawn_path, twist_rates
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -188,7 +188,7 @@ def _fold_errors(recording: Recording, windows: Windows, fold: Fold, fit: Pooled
     mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
     s, e = windows.start[mine], windows.end[mine]
     geometry = track_geometry(fit.model, fit.parameters, recording.width_m, typical)
-    rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=windows.steps)
+    rates = twist_rates(recording, controller_model(geometry), steps=windows.steps)
     theta, place = drawn_path(windows.steps, rates)(windows.knot_t)
     miss = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
     turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]

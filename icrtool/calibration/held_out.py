@@ -24,7 +24,7 @@ from icrtool.motion.models import (
     MODELS,
     MotionModel,
     TypicalDrive,
-    controller_parameters,
+    controller_model,
     track_geometry,
     typical_drive,
     wheel_motion,
@@ -259,7 +259,7 @@ class _Tester:
 
     def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> _Fitted:
         """Fit a model to everything; one with a gyro weighs the turn rate of a fit for wheels alone."""
-        pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.turning)
+        pool = Pool(self._windows, self._widths, model, wheels)
         whole, count = pool.fit(), len(self.folds)
         inner = np.full((count, count), np.nan)
         for f in range(count):
@@ -275,9 +275,9 @@ class _Tester:
         model, pool, fits, errors, delays = fitted.model, fitted.pool, [], [], []
         for f in range(len(self.folds)):
             if wheels is not None:
-                pool = Pool(self._windows, self._widths, model, wheels.fits[f].turning)
+                pool = Pool(self._windows, self._widths, model, wheels.fits[f])
             fit = pool.fit(self._clear[f], fitted.pool.without(fitted.whole, ~self._clear[f]))
-            found, delay = self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f])
+            found, delay = self._trial_errors(pool, fit, f)
             fits.append(fit)
             errors.append(found)
             delays.append(delay)
@@ -299,7 +299,7 @@ class _Tester:
             return float("nan")
         return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
-    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> tuple[Floats, float]:
+    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int) -> tuple[Floats, float]:
         """Return the errors of a fold's trials, and the delay of the wheels [s] that they hold for.
 
         Notes
@@ -310,9 +310,8 @@ class _Tester:
         fold = self.folds[f]
         i = fold.recording
         own = pool.own_constants(i, fit.parameters) if fold.whole else fit.constants[i]
-        turn = None if wheels is None else wheels.turning
         recording, steps = self._recordings[i], self._windows[i].steps
-        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]), steps)
+        rates = twist_rates(recording, fit, float(own[2]), steps)
         return trial_errors(recording, self._trials[f], rates, float(own[1]), steps), float(own[1])
 
     def controller_errors(self, fit: PooledFit, f: int, delay_s: float) -> Floats:
@@ -320,7 +319,7 @@ class _Tester:
         i = self.folds[f].recording
         recording, steps = self._recordings[i], self._windows[i].steps
         geometry = track_geometry(fit.model, fit.parameters, recording.width_m, self.typical)
-        rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=steps)
+        rates = twist_rates(recording, controller_model(geometry), steps=steps)
         return trial_errors(recording, self._trials[f], rates, delay_s, steps)
 
 

@@ -16,10 +16,11 @@ import numpy as np
 from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
 from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
-from icrtool.calibration.record import Calibration, FittedModel
+from icrtool.calibration.record import Calibration
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs, Summary
+from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
@@ -129,7 +130,7 @@ def compare_models(
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         scores=tuple(scores),
         chosen=wheels.chosen,
-        fits={name: FittedModel(fit.model, fit.parameters, fit.covariance) for name, fit in wheels.fits.items()},
+        fits={name: fit.fitted for name, fit in wheels.fits.items()},
         best=wheels.recommended,
         width_m=recording.width_m,
         heading=heading,

@@ -14,14 +14,13 @@ from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import measure_error_sources
 from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_out, mask_windows
-from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
+from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
-from icrtool.motion.fit import Pool, PooledFit
-from icrtool.motion.models import GYRO_TERMS
-from icrtool.motion.recording import Recording, Windows, cut_windows
+from icrtool.motion.fit import Pool
+from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import Trials, trial_errors, twist_rates
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
@@ -161,9 +160,9 @@ def calibration_from(
     scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
     return Calibration(
         robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
-        fitted=_fitted(best),
-        others={name: _fitted(fit) for name, fit in wheels.fits.items()},
-        gyro=None if gyro is None else _fitted(gyro.fits[gyro.recommended]),
+        fitted=best.fitted,
+        others={name: fit.fitted for name, fit in wheels.fits.items()},
+        gyro=None if gyro is None else gyro.fits[gyro.recommended].fitted,
         typical=wheels.typical,
         why=wheels.why,
         logs=logs,
@@ -179,10 +178,6 @@ def calibration_from(
 def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
     without = [one.name for one in recordings if one.gyro_radps is None]
     return () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
-
-
-def _fitted(fit: PooledFit) -> FittedModel:
-    return FittedModel(fit.model, fit.parameters, fit.covariance)
 
 
 def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
@@ -233,11 +228,9 @@ def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro:
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
-    windows: list[Windows] = [cut_windows(recording)]
-    wheels = (calibration.fitted.model, calibration.fitted.parameters) if GYRO_TERMS[0] in fitted.model.terms else None
-    pool = Pool(windows, [recording.width_m], fitted.model, wheels)
+    pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
     own = pool.own_constants(0, fitted.parameters)
-    return twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2])), float(own[1])
+    return twist_rates(recording, fitted, float(own[2])), float(own[1])
 
 
 def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
@@ -264,7 +257,7 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
                 return None
             fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
             delay_s = float(fit.constants[0, 1])
-        return twist_rates(recording, fit.model, fit.parameters), delay_s
+        return twist_rates(recording, fit), delay_s
 
     def errors_of(trials: Trials) -> Floats:
         errors: Floats = np.full(trials.ends.shape, np.nan)

@@ -13,62 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.motion.models import (
-    MotionModel,
-    TrackGeometry,
-    TypicalDrive,
-    track_geometry,
-    twist,
-    wheel_motion,
-)
+from icrtool.motion.models import FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import Floats, Ints, RobotLog
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
-
-NOT_SHOWN = 0.7
-"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
-
-STEP = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class FittedModel:
-    """A model of the family with its parameters.
-
-    Attributes
-    ----------
-    parameters : (k,), in the order of the model's terms; covariance : (k, k)
-    """
-
-    model: MotionModel
-    parameters: Floats
-    covariance: Floats
-
-    @property
-    def std(self) -> Floats:
-        """One standard deviation of each parameter (k,)."""
-        deviations: Floats = np.sqrt(np.diag(self.covariance))
-        return deviations
-
-    @property
-    def not_shown(self) -> tuple[str, ...]:
-        """Names of the terms that the data did not show: they rest on the prior."""
-        share = self.std / self.model.prior_std
-        return tuple(name for name, left in zip(self.model.terms, share, strict=True) if left > NOT_SHOWN)
-
-    def geometry(self, width_m: float, typical: TypicalDrive) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs, multipliers and radius factors, and their covariance (7, 7)."""
-        at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
-        by_parameter = np.zeros((len(at), len(self.parameters)))
-        for k in range(len(self.parameters)):
-            moved = self.parameters.copy()
-            moved[k] += STEP
-            by_parameter[:, k] = (np.array(track_geometry(self.model, moved, width_m, typical)) - at) / STEP
-        covariance: Floats = by_parameter @ self.covariance @ by_parameter.T
-        return TrackGeometry(*at.tolist()), covariance
 
 
 class HeldOutScore(NamedTuple):
@@ -244,7 +195,7 @@ class Calibration:
         x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
         """
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
-        found = twist(self.fitted.model, self.fitted.parameters, wheel_motion(left, right, self.width_m))
+        found = self.fitted.twist(wheel_motion(left, right, self.width_m))
         return found[:, 0] if np.ndim(v_left) == 0 else found
 
     def odometry(self, log: RobotLog) -> Odometry:

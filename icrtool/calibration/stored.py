@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, TypedDict, TypeVar
 
 import msgspec
@@ -14,10 +15,9 @@ from icrtool.calibration.record import (
     CalibrationLog,
     ControllerErrors,
     ErrorSources,
-    FittedModel,
     HeldOutScore,
 )
-from icrtool.motion.models import TypicalDrive, find_model
+from icrtool.motion.models import FittedModel, TypicalDrive, find_model
 from icrtool.records.text import escaped
 
 WIDEST_M = 20.0
@@ -56,12 +56,13 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
     if document["schema"] != CALIBRATION_SCHEMA:
         raise ValueError(f"schema {document['schema']!r}")
     gyro, controller, sources = document["gyro"], document["controller"], document.get("error_sources")
+    fitted = _fitted(document["model"], document)
     try:
         found = Calibration(
             robot=_robot(document["robot"]),
-            fitted=_fitted(document["model"], document),
+            fitted=fitted,
             others={name: _fitted(name, one) for name, one in document["models"].items()},
-            gyro=None if gyro is None else _fitted(gyro["model"], gyro),
+            gyro=None if gyro is None else replace(_fitted(gyro["model"], gyro), wheels=fitted),
             typical=_record(TypicalDrive, document["typical"]),
             why=_text(document["why"]),
             logs=tuple(_record(CalibrationLog, log) for log in document["logs"]),

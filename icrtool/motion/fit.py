@@ -16,7 +16,7 @@ import numpy as np
 
 from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
-from icrtool.motion.models import MotionModel, model_columns, twist, wheel_motion
+from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, Windows
 from icrtool.records.tables import Bools, Floats
 
@@ -27,22 +27,18 @@ CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02])
 """Prior of `CONSTANTS` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
 
 
-@dataclass(frozen=True, slots=True)
-class PooledFit:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PooledFit(FittedModel):
     """A model fitted to windows of several recordings.
 
     Attributes
     ----------
-    parameters : (k,) of the model's terms; covariance : (k, k)
     constants : (recordings, 3), see `CONSTANTS`
     solution : of all parameters, those of the model first, then three a recording
     residuals, jacobian : of all windows (m,), (m, k + 3 recordings), at the minimum
     kept : (m,) the residuals that were fitted
     """
 
-    model: MotionModel
-    parameters: Floats
-    covariance: Floats
     constants: Floats
     solution: RobustFit
     residuals: Floats
@@ -50,13 +46,9 @@ class PooledFit:
     kept: Bools
 
     @property
-    def turning(self) -> Turning:
-        """The model and parameters whose turn rate a model with a gyro combines with the gyro's."""
-        return self.model, self.parameters
-
-
-Turning = tuple[MotionModel, Floats]
-"""A wheels-only model and its parameters."""
+    def fitted(self) -> FittedModel:
+        """The model and its parameters alone."""
+        return FittedModel(self.model, self.parameters, self.covariance, self.wheels)
 
 
 class WindowResiduals:
@@ -66,14 +58,14 @@ class WindowResiduals:
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
+    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
     """
 
-    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
+    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None) -> None:
         steps = windows.steps
-        motion = wheel_motion(steps.v_left, steps.v_right, width_m)
+        motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
         if wheels is not None:
-            motion = motion._replace(gyro=steps.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
+            motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
         self._fixed, axes, columns = model_columns(model, motion)
         # the gyro's bias is one more column of the turn rate
         self._axes = np.append(axes, OMEGA)
@@ -108,13 +100,17 @@ class Pool:
     Parameters
     ----------
     windows, widths_m : by recording
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
+    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
     """
 
     def __init__(
-        self, windows: Sequence[Windows], widths_m: Sequence[float], model: MotionModel, wheels: Turning | None = None
+        self,
+        windows: Sequence[Windows],
+        widths_m: Sequence[float],
+        model: MotionModel,
+        wheels: FittedModel | None = None,
     ) -> None:
-        self.model = model
+        self.model, self._wheels = model, wheels
         self._parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(windows, widths_m, strict=True)]
         self._windows = windows
         groups, offset = [], 0
@@ -189,8 +185,9 @@ class Pool:
         k = len(self.model.terms)
         at, residuals, jacobian = last[0]
         return PooledFit(
-            self.model, found.x[:k], found.covariance[:k, :k], found.x[k:].reshape(-1, 3), found,
-            residuals + jacobian @ (found.x - at), jacobian, rows,
+            self.model, found.x[:k], found.covariance[:k, :k], self._wheels,
+            constants=found.x[k:].reshape(-1, 3), solution=found, residuals=residuals + jacobian @ (found.x - at),
+            jacobian=jacobian, kept=rows,
         )  # fmt: skip
 
     def without(self, fit: PooledFit, dropped: Bools) -> Floats:

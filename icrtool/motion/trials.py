@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.kernels.open_loop import trial_ends
-from icrtool.motion.fit import Turning
-from icrtool.motion.models import MotionModel, twist, wheel_motion
+from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import MOVING_MPS, Recording, Steps, joined_steps, samples_a_step
 from icrtool.records.tables import Complexes, Floats, Ints
 
@@ -131,25 +130,16 @@ def drawn_path(steps: Steps, rates: Floats) -> PathAt:
 
 
 def twist_rates(
-    recording: Recording,
-    model: MotionModel,
-    parameters: Floats,
-    wheels: Turning | None = None,
-    gyro_bias: float = 0.0,
-    steps: Steps | None = None,
+    recording: Recording, fitted: FittedModel, gyro_bias: float = 0.0, steps: Steps | None = None
 ) -> Floats:
     """Return the body twist v_x, v_y, omega (3, n) of each wheel sample, or step of joined ones.
 
     Parameters
     ----------
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
     gyro_bias : added to the turn rate [rad/s]
     steps : the wheel samples joined; default single samples
     """
     of = steps if steps is not None else joined_steps(recording, 1)
-    motion = wheel_motion(of.v_left, of.v_right, recording.width_m)
-    if wheels is not None and recording.gyro_radps is not None:
-        motion = motion._replace(gyro=of.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
-    rates = twist(model, parameters, motion)
+    rates = fitted.twist(wheel_motion(of.v_left, of.v_right, recording.width_m, of.gyro))
     rates[2] += gyro_bias
     return rates

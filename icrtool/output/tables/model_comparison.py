@@ -11,8 +11,7 @@ import numpy as np
 
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE
 from icrtool.calibration.model_comparison import ModelComparison
-from icrtool.calibration.record import FittedModel
-from icrtool.motion.models import TypicalDrive
+from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_format import FITTED, TABLE_WIDTH
 from icrtool.records.dropout import ModelScore
 

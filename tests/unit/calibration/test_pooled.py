@@ -62,7 +62,7 @@ def test_a_log_is_tested_with_parameters_of_the_others() -> None:
     table, _ = hold_out(recordings, [SIX], (5.0, 10.0))
     alone = Pool([cut_windows(one) for one in recordings[:2]], [WIDTH_M] * 2, SIX).fit()
     own = Pool([cut_windows(recordings[2])], [WIDTH_M], SIX).own_constants(0, alone.parameters)
-    rates = twist_rates(recordings[2], SIX, alone.parameters)
+    rates = twist_rates(recordings[2], alone)
     errors = trial_errors(recordings[2], cut_trials(recordings[2], (5.0, 10.0)), rates, float(own[1]))
     # the two fits stop within a small share of their standard deviation of one another
     assert table.score("six").folds[2].expected == pytest.approx(np.nanmean(errors, axis=0), rel=0.02)
@@ -162,12 +162,12 @@ def test_a_trial_is_predicted_without_the_blocks_that_it_touches() -> None:
         model = MODELS[table.chosen[first]]
         clear = np.tile((windows.end_m <= begin) | (windows.start_m >= end), 2)
         fit_apart = Pool([windows], [WIDTH_M], model).fit(clear)
-        rates = twist_rates(recording, model, fit_apart.parameters)
+        rates = twist_rates(recording, fit_apart)
         one = Trials(trials.starts[[row]], trials.ends[[row]])
         expected = trial_errors(recording, one, rates, float(fit_apart.constants[0, 1]))
         assert errors[row, 0] == pytest.approx(expected[0, 0], rel=0.02, abs=1e-3)
         # the fit to everything gives another error: the comparison above can fail
-        whole = twist_rates(recording, model, table.fits[model.name].parameters)
+        whole = twist_rates(recording, table.fits[model.name])
         assert trial_errors(recording, one, whole)[0, 0] != pytest.approx(expected[0, 0], rel=1e-3)
 
 

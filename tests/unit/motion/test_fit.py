@@ -7,9 +7,10 @@ import pytest
 
 from icrtool.errors import DataError
 from icrtool.motion.fit import CONSTANTS, Pool, WindowResiduals
-from icrtool.motion.models import MODELS, MotionModel, find_model, twist, wheel_motion
+from icrtool.motion.models import MODELS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.records.tables import Floats
 from support.recordings import WIDTH_M, draw_parameters, make_recording
 
 EIGHT = MODELS["eight"]
@@ -17,6 +18,10 @@ SEEDS = range(8)
 STEP = 1e-6
 ROUNDING_M = 1e-9
 FREE = [model for model in MODELS.values() if model.terms]
+
+
+def fitted(model: MotionModel, parameters: Floats) -> FittedModel:
+    return FittedModel(model, parameters, np.eye(len(parameters)))
 
 
 def pool_of(model: MotionModel, *recordings: Recording) -> Pool:
@@ -27,7 +32,7 @@ def pool_of(model: MotionModel, *recordings: Recording) -> Pool:
 def test_derivatives_are_those_of_differences(name: str) -> None:
     model = find_model(name)
     recording = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0, gyro=True)
-    wheels = (EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
+    wheels = fitted(EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
     residuals = WindowResiduals(cut_windows(recording), model, WIDTH_M, wheels)
     x = np.concatenate([draw_parameters(model, np.random.default_rng(1)), [0.02, 0.033, 0.01]])
     k = len(model.terms)
@@ -46,7 +51,7 @@ def test_window_ends_equal_the_direct_integration() -> None:
     parameters = draw_parameters(EIGHT, np.random.default_rng(2))
     recording = make_recording(EIGHT, parameters, seconds=60.0)
     trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
-    rates = twist_rates(recording, EIGHT, parameters)
+    rates = twist_rates(recording, fitted(EIGHT, parameters))
     errors, drive = trial_errors(recording, trials, rates), recording.drive
     np.testing.assert_array_equal(rates, twist(EIGHT, parameters, wheel_motion(drive.v_left, drive.v_right, WIDTH_M)))
     for start in range(0, 300, 50):
@@ -119,6 +124,6 @@ def test_a_delay_of_the_wheels_is_found_and_used() -> None:
     found = pool_of(model, moved).fit()
     assert found.constants[0, 1] == pytest.approx(0.2, abs=0.02)
     trials = cut_trials(moved, (10.0,))
-    rates = twist_rates(moved, model, found.parameters)
+    rates = twist_rates(moved, found)
     with_delay, without = trial_errors(moved, trials, rates, 0.2), trial_errors(moved, trials, rates)
     assert np.nanmean(with_delay) < 0.5 * np.nanmean(without)
