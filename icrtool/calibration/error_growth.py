@@ -201,7 +201,7 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     """
     stretches = 0
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    for fold, fit, delay in zip(table.folds, table.without, table.delays_s, strict=True):
+    for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
         recording = recordings[fold.recording]
         try:
             windows = cut_windows(recording, LENGTHS_M, recordings)
@@ -209,12 +209,19 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
             continue
         mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
         ends = Ends(windows.knot_t, windows.start[mine], windows.end[mine])
-        errors = path_errors(windows.steps, ends, fit, recording.width_m, delay)
+        errors = path_errors(windows.steps, ends, fit, recording.width_m, own.wheels_later_s)
         row = np.searchsorted(recording.t_s, windows.knot_t)
         heading = recording.drive.heading[row]
         turned = errors.turned - (heading[ends.end] - heading[ends.start])
         stretches += len(np.unique(np.floor(windows.start_m[mine] / CHOICE_HORIZON_M)))
-        found.append((windows.length_m[mine], errors, turned, errors.moved - windows.reference[mine]))
+        found.append(
+            (
+                windows.length_m[mine],
+                errors,
+                turned,
+                errors.moved - np.exp(-1j * own.heading_offset_rad) * windows.reference[mine],
+            )
+        )
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
         return None

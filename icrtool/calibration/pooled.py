@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -21,7 +22,7 @@ from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool
 from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import Trials, trial_errors, twist_rates
+from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
@@ -151,8 +152,8 @@ def calibration_from(
             one.path,
             one.sha256,
             float(one.drive.distance[-1]),
-            float(np.degrees(own[0])),
-            -float(own[1]),
+            math.degrees(own.heading_offset_rad),
+            -own.wheels_later_s,
             one.begin_ns,
         )
         for one, own in zip(recordings, best.constants, strict=True)
@@ -196,7 +197,13 @@ ErrorsOf = Callable[[Trials], Floats]
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return what gives the errors of a calibration in any trials of a recording.
+    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated_path`."""
+    path = calibrated_path(calibration, recording, with_gyro=with_gyro)
+    return lambda trials: trial_errors(recording, trials, path)
+
+
+def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> PathAt:
+    """Return the path that a calibration makes of a recording.
 
     Parameters
     ----------
@@ -211,16 +218,7 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
 
     Notes
     -----
-    Delay of the wheels and bias of the gyro are the recording's own, found with the parameters held.
-    """
-    rates, wheels_delay_s = recorded_rates(calibration, recording, with_gyro=with_gyro)
-    return lambda trials: trial_errors(recording, trials, rates, wheels_delay_s)
-
-
-def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> tuple[Floats, float]:
-    """Return the body twist (3, n) of each wheel sample by a calibration, and the delay of the wheels [s].
-
-    Parameters, errors and notes are those of `predictor`.
+    Constants of the recording are found in it with the parameters held.
     """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
@@ -229,8 +227,7 @@ def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro:
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
-    own = pool.own_constants(0, fitted.parameters)
-    return twist_rates(recording, fitted, float(own[2])), float(own[1])
+    return predicted_path(recording, fitted, pool.own_constants(0, fitted.parameters))
 
 
 def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
@@ -247,8 +244,8 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
     edges = np.array([table.folds[f].begin_m for f in mine])
 
     @cache
-    def rates_without(first: int, last: int) -> tuple[Floats, float] | None:
-        fit, delay_s = table.without[mine[first]], table.delays_s[mine[first]]
+    def path_without(first: int, last: int) -> PathAt | None:
+        fit, own = table.without[mine[first]], table.own[mine[first]]
         if first != last:
             windows = [cut_windows(recording)]
             fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
@@ -256,8 +253,8 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 return None
             fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
-            delay_s = float(fit.constants[0, 1])
-        return twist_rates(recording, fit), delay_s
+            own = fit.constants[0]
+        return predicted_path(recording, fit, own)
 
     def errors_of(trials: Trials) -> Floats:
         errors: Floats = np.full(trials.ends.shape, np.nan)
@@ -271,12 +268,12 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
             last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
             last[ends < 0] = -1
             for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
-                if (known := rates_without(a, b)) is not None:
+                if (path := path_without(a, b)) is not None:
                     of_pair = last == b
                     kept = of_pair.any(axis=1)
                     rows, there = begun[kept], of_pair[kept]
                     part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
-                    errors[rows] = np.where(there, trial_errors(recording, part, *known), errors[rows])
+                    errors[rows] = np.where(there, trial_errors(recording, part, path), errors[rows])
         return errors
 
     return errors_of

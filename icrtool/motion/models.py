@@ -89,7 +89,9 @@ TERMS: dict[str, Term] = {
         Term("vy_v", VY, lambda m: m.v, 0.0, 0.0, 0.02, "sideways while driving ahead (Anousaki 2004)"),
         Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, 0.0, 0.0, 0.1, "drag in turns (Seegmiller 2014)"),
         Term("gyro_scale", OMEGA, lambda m: m.gyro, 0.0, 0.0, 0.02, "scale error of the gyro"),
-        Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.5, "weight of the wheels in the turn rate"),
+        Term(
+            "wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.15, "weight of the wheels in the turn rate"
+        ),
     )
 }
 """Every term by name."""
@@ -171,6 +173,11 @@ def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints
     for row, name in zip(columns, model.terms, strict=True):
         row[:] = TERMS[name].column(motion)
     return fixed, axes, columns
+
+
+def gyro_gains(model: MotionModel) -> Floats:
+    """Return by how much each parameter (k,) of a model with a gyro raises the gyro's share of the turn rate."""
+    return np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
 
 
 def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
