@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import math
-from textwrap import wrap
 from typing import Any
 
 from icrtool.calibration.transfer import Cell, Pair, Transfer
-from icrtool.output.text_format import TABLE_WIDTH
+from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.text import table_cell
 
@@ -67,29 +66,34 @@ def transfer_csv(transfer: Transfer) -> bytes:
     return text.getvalue().encode()
 
 
-def format_transfer(transfer: Transfer) -> str:
+def format_transfer(transfer: Transfer) -> Text:
     """Return verdicts, differences and the transfer matrix, no line end."""
-    lines: list[str] = []
+    blocks: list[Block] = []
     for pair in transfer.pairs:
-        lines += [*wrap(verdict(transfer, pair), TABLE_WIDTH), ""]
-        lines.append(f"{'':<24}{pair.first:>16.16}{pair.second:>16.16}{'difference ± std':>24}")
-        for one in pair.parameters:
-            difference = f"{one.difference:+.3f} ± {one.std:.3f}"
-            lines.append(f"{one.quantity:<24}{one.first:>+16.3f}{one.second:>+16.3f}{difference:>24}")
+        rows = [
+            (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", f"{one.difference:+.3f} ± {one.std:.3f}")
+            for one in pair.parameters
+        ]
+        table = Table("lr", rows, ("", pair.first, pair.second, "difference ± std"))
+        blocks += [verdict(transfer, pair), "", table]
         for horizon, change in pair.errors.items():
             if math.isfinite(change.p95_m):
                 route = ", the same route" if pair.paired else ""
-                lines.append(f"held-out error after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
-                             f"expected {_change(change[3:])}")  # fmt: skip
-        lines.append("")
-    lines.append(f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column")
+                blocks.append(f"held-out error after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
+                              f"expected {_change(change[3:])}")  # fmt: skip
+        blocks.append("")
     names = list(transfer.calibrations)
-    lines.append(f"{'':<24}" + "".join(f"{name:>20.18}" for name in names))
-    for row in names:
-        cells = (transfer.cell(row, column, CHOICE_HORIZON_M).errors for column in names)
-        lines.append(f"{row:<24.22}" + "".join(f"{f'{one.p95_m:.2f} / {one.expected_m:.2f}':>20}" for one in cells))
-    lines.append("on the diagonal each trial is predicted by what was not fitted to it")
-    return "\n".join(line.rstrip() for line in lines)
+    cells = [[transfer.cell(row, column, CHOICE_HORIZON_M) for column in names] for row in names]
+    matrix = [
+        (row[0].calibrated_on, *(f"{one.errors.p95_m:.2f} / {one.errors.expected_m:.2f}" for one in row))
+        for row in cells
+    ]
+    blocks += [
+        f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
+        Table("lr", matrix, ("", *names)),
+        "on the diagonal each trial is predicted by what was not fitted to it",
+    ]
+    return Text(blocks)
 
 
 def verdict(transfer: Transfer, pair: Pair) -> str:
