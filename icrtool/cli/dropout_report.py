@@ -15,6 +15,7 @@ from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.options import POSITIVE
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -265,7 +266,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
-        click.echo(format_dropout(report))
+        show(format_dropout(report))
         page = f"; page: {directory / PAGE_FILE}" if request.page else ""
         click.echo(f"\nwritten to {directory / 'dropout'}{page}")
     else:

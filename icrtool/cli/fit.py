@@ -11,6 +11,7 @@ import click
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
     if not request.prints_nothing:
         from icrtool.output.tables.run import format_run
 
-        click.echo(format_run(run))
+        show(format_run(run))
         click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
     from icrtool.records.samples import ROLE_WORDS
 

@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import recorded_rates, recording_of
+from icrtool.calibration.pooled import calibrated_path, recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
 from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.motion.trials import wheels_path
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
@@ -202,7 +201,7 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
 def _calibrated_path(run: Run, calibration: Calibration, steps: Steps) -> dict[str, Any] | None:
     recording = recording_of(run)
     try:
-        place, heading = wheels_path(recording, *recorded_rates(calibration, recording))
+        heading, place = calibrated_path(calibration, recording)(recording.t_s)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None
