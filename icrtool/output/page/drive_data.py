@@ -16,7 +16,6 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
-from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
@@ -141,8 +140,8 @@ def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
-    fixes, code = run.sensors.fixes, run.gnss.code
-    groups = {"used": (code > UNSEEN) & (code != GATED), "rejected": code == GATED}
+    fixes = run.sensors.fixes
+    groups = {"used": run.gnss.used, "rejected": run.gnss.rejected}
     found = {}
     for name, chosen in groups.items():
         difference = run.gnss.difference[chosen]
@@ -159,7 +158,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     heading = run.heading
-    used = np.flatnonzero((heading.code > UNSEEN) & (heading.code != GATED))
+    used = np.flatnonzero(heading.used)
     rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
     return {
         "t": packed(heading.t_s[rows], "f64"),
