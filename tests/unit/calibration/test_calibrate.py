@@ -67,7 +67,7 @@ def test_a_circle_one_way_does_not_separate_antenna_from_offset() -> None:
     found = calibrate(simulate(0, path="circle"))
     for key in ("antenna_forward_minus_x_icr_m", "heading_offset_deg"):
         assert found.parameter(key).verdict == "not shown"
-        assert "add as many turns to the left" in found.parameter(key).note
+        assert "in one direction only" in found.parameter(key).note
     assert not any(setting.key.startswith("frames.") for setting in found.settings)
 
 
