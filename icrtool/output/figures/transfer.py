@@ -24,7 +24,7 @@ def draw_transfer(document: Mapping[str, Any]) -> Figure:
     ----------
     document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
     """
-    names, rows = list(document["groups"]), [one for one in document["costs"] if _known(one["p95_m"])]
+    names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
     subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
     figure = new_figure(" · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows))
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
