@@ -58,6 +58,12 @@ CAPTIONS = {
     ),
     "worst": ("The worst trials", "What they share (a turn, a slope, a place) is where the model fails."),
     "outages": ("Outages", "The path without GNSS, forced or real, and where the estimate was when fixes returned."),
+    "icrs": (
+        "Final ICRs of every log",
+        "One robot on one ground should lie on one level; a step is other ground or wear.",
+    ),
+    "errors": ("Errors by robot and group", "Each point is a log: how much the logs of a group differ."),
+    "failures": ("Why logs failed", "The commonest reason first."),
     "transfer": (
         "The cost of a foreign calibration",
         "Left: the darker, the larger the error. Right: an interval (95 %) that crosses zero may be chance.",
