@@ -13,9 +13,9 @@ from typing import Any, Literal, NotRequired, TypedDict, get_type_hints
 import msgspec
 import numpy as np
 
-from icrtool.calibration.measured_errors import ControllerErrors, ErrorSources
-from icrtool.calibration.record import CalibrationLog, ControllerNumbers, HeldOutScore
-from icrtool.calibration.transfer import Cell, Difference, ErrorChange, TransferCost
+from icrtool.calibration.error_differences import ErrorEstimate
+from icrtool.calibration.record import CalibrationLog, ControllerErrors, ControllerNumbers, ErrorSources, HeldOutScore
+from icrtool.calibration.transfer import Difference
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.kernels.block_sums import BlockSums
@@ -134,13 +134,15 @@ DropoutDocument = plain("DropoutDocument", {
 })  # fmt: skip
 
 Group = plain("Group", {"model": str, "logs": list[record(CalibrationLog)], "geometry": record(TrackGeometry)})
+PLACE = {"calibrated_on": str, "tested_on": str, "horizon_m": float}
 PairDocument = plain("PairDocument", {
     "first": str, "second": str, "parameters": list[record(Difference, significant=bool)],
-    "errors": list[record(ErrorChange)], "verdict": str,
+    "errors": list[record(ErrorEstimate, "ErrorChange", horizon_m=float, paired=bool)], "verdict": str,
 })  # fmt: skip
 CompareDocument = plain("CompareDocument", {
     "schema": Literal["icrtool/compare/1"], "groups": dict[str, Group], "pairs": list[PairDocument],
-    "transfer": list[record(Cell)], "costs": list[record(TransferCost)],
+    "transfer": list[record(ErrorEstimate, "Cell", **PLACE, trials=int)],
+    "costs": list[record(ErrorEstimate, "Cost", **PLACE)],
 })  # fmt: skip
 
 Source = plain("Source", {"name": str, "model": str, "created": str})

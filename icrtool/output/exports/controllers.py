@@ -127,7 +127,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
     right, left, x = numbers.icrs_m
     std_right, std_left, std_x = numbers.icr_std_m
     robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
-    distance_m = numbers.way_m
+    distance_m = numbers.distance_m
     origin = (
         f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {distance_m:.0f} m{robot}, "
         f"fitted {numbers.created[:10]}"

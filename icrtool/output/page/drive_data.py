@@ -11,14 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import gyro_recording_of, recorded_rates
+from icrtool.calibration.pooled import calibrated_path, gyro_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
-from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.motion.recording import Recording
-from icrtool.motion.trials import wheels_path
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
@@ -143,8 +141,8 @@ def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
-    fixes, code = run.sensors.fixes, run.gnss.code
-    groups = {"used": (code > UNSEEN) & (code != GATED), "rejected": code == GATED}
+    fixes = run.sensors.fixes
+    groups = {"used": run.gnss.used, "rejected": run.gnss.rejected}
     found = {}
     for name, chosen in groups.items():
         difference = run.gnss.difference[chosen]
@@ -161,7 +159,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     heading = run.heading
-    used = np.flatnonzero((heading.code > UNSEEN) & (heading.code != GATED))
+    used = np.flatnonzero(heading.used)
     rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
     return {
         "t": packed(heading.t_s[rows], "f64"),
@@ -221,13 +219,15 @@ def _path(
     if with_gyro and recording.gyro_radps is None:
         return None
     try:
-        place, heading = wheels_path(recording, *recorded_rates(calibration, recording, with_gyro=with_gyro))
+        heading, place = calibrated_path(calibration, recording, with_gyro=with_gyro)(recording.t_s)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None
     rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
     columns = {"forward": place.real, "right": place.imag, "turn": heading}
-    return {"every": every} | {name: packed_sums(column[rows]) for name, column in columns.items()}
+    return {"every": every, "first_turn": float(heading[0])} | {
+        name: packed_sums(column[rows]) for name, column in columns.items()
+    }
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from icrtool.output.figures.drawing_process import matplotlib_unsaid
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ CAPTIONS = {
         "The drive from above",
         "Filter and position reference should coincide. Odometry leaves them by what wheel speeds alone lose.",
     ),
-    "icr_estimates": ("ICR estimates over time", "Good: the lines settle early and stay within their bands."),
+    "icr_estimates": ("ICR estimates over time", "Good: the lines settle soon and stay within their bands."),
     "icr_clusters": (
         "Where the ICRs lay",
         "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
@@ -84,7 +84,7 @@ def drawn_pictures(figures: Mapping[str, Callable[[], Figure]]) -> dict[str, Pic
     from icrtool.output.figures.style import style
 
     found = []
-    with matplotlib_unsaid():
+    with quiet_matplotlib():
         for name, draw in figures.items():
             with style():
                 image = BytesIO()

@@ -8,8 +8,8 @@ import numpy as np
 
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.pooled import CalibrationResult
-from icrtool.calibration.record import Calibration, FittedModel
-from icrtool.motion.models import TERMS
+from icrtool.calibration.record import Calibration
+from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.text_blocks import Block, Table, Text
 
 GEOMETRY = (

@@ -10,8 +10,7 @@ import numpy as np
 
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE
 from icrtool.calibration.model_comparison import ModelComparison
-from icrtool.calibration.record import FittedModel
-from icrtool.motion.models import TypicalDrive
+from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
 from icrtool.output.text_format import FITTED
 from icrtool.records.dropout import ModelScore

@@ -29,7 +29,7 @@ const icrtoolOpenLoop = (() => {
       const k = Math.min(Math.floor(i / path.every), values.length - 2), from = k * path.every;
       return values[k] + ((i - from) / (Math.min(from + path.every, last) - from)) * (values[k + 1] - values[k]);
     };
-    const turned = heading - at(path.turn, start), c = Math.cos(turned), s = Math.sin(turned);
+    const turned = heading - at(path.turn, start) - path.first_turn, c = Math.cos(turned), s = Math.sin(turned);
     const forward0 = at(path.forward, start), right0 = at(path.right, start);
     const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
     for (let i = start; i <= end; i++) {
