@@ -21,12 +21,12 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
 from icrtool.motion.trials import Trials
 from icrtool.output.dropout_directory import report_document
+from icrtool.output.json_file import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
-from icrtool.output.run_directory import json_bytes
 from icrtool.records.run import Run, drive_of
 from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
