@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams
+from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.kernels.robust import mad_std
 from icrtool.records.measurements import SensorData
@@ -28,6 +28,9 @@ LONGEST_HOLE_S, HOLE_IN_INTERVALS = 0.6, 5.0
 FEWEST_KNOTS = 30
 LONGEST_HELD_IN_USUAL = 2.0
 """A value held for longer than this many times the usual was constant."""
+
+WINDOW_M = 1.0
+"""The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
 LEAST_STD_M, LEAST_TURN_GAIN = 0.01, 1e-3
 
@@ -172,7 +175,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    windows = cut_windows(knots.drive)
+    windows = cut_windows(knots.drive, window_length(knots.drive, WINDOW_M))
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
 
     def clear(begin: Ints, end: Ints) -> Bools:
