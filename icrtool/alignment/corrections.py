@@ -195,7 +195,7 @@ def _decide(
 
 
 def _apply(log: RobotLog, convention: Convention) -> RobotLog:
-    """Return the log with sides and position as the convention says; the heading's handedness is left to the filter."""
+    """Return the log with sides and position of a convention; the heading's handedness is left to the filter."""
     if convention == AS_NAMED:
         return log
     wheels, gnss = log.wheels, log.gnss

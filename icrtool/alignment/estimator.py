@@ -51,7 +51,7 @@ MIDDLE_STD_M = 0.1
 """The middle of the ICRs lies this near to the antenna, to either side."""
 
 SAME_CLOCK_STD_S = 1e-3
-"""Fields of the same messages are late together."""
+"""Fields of the same messages lag alike."""
 
 STEP_S, TURN_STEP_S = 0.02, 0.1
 """Delays are differentiated over the first step to either side, noisy headings over the second."""
@@ -60,7 +60,7 @@ OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
 RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
-"""A robot answers its wheels late by up to 0.1 s, which no drive separates from a delay of the streams."""
+"""A robot lags its wheels by up to 0.1 s, which no drive separates from a delay of the streams."""
 
 CLOCK_STD_S = 0.05
 """A body follows a change of speed later or earlier than a turn, which looks as if its position lagged its heading: by
@@ -84,7 +84,7 @@ MOST_STEPS = 15
 
 
 class Geometry(NamedTuple):
-    """What the estimate says of the robot, with covariance.
+    """The geometry of the robot, with covariance.
 
     Attributes
     ----------
@@ -278,11 +278,11 @@ class _Model:
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
         """Return residuals along, across and of turns, and their Jacobian."""
-        place, place_slopes = self._displacements(x)
-        turn, turn_slopes = self._turns(x)
+        place, place_jacobian = self._displacements(x)
+        turn, turn_jacobian = self._turns(x)
         return (
             np.concatenate([place.real, place.imag, turn]),
-            np.concatenate([place_slopes.real, place_slopes.imag, turn_slopes]),
+            np.concatenate([place_jacobian.real, place_jacobian.imag, turn_jacobian]),
         )
 
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
@@ -333,27 +333,27 @@ class _Model:
         at = np.interp(t, drive.wheel_t, path)
         predicted = at[end] - at[begin]
         speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
-        slopes = np.zeros((len(begin), len(x)), np.complex128)
-        slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
-        slopes[:, C], slopes[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
-        slopes[:, D], slopes[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
-        slopes[:, TP] = -(speed[end] - speed[begin])
+        jacobian = np.zeros((len(begin), len(x)), np.complex128)
+        jacobian[:, A], jacobian[:, M] = between(self.v * nose), between(self.u * nose)
+        jacobian[:, C], jacobian[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
+        jacobian[:, D], jacobian[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
+        jacobian[:, TP] = -(speed[end] - speed[begin])
         sideways = np.interp(t, self.middle_t, x[C] + x[L] * self.v) * self._smooth_turn(t, x)
-        slopes[:, TH] = slopes[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
+        jacobian[:, TH] = jacobian[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
         psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + x[D]
         level = np.exp(-0.5j * (psi[begin] + psi[end]))
-        return (predicted - self.seen) * level, slopes * level[:, None]
+        return (predicted - self.seen) * level, jacobian * level[:, None]
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return predicted minus seen heading changes (u,), and their slopes (u, k)."""
+        """Return predicted minus seen heading changes (u,), and their jacobian (u, k)."""
         windows, t = self.windows, self.drive.wheel_t
         begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:
             return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
 
-        slopes = np.zeros((len(begin), len(x)))
-        slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
-        slopes[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        predicted = x[K] * slopes[:, K] + x[Q] * slopes[:, Q] + x[G] * TURN_WINDOW_S
-        return predicted - self.turned, slopes
+        jacobian = np.zeros((len(begin), len(x)))
+        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        jacobian[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * TURN_WINDOW_S
+        return predicted - self.turned, jacobian
