@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from icrtool.output.json_file import schema_of
 from icrtool.output.page.render import render
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -31,12 +31,4 @@ def comparison_page(document: Mapping[str, Any], title: str) -> str:
 def comparison_in(place: Path) -> Path | None:
     """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
     files = sorted(place.glob("*.json")) if place.is_dir() else [place]
-    return next((file for file in files if (schema_of(file) or "").startswith(COMPARISON_FAMILY)), None)
-
-
-def schema_of(file: Path) -> str | None:
-    """Return the schema that a JSON file states; None where it states none."""
-    try:
-        return str(json.loads(file.read_bytes())["schema"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+    return next((file for file in files if schema_of(file).startswith(COMPARISON_FAMILY)), None)
