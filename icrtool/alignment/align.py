@@ -42,7 +42,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     log = with_wheel_speeds(log, config)
     found = align_streams(log, config)
     wheels, heading, delays = found.wheels, found.heading, found.delays
-    quality = grade_fixes(found.log, config, heading)
+    quality = grade_fixes(found.log, config, found.fix_steps)
     aligned = sensors_as_sent(quality.log, config)
     sense, offset = heading.remaining
     sensors = replace(

@@ -59,6 +59,33 @@ class DriveArrays(NamedTuple):
     fix_std_m: float
     same_clock: bool
 
+    @property
+    def mean_speed(self) -> Floats:
+        """Mean of the sides' speeds (n,) [m/s]."""
+        return (self.v_left + self.v_right) / 2
+
+    @property
+    def half_difference(self) -> Floats:
+        """Half of what left is faster than right (n,) [m/s]."""
+        return (self.v_left - self.v_right) / 2
+
+    @property
+    def nose(self) -> Complexes:
+        """Heading as a unit vector in the middle of each wheel interval (n,)."""
+        return np.asarray(np.exp(1j * np.interp(self.wheel_t + self.wheel_dt / 2, self.heading_t, self.heading)))
+
+    def cumulate(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each wheel sample (n,)."""
+        return np.concatenate([[0.0], np.cumsum((rate * self.wheel_dt)[:-1])])
+
+    def until_fixes(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each fix (m,)."""
+        return np.asarray(np.interp(self.fix_t, self.wheel_t, self.cumulate(rate)))
+
+    def laid_until_fixes(self) -> Complexes:
+        """Return the mean of the sides laid along the heading, until each fix (m,) [m]."""
+        return self.until_fixes(self.mean_speed * self.nose)
+
 
 class DriveWindows(NamedTuple):
     """Windows of a drive.

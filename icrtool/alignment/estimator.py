@@ -253,23 +253,17 @@ class _Model:
 
     def __init__(self, drive: DriveArrays, windows: DriveWindows, width_m: float) -> None:
         self.drive, self.windows, self.b = drive, windows, width_m
-        self.v = (drive.v_left + drive.v_right) / 2
-        self.u = (drive.v_left - drive.v_right) / 2
+        self.v, self.u = drive.mean_speed, drive.half_difference
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
-        self.turn_v, self.turn_w = self._cumulate(self.v).real, self._cumulate(2 * self.u / width_m).real
+        self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
         self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
             windows.turn_begin, drive.heading_t, drive.heading
         )
 
-    def _cumulate(self, rate: Floats | Complexes) -> Complexes:
-        total: Complexes = np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
-        return total
-
     def first_offset(self) -> float | None:
         """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""
-        nose = np.exp(1j * np.interp(self.middle_t, self.drive.heading_t, self.drive.heading))
-        at = np.interp(self.drive.fix_t, self.drive.wheel_t, self._cumulate(self.v * nose))
+        at = self.drive.laid_until_fixes()
         laid = at[self.windows.end] - at[self.windows.begin]
         unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
         if len(unit) < FEWEST_WINDOWS:
@@ -288,7 +282,7 @@ class _Model:
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
         """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
         nose, rate = self._directions(x)
-        path = self._cumulate(self._velocity(x, rate) * nose)
+        path = self.drive.cumulate(self._velocity(x, rate) * nose)
         t = self.drive.fix_t
         turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.drive.wheel_t
         return (
@@ -326,10 +320,10 @@ class _Model:
         begin, end = windows.begin, windows.end
 
         def between(velocity: Complexes) -> Complexes:
-            at = np.interp(t, drive.wheel_t, self._cumulate(velocity))
+            at = np.interp(t, drive.wheel_t, drive.cumulate(velocity))
             return np.asarray(at[end] - at[begin], np.complex128)
 
-        path = self._cumulate(body * nose)
+        path = drive.cumulate(body * nose)
         at = np.interp(t, drive.wheel_t, path)
         predicted = at[end] - at[begin]
         speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)

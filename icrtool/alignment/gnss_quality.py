@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icrtool.alignment.gnss_steps import FixSteps, measure_steps
-from icrtool.alignment.heading_alignment import HeadingAlignment
+from icrtool.alignment.gnss_steps import FixSteps
 from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
 from icrtool.records.tables import (
@@ -82,7 +81,7 @@ class GnssQuality:
     warnings: tuple[str, ...]
 
 
-def grade_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> GnssQuality:
+def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
@@ -91,8 +90,6 @@ def grade_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> Gns
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
     """
     gnss, changes = log.gnss, config.filter.preset != "paper"
-    sense, offset = heading.remaining
-    steps = measure_steps(log, mirrored=sense < 0, offset_rad=offset)
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     kinds, misreported = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}

@@ -141,8 +141,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     t = drive.fix_t
 
     def at(speed: Floats, shift_s: float = 0.0) -> Floats:
-        total = np.concatenate([[0.0], np.cumsum((speed * drive.wheel_dt)[:-1])])
-        return np.asarray(np.interp(t + shift_s, wheel_t, total), np.float64)
+        return np.asarray(np.interp(t + shift_s, wheel_t, drive.cumulate(speed)), np.float64)
 
     speeds = [(at(speed, SPEED_S / 2) - at(speed, -SPEED_S / 2)) / SPEED_S for speed in (left, right)]
     heading = np.interp(t, drive.heading_t, drive.heading)

@@ -66,7 +66,7 @@ def command(
             with atomic_file(file) as partial:
                 partial.write_bytes(content)
     if plot is not None:
-        write_transfer_picture(transfer, plot)
+        write_transfer_picture(document, plot)
     if as_json:
         print_json("compare", document)
     elif not quiet:
