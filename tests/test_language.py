@@ -23,6 +23,7 @@ DONE: tuple[str, ...] = (
     "figures",
     "kernels",
     "logs",
+    "calibration",
     "motion",
     "simulation",
     "dropout_analysis",
@@ -42,6 +43,7 @@ DONE: tuple[str, ...] = (
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PUBLISHED = (
+    "way_noise",
     "too_little_way_left",
     "blind_icr_10m_p95_m",
     "blind_no_slip_10m_p95_m",

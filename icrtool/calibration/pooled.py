@@ -176,6 +176,7 @@ def calibration_from(
         held_out=tuple(scores),
         controller=controller_errors(recordings, wheels),
         sources=measure_error_sources(recordings, wheels),
+        gyro_sources=None if gyro is None else measure_error_sources(recordings, gyro),
         warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,
