@@ -128,7 +128,7 @@ def take_heading(
 
 @njit
 def advance(
-    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, x: Floats, P: Floats,
+    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, turn_variance: float, x: Floats, P: Floats,
     parameters: FilterParameters,
 ) -> float:  # fmt: skip
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
@@ -149,6 +149,7 @@ def advance(
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]
+    P[11] += turn_variance * dt
     return travelled
 
 
@@ -179,6 +180,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
         slips = held < len(data.slipping) and data.slipping[held]
+        turn_variance = data.turn_variance[held] if held < len(data.turn_variance) else 0.0
         while True:
             t_next = t_wheel
             if j < n_gnss:
@@ -189,7 +191,9 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 t_next = min(t_next, data.change_t[c])
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
-                travelled += advance(dt, in_gap, slips, data.v_left[held], data.v_right[held], x, P, parameters)
+                travelled += advance(
+                    dt, in_gap, slips, data.v_left[held], data.v_right[held], turn_variance, x, P, parameters
+                )
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
