@@ -172,7 +172,6 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
         t_wheel = data.wheel_t[k]
         in_gap = t_wheel - data.wheel_t[held] > parameters.wheel_gap_s
         slips = held < len(data.slipping) and data.slipping[held]
-        turn_variance = data.turn_variance[held] if held < len(data.turn_variance) else 0.0
         while True:
             t_next = t_wheel
             if j < n_gnss:
@@ -184,8 +183,9 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
                 travelled += advance(
-                    dt, in_gap, slips, data.v_left[held], data.v_right[held], turn_variance, x, P, parameters
-                )
+                    dt, in_gap, slips, data.v_left[held], data.v_right[held],
+                    data.turn_variance[held] if held < len(data.turn_variance) else 0.0, x, P, parameters,
+                )  # fmt: skip
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
