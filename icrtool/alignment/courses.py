@@ -27,11 +27,8 @@ COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6
 ENOUGH_COURSES = 24.0
 """A course is as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
 
-LARGEST_TURN_ERROR_RAD = 1.0
-"""A course is used where bias and scale of the turn rate turn its window by less than this: it is linear in them."""
-
-LONGEST_COURSE_S = 10.0
-"""... and a change between displacements, of which no turn rate is known, where each takes less."""
+LARGEST_TURN_ERROR_RAD = 2.0
+"""A course is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
 
 FEWEST_FIXES = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
@@ -40,8 +37,8 @@ SPIKE_SIGMAS = 8.0
 MIDDLE_NOISE = 0.01
 """Turns that change the sides' speeds by less than this show no middle."""
 
-LONGEST_STRETCH_S = 30.0
-"""Courses further apart are not compared."""
+LONGEST_STRETCH_S = 60.0
+"""Displacements that take longer, or are further apart, are not compared without a turn rate."""
 
 
 class TurnRate(NamedTuple):
@@ -211,7 +208,8 @@ def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
     begin, end = edge[:-1], edge[1:] - 1
     went = np.interp(t[end], drive.wheel_t, along) - np.interp(t[begin], drive.wheel_t, along)
     seen = (place[end] - place[begin]) * np.sign(went)
-    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went)) & (t[end] - t[begin] < LONGEST_COURSE_S)
+    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
+    kept &= t[end] - t[begin] < LONGEST_STRETCH_S
     middle, seen = ((t[begin] + t[end]) / 2)[kept], seen[kept]
     near = np.diff(middle) < LONGEST_STRETCH_S
     return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]

@@ -27,7 +27,7 @@ LARGEST_START_STD_RAD = math.radians(5.0)
 LARGEST_SPREAD = 2.0
 """Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
 
-LARGEST_WALK = math.radians(3.0)
+LARGEST_WALK = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
 LONGEST_HOLE_S = 1.0
