@@ -27,7 +27,7 @@ LARGEST_START_STD_RAD = math.radians(5.0)
 LARGEST_SPREAD = 2.0
 """Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
 
-LARGEST_WALK = math.radians(10.0)
+LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
 LONGEST_HOLE_S = 1.0
@@ -90,7 +90,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         )
     drive = drive_arrays(log)
     found = _with_gyro(log, drive, None)
-    if found is not None and found.estimate.noises["angle"] < LARGEST_WALK:
+    if found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT:
         return found
     turn = wheel_rate(drive, width_m)
     pair, length = _pair(log, turn)

@@ -62,7 +62,7 @@ MIDDLE_OF_THE_TURN = 0.5
 1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
 
 TURN_WANDER_RAD = math.radians(1.2)
-"""How far a body turns more or less than its wheels show, Brownian motion [rad/sqrt(s)]: the errors of an attitude
+"""How far a body turns more or less than its wheels show, a random walk [rad/sqrt(s)]: the errors of an attitude
 sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow it."""
 
 RESPONSE_S, CHANGE_S = 0.1, 0.5
