@@ -259,6 +259,41 @@ def track_geometry(
     )
 
 
+def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
+    """Return the parameters of model ``full_linear`` with given track ICRs, and their derivatives.
+
+    Parameters
+    ----------
+    icrs_m : y_icr_right, y_icr_left, x_icr
+    width_m : track width b of the terms
+
+    Returns
+    -------
+    parameters : (6,) of the terms, for wheels of the configured radius
+    by : (6, 5) derivatives by the three ICRs [1/m], by a scale of both wheel speeds, and by the scale of the left less
+        that of the right
+
+    Notes
+    -----
+    With scales s_l, s_r and W = y_r - y_l: v_x = (s_l V_l y_r - s_r V_r y_l) / W, omega = (s_l V_l - s_r V_r) / W,
+    v_y = -x omega (Pentzer 2014, Eqs. 8-12).
+    """
+    right, left, x = icrs_m.tolist()
+    W = right - left
+    middle, gain, aside = (right + left) / W, width_m / W, -2.0 * x / W
+    by = {
+        "vx_v": (0.0, 0.0, 0.0, 1.0, middle / 2),
+        "vx_w": (-2.0 * left / W**2, 2.0 * right / W**2, 0.0, middle, 0.5),
+        "omega_w": (-gain / W, gain / W, 0.0, gain, 0.0),
+        "omega_v": (0.0, 0.0, 0.0, 0.0, gain),
+        "vy_w": (-aside / W, aside / W, -2.0 / W, aside, 0.0),
+        "vy_v": (0.0, 0.0, 0.0, 0.0, aside / 2),
+    }
+    value = {"vx_v": 1.0, "vx_w": middle, "omega_w": gain, "omega_v": 0.0, "vy_w": aside, "vy_v": 0.0}
+    terms = MODELS["full_linear"].terms
+    return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
+
+
 NOT_SHOWN = 0.7
 """A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
 

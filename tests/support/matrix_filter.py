@@ -12,8 +12,9 @@ import numpy as np
 
 from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import GATED, RECOVERED, USED, FilterOutput, FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterOutput, FilterParameters, Measurements
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, Floats
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 
 def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
@@ -76,6 +77,7 @@ def run_filter_plain(
         slips = held < len(data.slipping) and data.slipping[held]
         if dt > 0:
             Q = np.diag(parameters.process_variance) * (REFERENCE_STEP_S * dt if parameters.rate_invariant else dt**2)
+            Q[2, 2] += dt * data.turn_variance[held] if held < len(data.turn_variance) else 0.0
             if in_gap or slips:
                 if slips and not in_gap:
                     speeds = (data.v_left[held], data.v_right[held])

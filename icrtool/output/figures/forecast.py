@@ -37,7 +37,8 @@ def draw_forecast(
         grown.axhline(budget, **HALF_WIDTH.keywords())
         grown.annotate(
             f"budget {budget:g} m", (0.99, budget), xycoords=("axes fraction", "data"), xytext=(0, 2),
-            textcoords="offset points", ha="right", fontsize=8, color="0.3",
+            textcoords="offset points", ha="right", fontsize=8, color="0.3", zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )  # fmt: skip
     if forecast.distance_m[-1] > measured_m:
         grown.axvline(measured_m, label="measured up to here", **MEAN.keywords())
@@ -45,7 +46,7 @@ def draw_forecast(
     grown.set_ylabel("position error [m]")
     grown.set_xlim(0.0, None)
     grown.set_ylim(0.0, None)
-    grown.legend(loc="upper left")
+    grown.legend(loc="upper left", frameon=True, facecolor="white", edgecolor="none", framealpha=0.9)
     path.plot(forecast.east_m, forecast.north_m, label="path", **FILTER.keywords())
     every = max(len(forecast.distance_m) // CIRCLES, 1)
     rows = np.arange(every - 1, len(forecast.distance_m), every)
