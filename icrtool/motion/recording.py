@@ -129,8 +129,8 @@ class Steps(NamedTuple):
         """Return the derivative of the gyro's turn rate by time (n,) [rad/s^2]; 0 where it cannot be formed."""
         middle = self.t + self.held / 2.0
         apart = np.append(middle[1:], middle[-1]) - np.append(middle[:1], middle[:-1])
-        rise = np.append(self.gyro[1:], self.gyro[-1]) - np.append(self.gyro[:1], self.gyro[:-1])
-        change: Floats = np.divide(rise, apart, out=np.zeros(len(rise)), where=apart > 0.0)
+        risen = np.append(self.gyro[1:], self.gyro[-1]) - np.append(self.gyro[:1], self.gyro[:-1])
+        change: Floats = np.divide(risen, apart, out=np.zeros(len(risen)), where=apart > 0.0)
         return change
 
 
