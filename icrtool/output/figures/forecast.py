@@ -55,7 +55,7 @@ def draw_forecast(
         size, size, np.zeros(len(rows)), units="xy", offset_transform=path.transData, edgecolors=ICR.color,
         facecolors="none", linewidths=0.8, offsets=np.column_stack([forecast.east_m[rows], forecast.north_m[rows]]),
     )  # fmt: skip
-    path.plot([], [], label=f"95 % of the errors, up to {MEASURED_TO_M:g} m", color=ICR.color, linewidth=0.8)
+    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=ICR.color, linewidth=0.8)
     path.add_collection(circles)
     path.update_datalim(
         [(e + a * r, n + a * r) for e, n, r in zip(forecast.east_m[rows], forecast.north_m[rows], size / 2, strict=True)
@@ -65,5 +65,5 @@ def draw_forecast(
     path.set_aspect("equal", adjustable="datalim")
     path.set_xlabel("East [m]")
     path.set_ylabel("North [m]")
-    figure.legend(loc="lower center", ncols=5, columnspacing=1.8)
+    figure.legend(loc="lower center", ncols=4, columnspacing=1.8)
     return figure
