@@ -157,7 +157,7 @@ def robust_least_squares(
             step = step / 2.0
             tried = evaluate(x + step)
         else:
-            # at a kink of the residuals no step lowers the loss
+            # no part of the step lowers the cost: the Jacobian of noisy data shows no further
             break
         x, (residuals, jacobian) = x + step, tried
         if before - after < settled**2:
