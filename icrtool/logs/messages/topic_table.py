@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,16 @@ _MOST_BYTES_AT_ONCE = 1 << 24
 """Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
 
 
+class SetBack(NamedTuple):
+    """How far log time goes back from one stored message to the next [ns], and the time that then comes again [ns]."""
+
+    step_ns: int
+    again_ns: int
+
+
+NOT_SET_BACK = SetBack(0, 0)
+
+
 @dataclass(frozen=True, slots=True)
 class TopicTable:
     """All messages of one topic, in log-time order.
@@ -43,6 +53,7 @@ class TopicTable:
     texts : the distinct texts of each text field
     unreadable : messages that did not have the shape of their type
     definition_source : where the message definition came from
+    set_back : of the clock that the messages were logged with
     """
 
     topic: LogText
@@ -52,6 +63,7 @@ class TopicTable:
     texts: dict[str, list[LogText]]
     unreadable: int
     definition_source: str
+    set_back: SetBack = NOT_SET_BACK
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -274,7 +286,19 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
+            NOT_SET_BACK if order is None else _set_back(times),
         )
+
+
+def _set_back(times: Ints) -> SetBack:
+    """Return how far stored log times (n,) go back at most, and how long the stretches between the steps overlap."""
+    steps = np.diff(times)
+    begins = np.flatnonzero(steps < 0) + 1
+    first = np.minimum.reduceat(times, [0, *begins])
+    last = np.maximum.reduceat(times, [0, *begins])
+    order = np.argsort(first, kind="stable")
+    again = np.maximum.accumulate(last[order])[:-1] - first[order][1:]
+    return SetBack(int(-steps.min()), int(again.max(initial=0)))
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
@@ -314,7 +338,10 @@ def _merged(group: list[TopicTable]) -> TopicTable:
             renumber = [np.array([*(places[text] for text in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
         columns[path] = _joined(parts, -1 if path in texts else 0)[order]
-    return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)
+    set_back = max(table.set_back for table in group)
+    return replace(
+        group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable, set_back=set_back
+    )
 
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
