@@ -381,7 +381,8 @@ def serve(connection: Connection, megabytes: int) -> None:
 RENEWED = 500
 """Logs a worker uses: what leaks is seen, and is not taken for the fault of one log."""
 
-WALL_FACTOR = 20
+WALL_FACTOR = 200
+"""A worker that gets no share of the processor is no finding; one that waits is ended after this many limits."""
 
 
 class Worker:

@@ -546,6 +546,20 @@ def test_a_clock_that_is_set_back_so_that_times_come_again_is_refused(tmp_path: 
         read_log(clock_set(tmp_path, -5 * 10**9, **clocks), CONFIG)
 
 
+@pytest.mark.parametrize("shift_ns", [-15 * 10**9, -HOUR_NS, 8 * 10**9])
+def test_a_few_messages_out_of_place_are_sorted(tmp_path: Path, shift_ns: int) -> None:
+    numbers: dict[str, int] = {}
+
+    def edit(topic: str, stamp: int, data: bytes) -> tuple[int, bytes]:
+        numbers[topic] = numbers.get(topic, 0) + 1
+        stamp += shift_ns if numbers[topic] in (60, 61, 70) else 0
+        return stamp, with_header(data, stamp)
+
+    found = read_log(rewritten(log(tmp_path), edit), CONFIG)
+    assert any(SORTED in warning for warning in found.warnings)
+    assert len(found.wheels.stamp_ns) >= 397
+
+
 @pytest.mark.parametrize("jump_ns", [HOUR_NS, -HOUR_NS, YEAR_NS, -YEAR_NS])
 def test_header_stamps_of_another_clock_are_reported(tmp_path: Path, jump_ns: int) -> None:
     path = clock_set(tmp_path, jump_ns, log_time=False)

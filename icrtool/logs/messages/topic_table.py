@@ -32,13 +32,23 @@ _MOST_BYTES_AT_ONCE = 1 << 24
 
 
 class SetBack(NamedTuple):
-    """How far log time goes back from one stored message to the next [ns], and the time that then comes again [ns]."""
+    """How far log time goes back at most from one stored message to the next, and how mixed messages are once sorted.
+
+    Attributes
+    ----------
+    step_ns : the largest step back
+    pieces : into how many a stretch between such steps is cut by sorting, in the mean: 1 where the stretches only
+        change places, about 2 where single messages are out of place, many where times come again
+    """
 
     step_ns: int
-    again_ns: int
+    pieces: float
 
 
-NOT_SET_BACK = SetBack(0, 0)
+NOT_SET_BACK = SetBack(0, 0.0)
+
+NEAR_NS = 2_000_000_000
+"""Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,19 +296,16 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
-            NOT_SET_BACK if order is None else _set_back(times),
+            NOT_SET_BACK if order is None else _set_back(times, order),
         )
 
 
-def _set_back(times: Ints) -> SetBack:
-    """Return how far stored log times (n,) go back at most, and how long the stretches between the steps overlap."""
+def _set_back(times: Ints, order: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting by `order` (n,) does to the stretches between."""
     steps = np.diff(times)
-    begins = np.flatnonzero(steps < 0) + 1
-    first = np.minimum.reduceat(times, [0, *begins])
-    last = np.maximum.reduceat(times, [0, *begins])
-    order = np.argsort(first, kind="stable")
-    again = np.maximum.accumulate(last[order])[:-1] - first[order][1:]
-    return SetBack(int(-steps.min()), int(again.max(initial=0)))
+    stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
+    pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
+    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:

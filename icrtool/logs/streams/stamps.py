@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.logs.messages.topic_table import NOT_SET_BACK, SetBack, TopicTable
+from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
 from icrtool.records.tables import Ints, Role
 
-NEAR_NS = 2_000_000_000
-"""A header stamp this far from the log time (median) is another clock's: GPS time is 18 s off, a dead RTC years."""
+MOST_PIECES = 10.0
+"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
 
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
@@ -78,10 +78,9 @@ def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
     DataError
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
-    if rows.set_back.again_ns > NEAR_NS:
+    if rows.set_back.pieces > MOST_PIECES:
         why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
-        again = f"{rows.set_back.again_ns / 1e9:.1f} s of it come again"
-        raise DataError(name, why, f"{again}, and samples cannot be put in order; cut the recording there")
+        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
     if rows.set_back.step_ns > NEAR_NS:
         yield (
             f"{name}: log time goes back by {rows.set_back.step_ns / 1e9:.0f} s; messages are sorted; if the clock was "
