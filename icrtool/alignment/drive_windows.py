@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.gnss_steps import bend_std_m, unbroken
-from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+from icrtool.records.measurements import Fixes
+from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
 
 WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_POSITION_STD = 12.0
@@ -78,11 +79,26 @@ class DriveWindows(NamedTuple):
     group: Ints
     turn_group: Ints
 
+    def rows(self, kept: Bools, turn_kept: Bools) -> DriveWindows:
+        """Return the windows of distance (w,) and of time (u,) that are marked."""
+        return self._replace(
+            begin=self.begin[kept], end=self.end[kept], group=self.group[kept],
+            turn_begin=self.turn_begin[turn_kept], turn_end=self.turn_end[turn_kept],
+            turn_group=self.turn_group[turn_kept],
+        )  # fmt: skip
+
 
 def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
     """Return a log as arrays; `heading` in place of its own."""
-    wheels, gnss = log.wheels, log.gnss
-    heading = log.heading if heading is None else heading
+    topics = {stream.role: stream.topic for stream in log.streams}
+    same_clock = "gnss" in topics and topics["gnss"] == topics.get("heading", "")
+    return join_streams(log.wheels, log.gnss, log.heading if heading is None else heading, same_clock=same_clock)
+
+
+def join_streams(
+    wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool
+) -> DriveArrays:
+    """Return streams as arrays; `same_clock` as in `DriveArrays`."""
     epoch = int(wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
@@ -91,11 +107,10 @@ def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveA
     wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
     heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad))
     step = dt * (np.abs(left) + np.abs(right)) / 2
-    topics = {stream.role: stream.topic for stream in log.streams}
     return DriveArrays(
         wheel_t, dt, left, right, heading_t, angle,
         fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
-        fix_std_m(gnss), "gnss" in topics and topics["gnss"] == topics.get("heading", ""),
+        fix_std_m(gnss), same_clock,
     )  # fmt: skip
 
 
@@ -127,7 +142,7 @@ def _averaged(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
     return np.add.reduceat(t, first) / count, np.add.reduceat(angle, first) / count
 
 
-def fix_std_m(gnss: PositionFixes) -> float:
+def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more."""
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance) & (variance > 0)]

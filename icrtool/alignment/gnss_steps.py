@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from icrtool.records.measurements import Fixes
 from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes, RobotLog
 
 FEWEST_STEPS = 40
@@ -130,7 +131,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     return FixSteps(step, product, moves, rows, jumps)
 
 
-def bend_std_m(gnss: PositionFixes) -> float:
+def bend_std_m(gnss: PositionFixes | Fixes) -> float:
     """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
 
     NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the

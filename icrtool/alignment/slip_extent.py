@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.wheel_motion import Windows
+from icrtool.alignment.slip_windows import Windows
 from icrtool.records.events import SlipKind
 from icrtool.records.tables import Bools, Floats
 

@@ -21,8 +21,8 @@ FEWEST_WINDOWS = 8
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 
-SMALLEST_SCALE_ERROR, SCALE_SIGMAS, USUAL_SCALE_STD = 0.01, 2.0, 0.04
-"""A scale is corrected by what remains of it beside a prior: wheels roll at their nominal radius to 4 %."""
+SMALLEST_SCALE_ERROR, SCALE_SIGMAS, LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.01, 2.0, 0.1, 0.04
+"""A scale that is shown is corrected by what remains of it beside a prior: wheels roll at their radius to 4 %."""
 
 SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
@@ -226,7 +226,7 @@ def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
     scale, std = fit.estimate("scale")
     error = abs(scale - 1.0)
     # a heading that scatters makes the path along it shorter by half its variance
-    if error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
+    if std > LARGEST_SCALE_STD or error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
         return 1.0, []
     if error <= LARGEST_SCALE_CORRECTION:
         scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)

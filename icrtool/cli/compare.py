@@ -9,6 +9,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def command(
     if as_json:
         print_json("compare", document)
     elif not quiet:
-        click.echo(format_transfer(transfer))
+        show(format_transfer(transfer))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

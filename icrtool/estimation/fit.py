@@ -23,28 +23,9 @@ def fit(
     smooth: bool = False,
     watch: Callable[[str], None] | None = None,
 ) -> Run:
-    """Learn a robot's track ICRs from a log.
+    """Align the sensors of a log, run the filter, summarise: `icrtool.fit` without its recommendation.
 
-    Parameters
-    ----------
-    log : as `icrtool.read_log` returns it
-    config : default: all defaults
-    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
-    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
-    smooth : also make the states of the RTS smoother
-    watch : called with the name of each stage when it begins
-
-    Returns
-    -------
-    Run
-        No file is touched.
-
-    Raises
-    ------
-    DataError
-        Streams that cannot be used together, or hold values that are not finite numbers.
-    ConfigError
-        A start that preset ``field`` does not take.
+    Parameters, return value and errors are those of `icrtool.calibration.fit.fit`.
 
     Notes
     -----

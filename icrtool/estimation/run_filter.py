@@ -17,7 +17,7 @@ from icrtool.estimation.filter_setup import (
     wheel_gap_s,
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
-from icrtool.kernels.filter_records import RECOVERED, USED, Codes, FilterOutput
+from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples
@@ -171,7 +171,7 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 def _outcome(
     stamps: Ints, index: Ints, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
-    """Put what the kernel said of the measurements it was given back in the rows of the stream."""
+    """Return the kernel's outcomes in the rows of the stream: it was given some of the measurements."""
     all_nis, all_code, all_difference = (
         np.full(len(stamps), np.nan),
         np.zeros(len(stamps), np.uint8),
@@ -190,7 +190,7 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     lost = np.zeros(len(gnss.stamp_ns), np.bool_)
     for begin, end in rtk_losses_ns:
         lost |= (gnss.stamp_ns > begin) & (gnss.stamp_ns < end)
-    used = gnss.stamp_ns[((gnss.code == USED) | (gnss.code == RECOVERED)) & ~lost]
+    used = gnss.stamp_ns[gnss.used & ~lost]
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)

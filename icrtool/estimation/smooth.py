@@ -8,6 +8,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.run_filter import Filtered, set_up_again
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.smoother import run_smoother
 from icrtool.records.run import STATE_COLUMNS, Run
 from icrtool.records.tables import Floats, States
@@ -46,7 +47,7 @@ def _distance(run: Run | Filtered, x: Floats) -> Floats:
     """Return the path length (n,) [m] with the smoothed ICRs, as Eqs. 8-12 have it; gaps add nothing."""
     table = run.table
     right, left, ahead = x[:, 3], x[:, 4], x[:, 5]
-    width = np.maximum(np.abs(left - right), 1e-6)
+    width = np.maximum(np.abs(left - right), MIN_ICR_SEPARATION_M)
     omega = (table.v_left_mps - table.v_right_mps) / width
     forward = (table.v_left_mps * right - table.v_right_mps * left) / width
     dt = np.where(run.in_gap, 0.0, np.append(np.diff(table.t_s), 0.0))

@@ -117,7 +117,8 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     from icrtool.calibration.from_runs import robot_of
     from icrtool.calibration.pooled import calibrate, gyro_recording_of
     from icrtool.output.stored_run import open_run
-    from icrtool.output.tables.held_out import format_held_out
+    from icrtool.output.tables.held_out import held_out_blocks
+    from icrtool.output.text_blocks import Text
 
     recordings, robots, left_out, seen = [], [], [], set()
     try:
@@ -142,7 +143,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     file = f"{CALIBRATIONS}/{name}.json"
     write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
-    table = "\n".join(format_held_out(result.wheels))
+    table = str(Text(held_out_blocks(result.wheels)))
     used = tuple(log for log in one.logs if log not in left_out)
     return PooledCalibration(one.robot, one.group, used, tuple(left_out), file, "", result.calibration.recommended,
                              float(numbers.multiplier), float(numbers.multiplier_std), table, one.key)  # fmt: skip

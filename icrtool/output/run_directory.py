@@ -13,7 +13,7 @@ from typing import Any
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
-from icrtool.output.figures.drawing_process import Drawer, DrawingHere
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.own_files import made_from
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
@@ -89,7 +89,6 @@ def write_run(
     *,
     states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
-    drawer: Drawer | None = None,
     note: Callable[[str], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
@@ -100,7 +99,6 @@ def write_run(
     directory : where it shall appear; an old run there is replaced, with all that was made from it
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-    drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
@@ -119,12 +117,12 @@ def write_run(
         atomic_directory(
             directory, is_run_directory, kind="run directory", names=LATER_NAMES, made_from=sources, note=note
         ) as partial,
-        (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
-        draw(_write_figures, run)
+        if plots:
+            _write_figures(run, partial / "plots", plots)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
@@ -189,15 +187,9 @@ def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
     return value.raw if isinstance(value, LogText) else value
 
 
-def load_figures() -> None:
-    """Load what the figures of a run need, in the process that will draw them."""
-    from icrtool.estimation.odometry import load_kernels
-    from icrtool.output.figures import run_figures  # noqa: F401 - for its own sake
+def _write_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:
+    directory.mkdir()
+    with quiet_matplotlib():
+        from icrtool.output.figures.run_figures import draw_figures
 
-    load_kernels()
-
-
-def _write_figures(directory: Path, formats: tuple[str, ...], run: Run) -> None:
-    from icrtool.output.figures.run_figures import draw_figures
-
-    draw_figures(run, directory, formats)
+        draw_figures(run, directory, formats)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icrtool.config import Config
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.trials import Drive
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
@@ -38,7 +39,7 @@ class MeasurementOutcome:
     ----------
     stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
     nis : (m,) normalised innovation squared, NaN where unseen
-    code : uint8 (m,), see `icrtool.kernels.ekf`: UNSEEN, USED, GATED, RECOVERED
+    code : uint8 (m,), see `icrtool.kernels.measurement_codes`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
 
@@ -47,6 +48,18 @@ class MeasurementOutcome:
     nis: Floats
     code: Bytes
     difference: Floats
+
+    @property
+    def used(self) -> Bools:
+        """Which measurements moved the filter (m,)."""
+        moved: Bools = (self.code == USED) | (self.code == RECOVERED)
+        return moved
+
+    @property
+    def rejected(self) -> Bools:
+        """Which measurements the innovation gate rejected (m,)."""
+        gated: Bools = self.code == GATED
+        return gated
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +165,7 @@ class Run:
 
     @property
     def usable(self) -> bool:
-        """Whether the ICRs may be used; `summary` says why not (``unusable_because``)."""
+        """Whether the ICRs may be used; ``unusable_because`` of `summary` is the reason where not."""
         return bool(self.summary["usable"])
 
     def write(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
 from icrtool.output.atomic_file import atomic_file, check_place
-from icrtool.output.figures.drawing_process import matplotlib_unsaid
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.run_directory import PLOT_FORMATS
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def save_picture(draw: Callable[[], Figure], file: Path) -> None:
         The file cannot be written.
     """
     form = file.suffix.removeprefix(".").lower()
-    with atomic_file(file) as partial, matplotlib_unsaid():
+    with atomic_file(file) as partial, quiet_matplotlib():
         from icrtool.output.figures.style import save, style
 
         with style():

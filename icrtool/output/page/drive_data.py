@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import recorded_rates, recording_of
+from icrtool.calibration.pooled import calibrated_path, recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
-from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.motion.trials import wheels_path
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
@@ -142,8 +140,8 @@ def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
-    fixes, code = run.sensors.fixes, run.gnss.code
-    groups = {"used": (code > UNSEEN) & (code != GATED), "rejected": code == GATED}
+    fixes = run.sensors.fixes
+    groups = {"used": run.gnss.used, "rejected": run.gnss.rejected}
     found = {}
     for name, chosen in groups.items():
         difference = run.gnss.difference[chosen]
@@ -160,7 +158,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     heading = run.heading
-    used = np.flatnonzero((heading.code > UNSEEN) & (heading.code != GATED))
+    used = np.flatnonzero(heading.used)
     rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
     return {
         "t": packed(heading.t_s[rows], "f64"),
@@ -202,7 +200,7 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
 def _calibrated_path(run: Run, calibration: Calibration, steps: Steps) -> dict[str, Any] | None:
     recording = recording_of(run)
     try:
-        place, heading = wheels_path(recording, *recorded_rates(calibration, recording))
+        heading, place = calibrated_path(calibration, recording)(recording.t_s)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None

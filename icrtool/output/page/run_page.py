@@ -15,7 +15,7 @@ from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
-from icrtool.output.figures.drawing_process import matplotlib_unsaid
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import WITH_PLACE, Picture, pictures_in, pictures_of
@@ -125,7 +125,7 @@ def draw_pictures(run: Run) -> dict[str, Picture]:
     from icrtool.output.figures.style import style
 
     found = []
-    with matplotlib_unsaid():
+    with quiet_matplotlib():
         for name, draw in FIGURES.items():
             with style():
                 image = BytesIO()
