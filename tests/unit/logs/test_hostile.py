@@ -239,6 +239,9 @@ def test_moments_are_seconds_or_times_with_a_zone() -> None:
         ("[dropout]\nhorizons_m = [" + ",".join(map(str, range(1, 100_000))) + "]", "dropout.horizons_m"),
         ("[robot]\nname = " + "[" * 100_000, "nested"),
         ("[robot]\nname = 1" + " " * 2_000_000, "bytes"),
+        (".".join(["a"] * 20_000) + " = 1", "nested"),
+        ("x = {" + ".".join(["a"] * 20_000) + " = 1}", "nested"),
+        ('[robot]\nname = "\\u001b[2J"', "robot.name"),
     ],
 )
 def test_configuration_out_of_bounds_is_refused_with_its_key(tmp_path: Path, text: str, key: str) -> None:
