@@ -28,18 +28,7 @@ DONE: tuple[str, ...] = (
     "records",
     "simulation",
     "dropout_analysis",
-    "output/exports",
-    *(
-        f"output/{module.stem}"
-        for module in sorted((ROOT / "icrtool/output").glob("*.py"))
-        if module.stem != "run_schema"
-    ),
-    *(
-        f"output/{kind}/{module.stem}"
-        for kind in ("figures", "tables")
-        for module in sorted((ROOT / "icrtool/output" / kind).glob("*.py"))
-        if module.stem not in {"calibration", "calibration_picture", "model_comparison", "run"}
-    ),
+    "output",
 )
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
@@ -48,6 +37,8 @@ PUBLISHED = (
     "blind_icr_10m_p95_m",
     "blind_no_slip_10m_p95_m",
     "sold_as_fixed",
+    "gyro_course",
+    "wheels_course",
     "change{n}_rise_{icr}_s",
     "rise_{name}_s",
     '"way_m"',

@@ -42,7 +42,7 @@ def command(
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.atomic_file import check_place, write_file
     from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
-    from icrtool.output.run_directory import json_bytes
+    from icrtool.output.json_file import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
@@ -65,7 +65,7 @@ def command(
         if file is not None:
             write_file(file, content)
     if plot is not None:
-        write_transfer_picture(transfer, plot)
+        write_transfer_picture(document, plot)
     if as_json:
         print_json("compare", document)
     elif not quiet:

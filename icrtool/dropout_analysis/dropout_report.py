@@ -141,11 +141,13 @@ def _calibration_rows(
         if recording is not None:
             models.append(ConstantModel(name, label, predictor(one, recording)))
             seen = one.fitted_to(recording.sha256)
-            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created))
+            kept = one.summary() | {"models": {}, "held_out": []}
+            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created, False, kept))
             if one.gyro is not None and recording.gyro_radps is not None:
                 name, label = f"{name}_gyro", f"{label} + gyro"
                 models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=True)))
-                used.append(UsedCalibration(name, label, one.gyro.model.name, len(one.logs), seen, one.created))
+                model = one.gyro.model.name
+                used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, True, kept))
     return tuple(used), models
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from icrtool.alignment.align import align
 from icrtool.alignment.reference_choice import choose_reference
@@ -39,9 +40,8 @@ def fit(
     measurements = align(log, config)
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
-    smoothed = smoother.smooth(filtered, config) if smooth else None
     begin("summary")
-    return Run(
+    run = Run(
         name=log.name,
         config=config,
         table=filtered.table,
@@ -50,9 +50,10 @@ def fit(
         sensors=filtered.sensors,
         gnss=filtered.gnss,
         heading=filtered.heading,
-        smoothed=smoothed,
+        smoothed=None,
         summary=summarise(log, measurements, filtered, config),
     )
+    return replace(run, smoothed=smoother.smooth(run)) if smooth else run
 
 
 def _ignore(stage: str) -> None:

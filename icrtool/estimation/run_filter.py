@@ -132,11 +132,11 @@ def _check_motion(sensors: SensorData) -> None:
     raise DataError(sensors.name, why, "use a log in which it drives and turns")
 
 
-def set_up_again(run: Run | Filtered, config: Config, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
+def set_up_again(run: Run, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
     """Prepare the filter run that gave `run`, to smooth it, or to take GNSS and heading away in some spans."""
     return set_up_filter(
         run.sensors,
-        config,
+        run.config,
         noise=noise_of(run),
         changes_s=run.changes_s,
         warm_start=run.began_with,
@@ -144,10 +144,8 @@ def set_up_again(run: Run | Filtered, config: Config, outages_ns: tuple[tuple[in
     )
 
 
-def noise_of(run: Run | Filtered) -> ProcessNoise:
+def noise_of(run: Run) -> ProcessNoise:
     """Return the process noise of the pose that a run was made with."""
-    if isinstance(run, Filtered):
-        return run.noise
     facts = run.summary["filter"]
     return ProcessNoise(float(facts["process_position_mps"]), float(facts["process_heading_degps"]))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
@@ -21,7 +20,7 @@ from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.trials_file import trials_file
@@ -103,11 +102,7 @@ def write_report(report: DropoutReport, directory: Path, *, plots: tuple[str, ..
 
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours, of whatever version."""
-    try:
-        schema = json.loads((directory / REPORT_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False
-    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+    return schema_of(directory / REPORT_FILE).startswith(SCHEMA_FAMILY)
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,12 @@ from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
 from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
+from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.own_files import made_from
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
 from icrtool.records.events import EVENT_COLUMNS
-from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
-from icrtool.records.text import LogText
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -158,33 +157,13 @@ def _inputs_of(directory: Path) -> list[dict[str, Any]]:
 
 def is_run_directory(directory: Path) -> bool:
     """Return whether a directory is a run of ours, of whatever version."""
-    try:
-        schema = json.loads((directory / RUN_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False
-    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+    return schema_of(directory / RUN_FILE).startswith(SCHEMA_FAMILY)
 
 
 def events_csv(events: list[dict[str, Any]]) -> str:
     """Return the text of events.csv: a row an event, numbers in full precision."""
     rows = [EVENT_COLUMNS, *(tuple(str(event[column]) for column in EVENT_COLUMNS) for event in events)]
     return "".join(f"{','.join(row)}\n" for row in rows)
-
-
-def json_bytes(document: Mapping[str, Any]) -> bytes:
-    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
-    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
-    return (text + "\n").encode("utf-8", errors="backslashreplace")
-
-
-def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
-    if isinstance(value, dict):
-        return {key: _as_in_the_log(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_as_in_the_log(item) for item in value]
-    return value.raw if isinstance(value, LogText) else value
 
 
 def _write_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:

@@ -13,7 +13,7 @@ from icrtool import __version__
 from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers, export_numbers
 from icrtool.calibration.record import Calibration
 from icrtool.output.exports.twist_model import format_twist
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from icrtool.calibration.forecast import Forecast
-    from icrtool.calibration.transfer import Transfer
 
 
 def check_picture(file: Path) -> None:
@@ -60,13 +59,13 @@ def write_forecast_picture(forecast: Forecast, title: str, budgets_m: tuple[floa
     save_picture(draw, file)
 
 
-def write_transfer_picture(transfer: Transfer, file: Path) -> None:
+def write_transfer_picture(document: Mapping[str, Any], file: Path) -> None:
     """Draw compared groups, as `write_picture`."""
 
     def draw() -> Figure:
         from icrtool.output.figures.transfer import draw_transfer
 
-        return draw_transfer(transfer)
+        return draw_transfer(document)
 
     save_picture(draw, file)
 

@@ -86,7 +86,7 @@ def _stream_table(run: Run) -> Table:
         role = ROLE_WORDS[stream["role"]] if run.summary["gnss"]["datum"] is None else stream["role"]
         rows.append((role, stream["topic"], kind, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
-    # Long names give way: the topic keeps its end, the type its begin.
+    # Long names are cut: the topic keeps its end, the type its begin.
     space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
     topic = min(widths[1], max(space - widths[2], space // 2))
     kind = min(widths[2], space - topic)

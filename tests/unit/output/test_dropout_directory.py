@@ -27,7 +27,7 @@ from icrtool.output.dropout_directory import (
     report_writer,
     write_tables,
 )
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
 from icrtool.output.trials_file import trials_file
 from icrtool.records.run import Run
 
