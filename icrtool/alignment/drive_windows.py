@@ -59,6 +59,33 @@ class DriveArrays(NamedTuple):
     fix_std_m: float
     same_clock: bool
 
+    @property
+    def mean_speed(self) -> Floats:
+        """Mean of the sides' speeds (n,) [m/s]."""
+        return (self.v_left + self.v_right) / 2
+
+    @property
+    def half_difference(self) -> Floats:
+        """Half of what left is faster than right (n,) [m/s]."""
+        return (self.v_left - self.v_right) / 2
+
+    @property
+    def nose(self) -> Complexes:
+        """Heading as a unit vector in the middle of each wheel interval (n,)."""
+        return np.asarray(np.exp(1j * np.interp(self.wheel_t + self.wheel_dt / 2, self.heading_t, self.heading)))
+
+    def cumulate(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each wheel sample (n,)."""
+        return np.concatenate([[0.0], np.cumsum((rate * self.wheel_dt)[:-1])])
+
+    def until_fixes(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each fix (m,)."""
+        return np.asarray(np.interp(self.fix_t, self.wheel_t, self.cumulate(rate)))
+
+    def laid_until_fixes(self) -> Complexes:
+        """Return the mean of the sides laid along the heading, until each fix (m,) [m]."""
+        return self.until_fixes(self.mean_speed * self.nose)
+
 
 class DriveWindows(NamedTuple):
     """Windows of a drive.
@@ -151,16 +178,22 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
+def window_length(drive: DriveArrays, least_m: float = WINDOW_M) -> float:
+    """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
+    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
+    return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
+
+
 def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
-    `length_m` is the length of a window; default: as the noise of the fixes asks for.
-
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
+
+    Parameters
+    ----------
+    length_m : of a window; default `window_length`
     """
-    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
-    length = max(WINDOW_M, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
-    length = length if length_m is None else length_m
+    length = window_length(drive) if length_m is None else length_m
     at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
     cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
     begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)

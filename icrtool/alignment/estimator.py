@@ -51,7 +51,7 @@ MIDDLE_STD_M = 0.1
 """The middle of the ICRs lies this near to the antenna, to either side."""
 
 SAME_CLOCK_STD_S = 1e-3
-"""Fields of the same messages are late together."""
+"""Fields of the same messages lag alike."""
 
 STEP_S, TURN_STEP_S = 0.02, 0.1
 """Delays are differentiated over the first step to either side, noisy headings over the second."""
@@ -60,7 +60,7 @@ OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
 RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
-"""A robot answers its wheels late by up to 0.1 s, which no drive separates from a delay of the streams."""
+"""A robot lags its wheels by up to 0.1 s, which no drive separates from a delay of the streams."""
 
 CLOCK_STD_S = 0.05
 """A body follows a change of speed later or earlier than a turn, which looks as if its position lagged its heading: by
@@ -84,7 +84,7 @@ MOST_STEPS = 15
 
 
 class Geometry(NamedTuple):
-    """What the estimate says of the robot, with covariance.
+    """The geometry of the robot, with covariance.
 
     Attributes
     ----------
@@ -140,8 +140,10 @@ class AlignmentFit(NamedTuple):
 
     @property
     def heading_scatter(self) -> float:
-        """Robust scatter of the heading [rad], across windows or within a second, whichever is more."""
-        return max(self.across_std, float(self.fit.scale[-1]) / math.sqrt(2.0))
+        """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
+        noise = math.sqrt(2.0) * self.drive.fix_std_m / self.windows.length_m
+        across = math.sqrt(max(self.across_std**2 - noise**2, 0.0))
+        return max(across, float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
     def across_std(self) -> float:
@@ -253,23 +255,17 @@ class _Model:
 
     def __init__(self, drive: DriveArrays, windows: DriveWindows, width_m: float) -> None:
         self.drive, self.windows, self.b = drive, windows, width_m
-        self.v = (drive.v_left + drive.v_right) / 2
-        self.u = (drive.v_left - drive.v_right) / 2
+        self.v, self.u = drive.mean_speed, drive.half_difference
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
-        self.turn_v, self.turn_w = self._cumulate(self.v).real, self._cumulate(2 * self.u / width_m).real
+        self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
         self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
             windows.turn_begin, drive.heading_t, drive.heading
         )
 
-    def _cumulate(self, rate: Floats | Complexes) -> Complexes:
-        total: Complexes = np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
-        return total
-
     def first_offset(self) -> float | None:
         """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""
-        nose = np.exp(1j * np.interp(self.middle_t, self.drive.heading_t, self.drive.heading))
-        at = np.interp(self.drive.fix_t, self.drive.wheel_t, self._cumulate(self.v * nose))
+        at = self.drive.laid_until_fixes()
         laid = at[self.windows.end] - at[self.windows.begin]
         unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
         if len(unit) < FEWEST_WINDOWS:
@@ -278,17 +274,17 @@ class _Model:
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
         """Return residuals along, across and of turns, and their Jacobian."""
-        place, place_slopes = self._displacements(x)
-        turn, turn_slopes = self._turns(x)
+        place, place_jacobian = self._displacements(x)
+        turn, turn_jacobian = self._turns(x)
         return (
             np.concatenate([place.real, place.imag, turn]),
-            np.concatenate([place_slopes.real, place_slopes.imag, turn_slopes]),
+            np.concatenate([place_jacobian.real, place_jacobian.imag, turn_jacobian]),
         )
 
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
         """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
         nose, rate = self._directions(x)
-        path = self._cumulate(self._velocity(x, rate) * nose)
+        path = self.drive.cumulate(self._velocity(x, rate) * nose)
         t = self.drive.fix_t
         turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.drive.wheel_t
         return (
@@ -326,34 +322,34 @@ class _Model:
         begin, end = windows.begin, windows.end
 
         def between(velocity: Complexes) -> Complexes:
-            at = np.interp(t, drive.wheel_t, self._cumulate(velocity))
+            at = np.interp(t, drive.wheel_t, drive.cumulate(velocity))
             return np.asarray(at[end] - at[begin], np.complex128)
 
-        path = self._cumulate(body * nose)
+        path = drive.cumulate(body * nose)
         at = np.interp(t, drive.wheel_t, path)
         predicted = at[end] - at[begin]
         speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
-        slopes = np.zeros((len(begin), len(x)), np.complex128)
-        slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
-        slopes[:, C], slopes[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
-        slopes[:, D], slopes[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
-        slopes[:, TP] = -(speed[end] - speed[begin])
+        jacobian = np.zeros((len(begin), len(x)), np.complex128)
+        jacobian[:, A], jacobian[:, M] = between(self.v * nose), between(self.u * nose)
+        jacobian[:, C], jacobian[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
+        jacobian[:, D], jacobian[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
+        jacobian[:, TP] = -(speed[end] - speed[begin])
         sideways = np.interp(t, self.middle_t, x[C] + x[L] * self.v) * self._smooth_turn(t, x)
-        slopes[:, TH] = slopes[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
+        jacobian[:, TH] = jacobian[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
         psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + x[D]
         level = np.exp(-0.5j * (psi[begin] + psi[end]))
-        return (predicted - self.seen) * level, slopes * level[:, None]
+        return (predicted - self.seen) * level, jacobian * level[:, None]
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return predicted minus seen heading changes (u,), and their slopes (u, k)."""
+        """Return predicted minus seen heading changes (u,), and their jacobian (u, k)."""
         windows, t = self.windows, self.drive.wheel_t
         begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:
             return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
 
-        slopes = np.zeros((len(begin), len(x)))
-        slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
-        slopes[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        predicted = x[K] * slopes[:, K] + x[Q] * slopes[:, Q] + x[G] * TURN_WINDOW_S
-        return predicted - self.turned, slopes
+        jacobian = np.zeros((len(begin), len(x)))
+        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        jacobian[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * TURN_WINDOW_S
+        return predicted - self.turned, jacobian

@@ -269,7 +269,7 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
 
 
 def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
-    """Return whether the reference makes up, shortly before or after, for the distance that the event misses.
+    """Return whether the reference makes up, shortly before or after, for the distance that is missing in the event.
 
     A position that is wrong for a while comes back; distance lost by slip does not.
     """

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams
+from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.kernels.robust import mad_std
 from icrtool.records.measurements import SensorData
@@ -28,6 +28,9 @@ LONGEST_HOLE_S, HOLE_IN_INTERVALS = 0.6, 5.0
 FEWEST_KNOTS = 30
 LONGEST_HELD_IN_USUAL = 2.0
 """A value held for longer than this many times the usual was constant."""
+
+WINDOW_M = 1.0
+"""The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
 LEAST_STD_M, LEAST_TURN_GAIN = 0.01, 1e-3
 
@@ -138,8 +141,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     t = drive.fix_t
 
     def at(speed: Floats, shift_s: float = 0.0) -> Floats:
-        total = np.concatenate([[0.0], np.cumsum((speed * drive.wheel_dt)[:-1])])
-        return np.asarray(np.interp(t + shift_s, wheel_t, total), np.float64)
+        return np.asarray(np.interp(t + shift_s, wheel_t, drive.cumulate(speed)), np.float64)
 
     speeds = [(at(speed, SPEED_S / 2) - at(speed, -SPEED_S / 2)) / SPEED_S for speed in (left, right)]
     heading = np.interp(t, drive.heading_t, drive.heading)
@@ -172,7 +174,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    windows = cut_windows(knots.drive)
+    windows = cut_windows(knots.drive, window_length(knots.drive, WINDOW_M))
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
 
     def clear(begin: Ints, end: Ints) -> Bools:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.alignment.estimator import SLIPPING, AlignmentFit
+from icrtool.alignment.estimator import PRIOR_STD, SLIPPING, TP, AlignmentFit
 from icrtool.config import Config
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
@@ -56,6 +56,21 @@ class StreamDelays:
     applied_heading_s: float
     applied_gnss_s: float
     warnings: tuple[str, ...]
+
+    @property
+    def clock_std_s(self) -> float:
+        """What remains unknown of the time between position and heading, where nothing or some of it was corrected [s].
+
+        Clocks agree as often as not. Where they were taken to agree, the deviation is that of the other case, times its
+        probability (Bayes factor of Dickey 1971: densities at zero after and before the drive).
+        """
+        value, std = self.apart
+        if self.together or not math.isfinite(std):
+            return 0.0
+        if self.applied_gnss_s != self.applied_heading_s:
+            return std
+        agree = PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
+        return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
     def heading_summary(self) -> dict[str, Any]:
         """Return the heading's numbers for run.json."""

@@ -164,12 +164,8 @@ def refuse_standing(log: RobotLog, drive: DriveArrays, windows: DriveWindows) ->
         return
     turned = np.abs(np.interp(drive.fix_t[end], drive.heading_t, drive.heading)
                     - np.interp(drive.fix_t[begin], drive.heading_t, drive.heading))  # fmt: skip
-    v, w = drive.v_left + drive.v_right, drive.v_left - drive.v_right
-    nose = np.exp(1j * np.interp(drive.wheel_t, drive.heading_t, drive.heading))
-    laid, apart = (np.concatenate([[0.0], np.cumsum((rate / 2 * drive.wheel_dt)[:-1])]) for rate in (v * nose, w))
     laid, apart = (
-        np.abs(np.interp(drive.fix_t[end], drive.wheel_t, one) - np.interp(drive.fix_t[begin], drive.wheel_t, one))
-        for one in (laid, apart)
+        np.abs(at[end] - at[begin]) for at in (drive.laid_until_fixes(), drive.until_fixes(drive.half_difference))
     )
     went = np.abs(drive.fix[end] - drive.fix[begin])
     moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))

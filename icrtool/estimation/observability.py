@@ -11,14 +11,12 @@ import numpy as np
 from icrtool.estimation.icr_uncertainty import DriveWindows, prior_std
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
-from icrtool.records.run import ICR_COLUMNS, half_width_m
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
 from icrtool.records.tables import Floats, States
 
 Excited = Literal["shown", "weak", "not shown"]
 
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
-
-WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 SLIP_SHARE = 0.03
 """Part of distance and of turn that slips differently from one window to the next."""
@@ -149,7 +147,7 @@ def withhold_unlearned(
         else:
             continue
         if verdicts[name] != "not shown":
-            sentences.append(f"{WORDS[name]} is not shown: {why}")
+            sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
         verdicts[name] = "not shown"
     return replace(found, verdicts=verdicts, sentences=tuple(sentences))
 
@@ -186,12 +184,19 @@ def _sentences(
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
-    unshown = ", ".join(f"{WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
+    unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {unshown}"
-    total = right + left
-    if total < TURNS_NEEDED_RAD:
-        return (first, f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}")
-    if min(right, left) < ONE_DIRECTION * max(right, left):
-        side = "left" if right > left else "right"
-        return (first, f"turned in one direction only: drive two full turns on the spot, or circles, to the {side}")
+    if lacks := lacking_turns(right, left):
+        return (first, lacks)
     return (first, f"too few turns in {distance_m:.0f} m for this measurement noise: {SPIN_BOTH}")
+
+
+def lacking_turns(right_rad: float, left_rad: float) -> str:
+    """Return which turns a drive lacks and what to drive, from its turns to either side; empty where it has enough."""
+    total = right_rad + left_rad
+    if total < TURNS_NEEDED_RAD:
+        return f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}"
+    if min(right_rad, left_rad) < ONE_DIRECTION * max(right_rad, left_rad):
+        side = "left" if right_rad > left_rad else "right"
+        return f"turned in one direction only: drive two full turns on the spot, or circles, to the {side}"
+    return ""

@@ -9,10 +9,10 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
-from icrtool.estimation.observability import WORDS, Excitation
+from icrtool.estimation.observability import Excitation
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import UNSEEN
-from icrtool.records.run import MeasurementOutcome
+from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import Floats, States
 
 SHORT_DRIVE_M, SMALL_TURN_RAD = 1.0, math.radians(20.0)
@@ -34,7 +34,7 @@ def unusable_reasons(
     excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome, noise: ProcessNoise
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be."""
-    hidden = [WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
+    hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
         share = rejected_share(outcome)

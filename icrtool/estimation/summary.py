@@ -51,8 +51,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    apart = measurements.findings.get("position_delay_against_heading_s")
-    covariance, excitation = learned(filtered, config, 0.0 if apart is None or apart.std is None else apart.std)
+    covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
     warnings = [

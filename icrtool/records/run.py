@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
 
-ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+ICR_WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+ICR_COLUMNS = tuple(ICR_WORDS)
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""

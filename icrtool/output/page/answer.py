@@ -13,10 +13,9 @@ from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import metres_text, reach_text
 from icrtool.output.text_format import signed
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+from icrtool.records.run import ICR_WORDS
 
 Grade = Literal["good", "care", "bad", "fact"]
-
-NAMES = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 IN_SAMPLE = {"icr_final": "ICR, final (fitted to the same drive)"}
 
@@ -165,7 +164,7 @@ def _icrs(icr: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     final, std = icr["final"], icr["final_std"]
     return tuple(
         (name, f"{signed(final[column])} ± {std[column]:.3f}" if final[column] is not None else "not shown")
-        for column, name in NAMES.items()
+        for column, name in ICR_WORDS.items()
     )
 
 
@@ -187,7 +186,7 @@ def _checks(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check
 
 def _excitation(summary: Mapping[str, Any]) -> Check:
     shown = summary["excitation"]
-    weak = [f"{NAMES[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
+    weak = [f"{ICR_WORDS[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
     turned = f"it turned {shown['turned_right_deg']:,.0f}° right and {shown['turned_left_deg']:,.0f}° left"
     if weak:
         return Check(

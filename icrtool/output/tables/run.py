@@ -17,7 +17,7 @@ from icrtool.output.text_format import (
     run_title,
     unusable_lines,
 )
-from icrtool.records.run import ICR_COLUMNS, Run, icr_text
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.samples import ROLE_WORDS
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
@@ -26,7 +26,6 @@ TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
 SMALLEST_DELAY_S = 0.05
 """A delay below this is not worth a line."""
 
-ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
 """What is printed beside an ICR, by the verdict of `find_excitation`."""
@@ -70,7 +69,7 @@ def excitation_rows(run: Run) -> list[Row]:
     if set(verdicts.values()) == {"shown"}:
         shown = "enough to show all three ICRs"
     else:
-        shown = ", ".join(f"{ICR_LABELS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
+        shown = ", ".join(f"{ICR_WORDS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
     right, left = found["turned_right_deg"], found["turned_left_deg"]
     spun = found["spun_right_deg"] + found["spun_left_deg"]
     return [("excitation", f"{shown}; turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot")]
@@ -99,11 +98,11 @@ def _icr_table(run: Run) -> Table:
     for column in ICR_COLUMNS:
         mean, std, time_s = (icr[key][column] for key in ("mean", "std", "convergence_s"))
         if icr["final"][column] is None:
-            rows.append((ICR_LABELS[column], icr_text(icr, column), "", "", ""))
+            rows.append((ICR_WORDS[column], icr_text(icr, column), "", "", ""))
             continue
         convergence = f"{time_s:.1f} s" if time_s is not None else "hardly moved"
         verdict = SHOWN_WORDS.get(verdicts[column], "")
-        rows.append((ICR_LABELS[column], icr_text(icr, column), convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
+        rows.append((ICR_WORDS[column], icr_text(icr, column), convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
     return Table("l", rows, ("ICR [m]".ljust(LABEL), "final ± std", "convergence time", "mean ± std after that", ""))
 
 
@@ -142,7 +141,7 @@ def _terrain_table(run: Run) -> list[Block]:
         mean, std = segment["mean"], segment["std"]
         icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
         rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", *icrs))
-    head = ("segment".ljust(LABEL), "begins", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))
+    head = ("segment".ljust(LABEL), "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
     return ["", Table("lrl", rows, head)] if rows else []
 
 
