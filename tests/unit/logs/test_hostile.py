@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import time
 import tracemalloc
@@ -348,3 +349,21 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
     with pytest.raises(LogError):
         open_log(path)
     assert time.process_time() - begin < LONGEST_S
+
+
+def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
+    from icrtool import config
+    from icrtool.fleet import manifest
+    from icrtool.logs import table_file
+    from icrtool.logs.containers import bag_directory, decompress, sqlite_bag
+    from icrtool.logs.messages import schema
+    from icrtool.records import text
+
+    promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
+    rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
+    stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"\d[\d,]*(?= |;)", row)]
+    assert stated == [
+        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, schema.DEEPEST, schema.MOST_FIELDS,
+        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
+        table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
+    ]  # fmt: skip
