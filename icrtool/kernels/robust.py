@@ -153,6 +153,9 @@ def robust_least_squares(
                 break
             step = step / 2.0
             tried = evaluate(x + step)
+        else:
+            # no part of the step lowers the cost: the Jacobian of noisy data shows no further
+            break
         x, (residuals, jacobian) = x + step, tried
     scale = scale_by_kind(residuals, kinds)
     groups = np.arange(len(residuals)) if group is None else group
