@@ -77,7 +77,8 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
     begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
     v, nose = drive.mean_speed, drive.nose
     seen = drive.fix[end] - drive.fix[begin]
-    laid, other = (at[end] - at[begin] for at in map(drive.until_fixes, (v * nose, v * np.conj(nose))))
+    along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
+    laid, other = (at[end] - at[begin] for at in (along, mirrored))
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(
