@@ -153,15 +153,16 @@ def noise_of(run: Run | Filtered) -> ProcessNoise:
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:
+    """Return the recorded states; their columns are those of the output, whose variances become deviations."""
     first = len(wheels.stamp_ns) - len(output.x)
     stamps = wheels.stamp_ns[first:]
-    std = np.sqrt(np.maximum(output.variance, 0.0))
-    means, deviations = ([np.ascontiguousarray(column) for column in values.T] for values in (output.x, std))
+    std = np.maximum(output.variance, 0.0, out=output.variance)
+    np.sqrt(std, out=std)
     return States(
         stamp_ns=stamps,
         t_s=(stamps - stamps[0]) / 1e9,
-        **dict(zip(STATE_COLUMNS, means, strict=True)),
-        **{f"std_{name}": column for name, column in zip(STATE_COLUMNS, deviations, strict=True)},
+        **dict(zip(STATE_COLUMNS, output.x.T, strict=True)),
+        **{f"std_{name}": column for name, column in zip(STATE_COLUMNS, std.T, strict=True)},
         v_left_mps=wheels.v_left_mps[first:],
         v_right_mps=wheels.v_right_mps[first:],
         distance_m=output.distance,
@@ -169,7 +170,7 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 
 
 def _outcome(
-    stamps: Ints, index: Ints, table: States, nis: Floats, code: Codes, difference: Floats
+    stamps: Ints, index: Ints | slice, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
     """Put what the kernel said of the measurements it was given back in the rows of the stream."""
     all_nis, all_code, all_difference = (

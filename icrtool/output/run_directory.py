@@ -100,7 +100,8 @@ def write_run(
     directory : where it shall appear; an old run there is replaced, with all that was made from it
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-    drawer : what draws the figures, in its own formats; default: this process, in those of `plots`
+    drawer : what draws the figures, in its own formats; default: this process, in those of `plots`. Those of a run of
+        more than `MOST_CSV_STATES` states are drawn by this process
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
@@ -110,6 +111,9 @@ def write_run(
     """
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
+    if drawer is None or len(run.table) > MOST_CSV_STATES:
+        # To another process a run goes as three copies of itself.
+        drawer = DrawingHere(plots if drawer is None else drawer.formats)
     if states is None:
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
@@ -119,7 +123,7 @@ def write_run(
         atomic_directory(
             directory, is_run_directory, kind="run directory", names=LATER_NAMES, made_from=sources, note=note
         ) as partial,
-        (drawer if drawer is not None else DrawingHere(plots)).into(partial / "plots") as draw,
+        drawer.into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
         states_name = f"states.{states}"

@@ -32,6 +32,11 @@ Draw = Callable[..., None]
 class Drawer(Protocol):
     """Who draws figures."""
 
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """Of ``png``, ``svg`` and ``pdf``."""
+        ...
+
     def into(self, directory: Path) -> AbstractContextManager[Draw]:
         """Give ``draw(write, *content)``, which has figures written into a new directory by the end of the block."""
         ...
@@ -58,18 +63,18 @@ class DrawingHere:
     """
 
     def __init__(self, formats: tuple[str, ...]) -> None:
-        self._formats = formats
+        self.formats = formats
 
     @contextmanager
     def into(self, directory: Path) -> Iterator[Draw]:
         """Give ``draw(write, *content)``; see `Drawer`."""
 
         def draw(write: Write, *content: object) -> None:
-            if not self._formats:
+            if not self.formats:
                 return
             directory.mkdir(exist_ok=True)
             with matplotlib_unsaid():
-                write(directory, self._formats, *content)
+                write(directory, self.formats, *content)
 
         yield draw
 
@@ -86,7 +91,7 @@ class DrawingProcess:
     """
 
     def __init__(self, formats: tuple[str, ...], load: Callable[[], None] | None = None) -> None:
-        self._formats = formats
+        self.formats = formats
         self._load = load
         self._pool: ProcessPoolExecutor | None = None
         self._workers: list[BaseProcess] = []
@@ -108,7 +113,7 @@ class DrawingProcess:
         self._stop(at_once=kind is not None)
 
     def _start(self) -> None:
-        if not self._formats:
+        if not self.formats:
             return
         method = "fork" if sys.platform == "linux" else None
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context(method), initializer=_begin)
@@ -139,7 +144,7 @@ class DrawingProcess:
         def draw(write: Write, *content: object) -> None:
             if self._pool is not None:
                 directory.mkdir(exist_ok=True)
-                pending.append(self._pool.submit(write, directory, self._formats, *content))
+                pending.append(self._pool.submit(write, directory, self.formats, *content))
 
         try:
             yield draw
