@@ -21,6 +21,7 @@ DONE: tuple[str, ...] = (
     "config",
     "errors",
     "figures",
+    "fleet",
     "kernels",
     "logs",
     "motion",

@@ -306,10 +306,10 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
         from icrtool.logs.read_log import read_log
 
         stages.begin("reading")
-        measured = read_log(log, request.config, stages.share)
+        logs = [read_log(log, request.config, stages.share)]
         from icrtool.calibration.fit import fit
 
-        run = fit(measured, request.config, smooth=request.smoothed, watch=stages.begin)
+        run = fit(logs.pop(), request.config, smooth=request.smoothed, watch=stages.begin)
         if (before := replaced_log(directory, run)) is not None:
             notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
         stages.begin("writing, pictures" if request.formats else "writing")
@@ -318,8 +318,8 @@ def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -
     if request.verbose:
         from icrtool.records.samples import ROLE_WORDS
 
-        for stream in measured.streams:
-            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
+        for stream in run.summary["streams"]:
+            click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
     return run
 
 

@@ -197,11 +197,11 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
 
         stages.begin("reading")
         options.load_ahead("pymap3d", "icrtool.calibration.fit")
-        measured = read_log(log, request.config, stages.share, start=request.start, end=request.end)
+        logs = [read_log(log, request.config, stages.share, start=request.start, end=request.end)]
         from icrtool.calibration.fit import fit
 
         run = fit(
-            measured,
+            logs.pop(),  # whose columns are freed where they are needed no longer
             request.config,
             warm_start=start,
             changes_s=request.changes_s,
@@ -220,7 +220,7 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
     from icrtool.records.samples import ROLE_WORDS
 
-    for stream in measured.streams:
-        if request.verbose or ("chosen over" in stream.why and not request.quiet):
-            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
+    for stream in run.summary["streams"]:
+        if request.verbose or ("chosen over" in stream["why"] and not request.quiet):
+            click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
     return run

@@ -173,13 +173,16 @@ def _outcome(
     stamps: Ints, index: Ints | slice, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
     """Put what the kernel said of the measurements it was given back in the rows of the stream."""
+    t_s = (stamps - table.stamp_ns[0]) / 1e9
+    if isinstance(index, slice):
+        return MeasurementOutcome(stamps, t_s, nis, code, difference)
     all_nis, all_code, all_difference = (
         np.full(len(stamps), np.nan),
         np.zeros(len(stamps), np.uint8),
         np.full(len(stamps), np.nan),
     )
     all_nis[index], all_code[index], all_difference[index] = nis, code, difference
-    return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
+    return MeasurementOutcome(stamps, t_s, all_nis, all_code, all_difference)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

@@ -35,7 +35,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.stamps import increasing
+from icrtool.logs.streams.stamps import usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
@@ -385,8 +385,6 @@ def _headings(
     if config.frames.heading != "auto":
         convention, why = config.frames.heading, "configured"
     stamps = source.stamps.on(clock)
-    rows = np.flatnonzero(source.usable)
-    order, _, _ = increasing(stamps[rows])
-    rows = rows[order]
+    rows = usable_rows(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"

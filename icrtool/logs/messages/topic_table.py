@@ -89,9 +89,9 @@ class TopicTable:
         return self.columns[path], self.texts[path]
 
     def floats(self, *paths: str) -> NDArray[np.float64]:
-        """Return the first of these columns as float64, NaN everywhere when the type has none."""
+        """Return the first of these columns as float64, not to be written to; NaN everywhere when the type has none."""
         values = self.find(*paths)
-        return np.full(len(self), np.nan) if values is None else values.astype(np.float64)
+        return np.full(len(self), np.nan) if values is None else values.astype(np.float64, copy=False)
 
     def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
         """Return the table of the chosen messages."""

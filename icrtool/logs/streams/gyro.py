@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
-from icrtool.logs.streams.stamps import increasing, stamp_rows
+from icrtool.logs.streams.stamps import stamp_rows, usable_rows
 from icrtool.records.tables import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
@@ -50,9 +50,8 @@ def find_gyro(
     if not found:
         return None
     _, topic, rate, sound, table = max(found, key=lambda one: one[:2])
-    stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
-    order, _, _ = increasing(stamps[rows])
-    rows = rows[order]
+    stamps = stamp_rows(table).on(clock)
+    rows = usable_rows(stamps, sound)
     sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     return GyroSamples(topic, stamps[rows], sign * rate[rows])
 
@@ -63,13 +62,11 @@ def find_gyros(tables: Sequence[TopicTable], clock: Literal["header", "log"]) ->
     for table in tables:
         if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in GYRO_AXES):
             continue
-        rates = np.column_stack([table.floats(axis) for axis in GYRO_AXES])
-        with np.errstate(invalid="ignore"):
-            sound = (np.abs(rates) <= FASTEST_RADPS).all(axis=1)
-        if np.count_nonzero(~sound) > MOST_BAD * len(rates) or not np.ptp(rates[sound], axis=0).any():
+        axes = [table.floats(axis) for axis in GYRO_AXES]
+        sound = np.logical_and.reduce([np.abs(rates) <= FASTEST_RADPS for rates in axes])
+        if np.count_nonzero(~sound) > MOST_BAD * len(sound) or not any(np.ptp(rates[sound]) for rates in axes):
             continue
-        stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
-        order, _, _ = increasing(stamps[rows])
-        rows = rows[order]
-        found.append(GyroAxes(table.topic, stamps[rows], rates[rows]))
+        stamps = stamp_rows(table).on(clock)
+        rows = usable_rows(stamps, sound)
+        found.append(GyroAxes(table.topic, stamps[rows], np.array([rates[rows] for rates in axes]).T))
     return tuple(found)

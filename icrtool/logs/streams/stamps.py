@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import Ints
+from icrtool.records.tables import Bools, Ints
 
 NEAR_NS = 2_000_000_000
 """A header stamp this far from the log time (median) is another clock's: GPS time is 18 s off, a dead RTC years."""
@@ -59,12 +59,23 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     return StampedRows(header, log_ns, "", delay)
 
 
-def increasing(stamps: Ints) -> tuple[Ints, int, int]:
+def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:
+    """Return the usable rows (n,) that make stamps strictly increasing; all rows as a slice, which copies nothing."""
+    if usable.all():
+        return increasing(stamps)[0]
+    rows = np.flatnonzero(usable)
+    return rows[increasing(stamps[rows])[0]]
+
+
+def increasing(stamps: Ints) -> tuple[Ints | slice, int, int]:
     """Return the rows that make stamps strictly increasing, how many went back, and how many were equal.
 
-    Rows are sorted by stamp; of rows with the same stamp the last one stays.
+    Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice.
     """
-    backwards = int(np.count_nonzero(np.diff(stamps) < 0))
+    steps = np.diff(stamps)
+    if (steps > 0).all():
+        return slice(None), 0, 0
+    backwards = int(np.count_nonzero(steps < 0))
     order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
     ordered = stamps[order]
     keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
