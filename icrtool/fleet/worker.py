@@ -24,6 +24,7 @@ import msgspec
 
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.fleet.row import Row
+from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished
 
 GRACE_S = 0.3
@@ -187,8 +188,12 @@ def main() -> None:
         output.write(msgspec.json.encode(line) + b"\n")
         output.flush()
 
+    def begin(stage: str) -> None:
+        give_back_freed()
+        send(Line(stage))
+
     for text in _lines_of(requests):
-        send(Line(row=process(decode_request(text), lambda stage: send(Line(stage)))))
+        send(Line(row=process(decode_request(text), begin)))
 
 
 def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:

@@ -49,10 +49,10 @@ _INDEX_HEAD_BYTES = _HEAD_BYTES + 6
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
 
-LARGEST_PART = 0.5
-"""Where the wanted messages end in this part of a chunk, the rest is not decompressed, so its checksum is not checked.
+SMALL_PART = 0.5
+"""A chunk of which less is wanted is decompressed up to the last wanted message; its checksum is not computed.
 
-Recorders close a chunk when an image has filled it: the small messages before the image are a few percent of it.
+Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
 """
 
 
@@ -127,12 +127,12 @@ class McapFile(ChunkedFile):
                     yield from self._read_chunk(chunk)
 
     def _needed(self, chunk: _Chunk, wanted: frozenset[int]) -> int | None:
-        """Return how many bytes of a chunk's records hold the wanted messages, by its message index; None for all."""
+        """Return where in a chunk the last wanted message ends, by its message index; None where most is wanted."""
         if chunk.channels is None or chunk.channels <= wanted or chunk.index_length > LARGEST_CHUNK_BYTES:
             return None
         self._stream.seek(chunk.at + chunk.length)
         index, at = self._stream.read(chunk.index_length), 0
-        last, others = 0, [np.array([chunk.size], np.uint64)]
+        found = []
         while at + _INDEX_HEAD_BYTES <= len(index):
             opcode, length, channel = struct.unpack_from("<BQH", index, at)
             at += _HEAD_BYTES + length
@@ -140,20 +140,21 @@ class McapFile(ChunkedFile):
                 return None
             count = (length - _INDEX_HEAD_BYTES + _HEAD_BYTES) // 16
             offsets = np.frombuffer(index, "<u8", 2 * count, at - 16 * count)[1::2]
-            if channel not in wanted:
-                others.append(offsets)
-            elif count:
-                last = max(last, int(offsets.max()))
-        behind = np.concatenate(others)
-        needed = int(behind[behind > last].min(initial=chunk.size))
-        return needed if needed < LARGEST_PART * chunk.size else None
+            found.append(np.stack([offsets, np.full(count, channel in wanted, np.uint64)]))
+        if not found or not chunk.size:
+            return None
+        begin, is_wanted = np.concatenate(found, axis=1)
+        order = np.argsort(begin)
+        end = np.append(begin[order][1:], np.uint64(chunk.size))
+        sizes = np.where(is_wanted[order], end - begin[order], 0)
+        return int(end[sizes > 0].max(initial=0)) if sizes.sum() < SMALL_PART * chunk.size else None
 
     def _read_part(self, chunk: _Chunk, needed: int) -> Block | None:
         """Return the messages in the first `needed` bytes of a chunk; None where all of it has to be read for them."""
         self._stream.seek(chunk.at)
         content = self._stream.read(min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
         try:
-            records = np.frombuffer(_chunk_records(content, self._inflation, cut=True), np.uint8)
+            records = np.frombuffer(_chunk_records(content, self._inflation, cut=True, needed=needed), np.uint8)
         except DecompressionError:
             return None
         rows, stop = self._table.scan_mcap(records)
@@ -388,8 +389,14 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     return record
 
 
-def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
-    """Return the records of a chunk record's content, decompressed and checked against its checksum."""
+def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> bytes:
+    """Return the records of a chunk record's content, decompressed and checked against its checksum.
+
+    Parameters
+    ----------
+    cut : the content is cut off; what can be decompressed is not checked
+    needed : so many bytes of a content that is cut off are enough
+    """
     if len(content) < 40:
         raise DecompressionError("its header is cut off")
     size = int.from_bytes(content[16:24], "little")
@@ -402,7 +409,7 @@ def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
     packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
     if len(packed) < length and not cut:
         raise DecompressionError("its header is damaged")
-    data = inflation.decompress(packed, compression, size, partial=cut)
+    data = inflation.decompress(packed, compression, min(size, needed) if cut else size, partial=cut)
     if checksum and not cut and zlib.crc32(data) != checksum:
         raise DecompressionError("its checksum is wrong")
     return data

@@ -52,7 +52,8 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    header = np.where(np.abs(log_ns - header - delay) > NEAR_NS, log_ns - delay, header)
+    far = np.abs(log_ns - header - delay) > NEAR_NS
+    header[far] = log_ns[far] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)

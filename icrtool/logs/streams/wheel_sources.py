@@ -129,7 +129,7 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
         if len(finite) == 1:
             means.append(values[:, finite[0]].astype(np.float64, copy=False))
         else:
-            means.append(values.T[finite].astype(np.float64).mean(axis=0) if finite else None)
+            means.append(values.T[finite].astype(np.float64, copy=False).mean(axis=0) if finite else None)
     return means[0], means[1]
 
 
@@ -170,11 +170,9 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
         return no_motion(table, "left and right wheels come in different messages")
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
-    positions, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
-    position, speed = (
-        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)])
-        for values in (_unwound(positions), speeds)
-    )
+    sides = [*range(lefts)], [*range(lefts, lefts + rights)]
+    position = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
+    speed = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
     return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
 
