@@ -19,7 +19,7 @@ AXE           = $(VENV)/axe-core/axe.min.js
 AXE_VERSION   = 4.14.1
 AXE_SHA256    = 29348999450cdf2849a8e70b7912fc2da85a849da39c0d0d5394f51d4a9ed95c
 
-.PHONY: axe help setup demo format format-check lint words types test stress fuzz bench unseen docs samples wheel-check check constraints clean
+.PHONY: axe help setup demo format format-check lint words types test stress fuzz bench unseen docs schemas samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -85,6 +85,9 @@ unseen: $(READY)  ## right, hedged or wrong on 120 physics drives with random se
 docs: $(READY)  ## build the documentation site into build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 	@echo "Pages: build/docs/index.html"
+
+schemas: $(READY)  ## write the JSON schemas of the documents into docs/reference/schemas
+	$(BIN)/python scripts/schemas.py
 
 samples: $(READY)  ## simulate the sample logs again
 	$(BIN)/python $(SAMPLES)

@@ -138,7 +138,7 @@ def test_a_command_that_a_page_shows_has_these_arguments(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
-    for log in ("field.mcap", "field.bag"):
+    for log in ("field.mcap", "other.bag"):
         (tmp_path / log).touch()
     for run in ("RUN", "icrtool-runs/field"):
         (tmp_path / run).mkdir(parents=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.gnss_quality import CLASSES, FixQuality, judge_fixes
+from icrtool.alignment.gnss_quality import CLASSES, GnssQuality, grade_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
@@ -42,7 +42,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     log = with_wheel_speeds(log, config)
     found = align_streams(log, config)
     wheels, heading, delays = found.wheels, found.heading, found.delays
-    quality = judge_fixes(found.log, config, heading)
+    quality = grade_fixes(found.log, config, found.fix_steps)
     aligned = sensors_as_sent(quality.log, config)
     sense, offset = heading.remaining
     sensors = replace(
@@ -50,7 +50,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         fixes=replace(
             aligned.fixes,
             fix_class=quality.fix_class,
-            misreported=quality.sold,
+            misreported=quality.misreported,
             down_weighted=quality.down_weighted,
         ),
         headings=replace(
@@ -84,6 +84,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         streams=found.log.streams,
         fix_statistics=_fix_statistics(quality),
         position_delay_s=delays.applied_gnss_s,
+        clock_std_s=delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
         warnings=(
             *(warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings),
@@ -140,7 +141,7 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
     )
 
 
-def _fix_statistics(quality: FixQuality) -> FixStatistics:
+def _fix_statistics(quality: GnssQuality) -> FixStatistics:
     gnss, std_m = quality.log.gnss, {}
     std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     for code, name in CLASSES.items():

@@ -153,10 +153,7 @@ def senses_by_distance(drive: DriveArrays) -> Convention:
     t = drive.fix_t
     rows = np.unique(np.floor(t / CHORD_S), return_index=True)[1]
     chord = np.abs(np.diff(drive.fix[rows]))
-    left, right = (
-        np.diff(np.interp(t[rows], drive.wheel_t, np.concatenate([[0.0], np.cumsum((speed * drive.wheel_dt)[:-1])])))
-        for speed in (drive.v_left, drive.v_right)
-    )
+    left, right = (np.diff(drive.until_fixes(speed)[rows]) for speed in (drive.v_left, drive.v_right))
     moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
     if np.count_nonzero(moved) < FEWEST_WINDOWS:
         return AS_NAMED
@@ -177,18 +174,11 @@ FEWEST_WINDOWS = 16
 
 def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
-    v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
+    v, u = drive.mean_speed, drive.half_difference
     some = slice(None, None, max(1, len(windows.begin) // MOST_WINDOWS))
     begin, end = windows.begin[some], windows.end[some]
-    nose = np.exp(1j * hand * np.interp(drive.wheel_t + drive.wheel_dt / 2, drive.heading_t, drive.heading))
-
-    def cumulated(rate: Floats) -> Floats:
-        return np.concatenate([[0.0], np.cumsum((rate * drive.wheel_dt)[:-1])])
-
-    spans = []
-    for rate in (v * nose, u * nose):
-        at = np.interp(drive.fix_t, drive.wheel_t, cumulated(rate))
-        spans.append((at[end] - at[begin]) / windows.length_m)
+    nose = drive.nose if hand > 0 else np.conj(drive.nose)
+    spans = [(at[end] - at[begin]) / windows.length_m for at in map(drive.until_fixes, (v * nose, u * nose))]
     seen = (drive.fix[end] - drive.fix[begin]) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
     design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
@@ -197,8 +187,8 @@ def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
     first, last = windows.turn_begin[few], windows.turn_end[few]
     turned = hand * (np.interp(last, drive.heading_t, drive.heading) - np.interp(first, drive.heading_t, drive.heading))
     by = [
-        np.interp(last, drive.wheel_t, cumulated(rate)) - np.interp(first, drive.wheel_t, cumulated(rate))
-        for rate in (u, v)
+        np.interp(last, drive.wheel_t, total) - np.interp(first, drive.wheel_t, total)
+        for total in map(drive.cumulate, (u, v))
     ]
     turn = _linear(np.column_stack(by), turned, windows.turn_group[few], 10.0)
     return _Shown(place.x, place.covariance, turn.x, turn.covariance, place.residuals)

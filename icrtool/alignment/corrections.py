@@ -22,6 +22,7 @@ from icrtool.alignment.conventions import (
 )
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
+from icrtool.alignment.gnss_steps import FixSteps, measure_steps
 from icrtool.alignment.heading_alignment import (
     FEWEST_WINDOWS,
     OPPOSITE_SENSE,
@@ -62,7 +63,7 @@ class AlignedStreams(NamedTuple):
     Attributes
     ----------
     log : corrected; the heading's offset and handedness stand in `heading`, which the filter applies
-    fit : the estimate; None where the drive is too short
+    drive : what the estimate was made of; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
     """
 
@@ -70,6 +71,7 @@ class AlignedStreams(NamedTuple):
     wheels: WheelAlignment
     heading: HeadingAlignment
     delays: StreamDelays
+    drive: DriveArrays
     fit: AlignmentFit | None
     derived: DerivedHeading | None
     warnings: tuple[str, ...]
@@ -78,6 +80,12 @@ class AlignedStreams(NamedTuple):
     def geometry(self) -> Geometry | None:
         """ICRs with covariance, from the same estimate; None without one."""
         return None if self.fit is None else self.fit.geometry()
+
+    @property
+    def fix_steps(self) -> FixSteps:
+        """Steps between the fixes beyond the motion of the wheels."""
+        expected = self.drive.laid_until_fixes() if self.fit is None else self.fit.expected_motion()[0]
+        return measure_steps(self.drive.fix_t, self.drive.fix, expected)
 
     @property
     def as_named(self) -> RobotLog:
@@ -155,7 +163,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:  # noqa: PLR
     )  # fmt: skip
     delays = find_delays(log, config, fit)
     return AlignedStreams(
-        delays.log, wheels, heading, delays, fit, derived,
+        delays.log, wheels, heading, delays, drive, fit, derived,
         (*wheels.warnings, *heading.warnings, *delays.warnings),
     )  # fmt: skip
 
@@ -195,7 +203,7 @@ def _decide(
 
 
 def _apply(log: RobotLog, convention: Convention) -> RobotLog:
-    """Return the log with sides and position as the convention says; the heading's handedness is left to the filter."""
+    """Return the log with sides and position of a convention; the heading's handedness is left to the filter."""
     if convention == AS_NAMED:
         return log
     wheels, gnss = log.wheels, log.gnss

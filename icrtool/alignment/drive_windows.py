@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.gnss_steps import bend_std_m, unbroken
-from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+from icrtool.records.measurements import Fixes
+from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
 
 WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_POSITION_STD = 12.0
@@ -58,6 +59,33 @@ class DriveArrays(NamedTuple):
     fix_std_m: float
     same_clock: bool
 
+    @property
+    def mean_speed(self) -> Floats:
+        """Mean of the sides' speeds (n,) [m/s]."""
+        return (self.v_left + self.v_right) / 2
+
+    @property
+    def half_difference(self) -> Floats:
+        """Half of what left is faster than right (n,) [m/s]."""
+        return (self.v_left - self.v_right) / 2
+
+    @property
+    def nose(self) -> Complexes:
+        """Heading as a unit vector in the middle of each wheel interval (n,)."""
+        return np.asarray(np.exp(1j * np.interp(self.wheel_t + self.wheel_dt / 2, self.heading_t, self.heading)))
+
+    def cumulate(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each wheel sample (n,)."""
+        return np.concatenate([[0.0], np.cumsum((rate * self.wheel_dt)[:-1])])
+
+    def until_fixes(self, rate: Floats | Complexes) -> Complexes:
+        """Return the integral of a rate (n,) until each fix (m,)."""
+        return np.asarray(np.interp(self.fix_t, self.wheel_t, self.cumulate(rate)))
+
+    def laid_until_fixes(self) -> Complexes:
+        """Return the mean of the sides laid along the heading, until each fix (m,) [m]."""
+        return self.until_fixes(self.mean_speed * self.nose)
+
 
 class DriveWindows(NamedTuple):
     """Windows of a drive.
@@ -78,11 +106,26 @@ class DriveWindows(NamedTuple):
     group: Ints
     turn_group: Ints
 
+    def rows(self, kept: Bools, turn_kept: Bools) -> DriveWindows:
+        """Return the windows of distance (w,) and of time (u,) that are marked."""
+        return self._replace(
+            begin=self.begin[kept], end=self.end[kept], group=self.group[kept],
+            turn_begin=self.turn_begin[turn_kept], turn_end=self.turn_end[turn_kept],
+            turn_group=self.turn_group[turn_kept],
+        )  # fmt: skip
+
 
 def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
     """Return a log as arrays; `heading` in place of its own."""
-    wheels, gnss = log.wheels, log.gnss
-    heading = log.heading if heading is None else heading
+    topics = {stream.role: stream.topic for stream in log.streams}
+    same_clock = "gnss" in topics and topics["gnss"] == topics.get("heading", "")
+    return join_streams(log.wheels, log.gnss, log.heading if heading is None else heading, same_clock=same_clock)
+
+
+def join_streams(
+    wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool
+) -> DriveArrays:
+    """Return streams as arrays; `same_clock` as in `DriveArrays`."""
     epoch = int(wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
@@ -91,11 +134,10 @@ def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveA
     wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
     heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad))
     step = dt * (np.abs(left) + np.abs(right)) / 2
-    topics = {stream.role: stream.topic for stream in log.streams}
     return DriveArrays(
         wheel_t, dt, left, right, heading_t, angle,
         fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
-        fix_std_m(gnss), "gnss" in topics and topics["gnss"] == topics.get("heading", ""),
+        fix_std_m(gnss), same_clock,
     )  # fmt: skip
 
 
@@ -127,7 +169,7 @@ def _averaged(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
     return np.add.reduceat(t, first) / count, np.add.reduceat(angle, first) / count
 
 
-def fix_std_m(gnss: PositionFixes) -> float:
+def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more."""
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance) & (variance > 0)]
@@ -136,16 +178,22 @@ def fix_std_m(gnss: PositionFixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
+def window_length(drive: DriveArrays, least_m: float = WINDOW_M) -> float:
+    """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
+    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
+    return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
+
+
 def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
-    `length_m` is the length of a window; default: as the noise of the fixes asks for.
-
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
+
+    Parameters
+    ----------
+    length_m : of a window; default `window_length`
     """
-    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
-    length = max(WINDOW_M, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
-    length = length if length_m is None else length_m
+    length = window_length(drive) if length_m is None else length_m
     at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
     cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
     begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)

@@ -3,11 +3,12 @@
 With the heading measured along the path, all of it is linear but for the heading offset and the delays. Windows of
 driven distance from fix i to fix j, and windows of time of the heading itself:
 
-    p_j - p_i = e^{j d} ∫(a v + m u + n |u| + j c u + j l v w) e^{j psi},   u = (V_l - V_r)/2
+    p_j - p_i = e^{j d} ∫(a v + m u + n |u| + j (c + l v) psi') e^{j psi},                           u = (V_l - V_r)/2
     psi(t + T) - psi(t) = k ∫w + q ∫v/b + g T,                                                       w = (V_l - V_r)/b
 
 with psi taken tau_h later than stamped, and p tau_p earlier. Then a is the wheel scale, W = a b/k, and in general
-y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c/(2 k/b) (Pentzer 2014, Eqs. 8-12).
+y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c - l v (Pentzer 2014, Eqs. 8-12). The motion sideways
+is that of the measured turn psi': the wheels' turn leads it while the robot begins to turn, which looks like a delay.
 
 Not separable: a sideways crab from the offset; the antenna's place from the ICRs (forward from x_icr, right from the
 middle of y); sideways slip l from tau_p at constant speed. Priors decide.
@@ -27,7 +28,7 @@ from icrtool.records.tables import Complexes, Floats
 NAMES = (
     "scale",
     "middle",
-    "x",
+    "sideways",
     "slip",
     "turn",
     "asymmetry",
@@ -40,31 +41,33 @@ NAMES = (
 A, M, C, L, K, Q, G, D, TP, TH, N = range(11)
 
 PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.1, 0.6, 0.1, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
-"""They keep apart what a drive does not, and say nothing where it does. Robots are symmetric: their ICRs lie about as
-far to either side. Delays of position and heading of one
-robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without that, a drive at
-constant speed does not separate the drift from unequal wheels."""
+PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
+"""They keep apart what a drive does not, and hardly matter where it does. Robots are symmetric: their ICRs lie about as
+far to either side (`MIDDLE_STD_M`), and x_icr within half of b (the third is in b). Delays of position and
+heading of one robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without
+that, a drive at constant speed does not separate the drift from unequal wheels."""
 
 MIDDLE_STD_M = 0.1
 """The middle of the ICRs lies this near to the antenna, to either side."""
 
 SAME_CLOCK_STD_S = 1e-3
-"""Fields of the same messages are late together."""
+"""Fields of the same messages lag alike."""
 
-STEP_S = 0.02
-"""Delays are differentiated over this step."""
+STEP_S, TURN_STEP_S = 0.02, 0.1
+"""Delays are differentiated over the first step to either side, noisy headings over the second."""
 
 OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
 RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
-"""A robot answers its wheels late by up to 0.1 s, which no drive separates from a delay of the streams."""
+"""A robot lags its wheels by up to 0.1 s, which no drive separates from a delay of the streams."""
 
-USUAL_APART_S, CLOCK_STD_S = 0.05, 0.08
-"""A body that slips sideways in proportion to speed and turn rate, or follows a change of speed later than a turn,
-looks as if its position lagged its heading: on 55 rigid-body drives without any delay by 0.05 s on average and by
-0.08 s rms, whatever the standard deviation that the fit states."""
+CLOCK_STD_S = 0.05
+"""A body follows a change of speed later or earlier than a turn, which looks as if its position lagged its heading: by
+0.05 s rms on 50 rigid-body drives without any delay, by 0.04 s on five recorded ones."""
+
+SCALE_STD = 0.003
+"""Slip that varies with speed and turns looks like a scale: by so much rms on the same drives."""
 
 SLIPPING = 0.08
 """Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show
@@ -73,12 +76,15 @@ neither a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 t
 ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 """An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
 
+MOUNTING_STD_RAD = math.radians(3.0)
+"""A sensor whose offset no drive shows points ahead to within this."""
+
 FEWEST_WINDOWS = 16
 MOST_STEPS = 15
 
 
 class Geometry(NamedTuple):
-    """What the estimate says of the robot, with covariance.
+    """The geometry of the robot, with covariance.
 
     Attributes
     ----------
@@ -148,6 +154,10 @@ class AlignmentFit(NamedTuple):
         noise = math.sqrt(2.0) * self.drive.fix_std_m
         return math.sqrt(max(float(self.fit.scale[0]) ** 2 - noise**2, 0.0)) / self.windows.length_m
 
+    def expected_motion(self) -> tuple[Complexes, Floats]:
+        """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
+        return _Model(self.drive, self.windows, self.width_m).until_fixes(self.fit.x)
+
     def geometry(self) -> Geometry:
         """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
         x, b = self.fit.x, self.width_m
@@ -187,8 +197,7 @@ def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
     y_right, y_left = (x[A] + x[M]) / 2 / left, -(x[A] - x[M]) / 2 / right
     width = y_right - y_left
     # sideways slip l v w of that speed displaces the centre as c does
-    sideways = x[C] + 2.0 * x[L] * speed / b
-    return np.array([y_right, y_left, -sideways * b / (2 * x[K]), left * width, right * width, width])
+    return np.array([y_right, y_left, -x[C] - x[L] * speed, left * width, right * width, width])
 
 
 def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
@@ -208,13 +217,17 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         return None
     model = _Model(drive, windows, width_m)
     start = PRIOR_MEAN.copy()
-    start[D] = model.first_offset()
+    offset = model.first_offset()
+    start[D] = 0.0 if offset is None else offset
     w, u = len(windows.begin), len(windows.turn_begin)
     kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = PRIOR_STD.copy()
+    # spins show the distance of the ICRs' middle from the antenna, and not its direction
+    prior_std[D] = MOUNTING_STD_RAD if offset is None else prior_std[D]
     prior_std[TP] = SAME_CLOCK_STD_S if drive.same_clock else prior_std[TP]
     prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
+    prior_std[C] *= width_m
     try:
         fit = robust_least_squares(
             model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
@@ -226,6 +239,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         # exact data on one circle: nothing separates the parameters
         return None
     covariance[TH, TH] += RESPONSE_STD_S**2
+    covariance[A, A] += SCALE_STD**2
     if not drive.same_clock:
         covariance[TP, TP] += CLOCK_STD_S**2
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
@@ -239,81 +253,101 @@ class _Model:
 
     def __init__(self, drive: DriveArrays, windows: DriveWindows, width_m: float) -> None:
         self.drive, self.windows, self.b = drive, windows, width_m
-        self.v = (drive.v_left + drive.v_right) / 2
-        self.u = (drive.v_left - drive.v_right) / 2
+        self.v, self.u = drive.mean_speed, drive.half_difference
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
-        self.turn_v, self.turn_w = self._cumulate(self.v).real, self._cumulate(2 * self.u / width_m).real
+        self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
         self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
             windows.turn_begin, drive.heading_t, drive.heading
         )
 
-    def _cumulate(self, rate: Floats | Complexes) -> Complexes:
-        total: Complexes = np.concatenate([[0.0], np.cumsum((rate * self.drive.wheel_dt)[:-1])])
-        return total
-
-    def first_offset(self) -> float:
-        """Return the direction of the displacements from wheels laid along the heading [rad]."""
-        nose = np.exp(1j * np.interp(self.middle_t, self.drive.heading_t, self.drive.heading))
-        at = np.interp(self.drive.fix_t, self.drive.wheel_t, self._cumulate(self.v * nose))
+    def first_offset(self) -> float | None:
+        """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""
+        at = self.drive.laid_until_fixes()
         laid = at[self.windows.end] - at[self.windows.begin]
-        unit = self.seen * np.conj(laid)
+        unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
+        if len(unit) < FEWEST_WINDOWS:
+            return None
         return float(np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12))))
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
         """Return residuals along, across and of turns, and their Jacobian."""
-        place, place_slopes = self._displacements(x)
-        turn, turn_slopes = self._turns(x)
+        place, place_jacobian = self._displacements(x)
+        turn, turn_jacobian = self._turns(x)
         return (
             np.concatenate([place.real, place.imag, turn]),
-            np.concatenate([place_slopes.real, place_slopes.imag, turn_slopes]),
+            np.concatenate([place_jacobian.real, place_jacobian.imag, turn_jacobian]),
         )
 
+    def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
+        """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
+        nose, rate = self._directions(x)
+        path = self.drive.cumulate(self._velocity(x, rate) * nose)
+        t = self.drive.fix_t
+        turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.drive.wheel_t
+        return (
+            np.asarray(np.interp(t - x[TP] - x[TH], self.drive.wheel_t, path), np.complex128),
+            np.asarray(np.interp(t - x[TH], self.drive.wheel_t, turn), np.float64),
+        )
+
+    def _heading_at(self, t: Floats, x: Floats) -> Floats:
+        """Return the heading that a wheel speed of time t (n,) acts along: a response delays both alike."""
+        return np.asarray(np.interp(t + x[TH], self.drive.heading_t, self.drive.heading) + x[D], np.float64)
+
+    def _directions(self, x: Floats) -> tuple[Complexes, Floats]:
+        """Return the measured heading as a unit vector, and its rate [rad/s] (n,)."""
+        edges = self._heading_at(np.append(self.drive.wheel_t, self.drive.wheel_t[-1] + self.drive.wheel_dt[-1]), x)
+        dt = np.maximum(self.drive.wheel_dt, 1e-9)
+        rate = np.where(self.drive.wheel_dt > 0.0, np.diff(edges) / dt, 0.0)
+        return np.exp(0.5j * (edges[1:] + edges[:-1])), rate
+
+    def _smooth_turn(self, t: Floats, x: Floats) -> Complexes:
+        """Return the derivative of the heading's unit vector [rad/s] at times t (m,), over `TURN_STEP_S`."""
+        after, before = self._heading_at(t + TURN_STEP_S, x), self._heading_at(t - TURN_STEP_S, x)
+        return np.asarray(0.5j * (after - before) / TURN_STEP_S * np.exp(0.5j * (after + before)), np.complex128)
+
+    def _velocity(self, x: Floats, rate: Floats) -> Complexes:
+        """Return the velocity in the body (n,), forward + j right."""
+        ahead = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u)
+        return np.asarray(ahead + 1j * (x[C] + x[L] * self.v) * rate, np.complex128)
+
     def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
-        """Return predicted minus seen displacements in the frame of the heading (w,), and their slopes (w, k)."""
+        """Return predicted minus seen displacements in the frame of the heading (w,), and their Jacobian (w, k)."""
         drive, windows = self.drive, self.windows
-        offset, late_h, late_p = float(x[D]), float(x[TH]), float(x[TH] + x[TP])
-
-        def heading_at(t: Floats) -> Floats:
-            return np.interp(t + late_h, drive.heading_t, drive.heading)
-
-        nose = np.exp(1j * (heading_at(self.middle_t) + offset))
-        rate = (heading_at(self.middle_t + STEP_S) - heading_at(self.middle_t - STEP_S)) / (2 * STEP_S)
-        sideways = 1j * self.v * 2 * self.u / self.b
-        # the turn rate, as a speed difference: with an asymmetry it does not vanish where both sides are equal
-        turning = self.u + x[Q] / (2.0 * x[K]) * self.v
-        body = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u) + 1j * x[C] * turning + x[L] * sideways
-        t = drive.fix_t - late_p
+        nose, rate = self._directions(x)
+        body = self._velocity(x, rate)
+        t = drive.fix_t - x[TP] - x[TH]
         begin, end = windows.begin, windows.end
 
         def between(velocity: Complexes) -> Complexes:
-            at = np.interp(t, drive.wheel_t, self._cumulate(velocity))
+            at = np.interp(t, drive.wheel_t, drive.cumulate(velocity))
             return np.asarray(at[end] - at[begin], np.complex128)
 
-        path = self._cumulate(body * nose)
+        path = drive.cumulate(body * nose)
         at = np.interp(t, drive.wheel_t, path)
         predicted = at[end] - at[begin]
         speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
-        slopes = np.zeros((len(begin), len(x)), np.complex128)
-        slopes[:, A], slopes[:, M] = between(self.v * nose), between(self.u * nose)
-        slopes[:, C], slopes[:, L] = between(1j * turning * nose), between(sideways * nose)
-        slopes[:, D], slopes[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
-        slopes[:, TP] = -(speed[end] - speed[begin])
-        slopes[:, TH] = slopes[:, TP] + between(1j * rate * body * nose)
-        psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + offset
+        jacobian = np.zeros((len(begin), len(x)), np.complex128)
+        jacobian[:, A], jacobian[:, M] = between(self.v * nose), between(self.u * nose)
+        jacobian[:, C], jacobian[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
+        jacobian[:, D], jacobian[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
+        jacobian[:, TP] = -(speed[end] - speed[begin])
+        sideways = np.interp(t, self.middle_t, x[C] + x[L] * self.v) * self._smooth_turn(t, x)
+        jacobian[:, TH] = jacobian[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
+        psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + x[D]
         level = np.exp(-0.5j * (psi[begin] + psi[end]))
-        return (predicted - self.seen) * level, slopes * level[:, None]
+        return (predicted - self.seen) * level, jacobian * level[:, None]
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return predicted minus seen heading changes (u,), and their slopes (u, k)."""
+        """Return predicted minus seen heading changes (u,), and their jacobian (u, k)."""
         windows, t = self.windows, self.drive.wheel_t
         begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:
             return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
 
-        slopes = np.zeros((len(begin), len(x)))
-        slopes[:, K], slopes[:, Q], slopes[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
-        slopes[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        predicted = x[K] * slopes[:, K] + x[Q] * slopes[:, Q] + x[G] * TURN_WINDOW_S
-        return predicted - self.turned, slopes
+        jacobian = np.zeros((len(begin), len(x)))
+        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        jacobian[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * TURN_WINDOW_S
+        return predicted - self.turned, jacobian

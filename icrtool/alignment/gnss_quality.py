@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icrtool.alignment.gnss_steps import FixSteps, measure_steps
-from icrtool.alignment.heading_alignment import HeadingAlignment
+from icrtool.alignment.gnss_steps import FixSteps
 from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
 from icrtool.records.tables import (
@@ -57,14 +56,14 @@ SHORTEST_LOSS_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class FixQuality:
+class GnssQuality:
     """What the fixes of a log are.
 
     Attributes
     ----------
     log : with the variances that the fixes deserve; the given one in preset ``paper``
     fix_class : uint8 (m,), keys of `CLASSES`
-    sold : bool (m,), fixes that claim to be fixed and are not
+    misreported : bool (m,), fixes that claim to be fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
     step_std_m : by class name, white noise from step to step [m]; NaN where there are too few steps
     jump_stamp_ns : (j,) first fix after a jump; jump_m : (j,) its size
@@ -73,7 +72,7 @@ class FixQuality:
 
     log: RobotLog
     fix_class: Bytes
-    sold: Bools
+    misreported: Bools
     down_weighted: Bools
     step_std_m: dict[str, float]
     jump_stamp_ns: Ints
@@ -82,7 +81,7 @@ class FixQuality:
     warnings: tuple[str, ...]
 
 
-def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> FixQuality:
+def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
@@ -91,8 +90,6 @@ def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> Fix
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
     """
     gnss, changes = log.gnss, config.filter.preset != "paper"
-    sense, offset = heading.remaining
-    steps = measure_steps(log, mirrored=sense < 0, offset_rad=offset)
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     kinds, misreported = _classes(log, stated, steps)
     white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
@@ -106,10 +103,10 @@ def judge_fixes(log: RobotLog, config: Config, heading: HeadingAlignment) -> Fix
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     if raised or down.any():
         gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
-    quality = FixQuality(
+    quality = GnssQuality(
         log=replace(log, gnss=gnss),
         fix_class=kinds,
-        sold=misreported,
+        misreported=misreported,
         down_weighted=down,
         step_std_m=white,
         jump_stamp_ns=gnss.stamp_ns[steps.jump_row],
@@ -193,9 +190,9 @@ def _spans(pairs: list[tuple[int, int]]) -> Ints:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _notes(quality: FixQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
+def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
     """Return sentences on what the fixes do not state, and on what was done to their noise."""
-    notes, misreported, rows = [], quality.sold, quality.fix_class
+    notes, misreported, rows = [], quality.misreported, quality.fix_class
     if misreported.any():
         notes.append(
             f"{_counted(misreported)} claim {_accuracy(stated[misreported], 'to be fixed')} but scatter or jump like "

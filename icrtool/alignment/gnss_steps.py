@@ -1,4 +1,4 @@
-"""How the fixes step against the wheels laid along the heading: white noise, noisy stretches, jumps."""
+"""How the fixes step against the motion of the wheels: white noise, noisy stretches, jumps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes, RobotLog
+from icrtool.records.measurements import Fixes
+from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes
 
 FEWEST_STEPS = 40
 """Fewer steps show no noise; a stretch is evaluated by as many."""
@@ -27,7 +28,6 @@ PERSISTS_SHARE = 0.5
 MOVES_MPS = 0.05
 """Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
 
-MOST_TO_FIT = 10_000
 GAP_IN_INTERVALS = 5.0
 
 LONGEST_INTERVAL_S = 1.0
@@ -83,44 +83,20 @@ class FixSteps:
         return np.asarray(share > 0.5)
 
 
-def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 0.0) -> FixSteps:
-    """Compare each step between fixes with the path of the wheels along the heading.
+def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
+    """Compare each step between fixes with the motion of the wheels.
 
     Parameters
     ----------
-    mirrored, offset_rad : what is done to the heading
-
-    Notes
-    -----
-    Scale and direction of the path, and an arm from the body origin, are fitted to the steps by clipped least squares:
-    wheels that slip and an antenna that is off centre make no jumps.
+    t : (m,) [s]; place : complex (m,) of the fixes; expected : complex (m,) by the wheels, as integrals [m]
     """
-    gnss, wheels, heading = log.gnss, log.wheels, log.heading
-    if min(len(gnss.stamp_ns), len(wheels.stamp_ns), len(heading.stamp_ns)) < 3:
-        count, none = len(gnss.stamp_ns), np.empty(0, np.complex128)
-        unknown = np.full(max(count - 2, 0), np.nan)
-        still = np.zeros(max(count - 1, 0), np.bool_)
-        return FixSteps(np.full(max(count - 1, 0), np.nan + 0j), unknown, still, np.empty(0, np.int64), none)
-    speed = (wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
-    travelled = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
-    distance = np.diff(np.interp(gnss.stamp_ns, wheels.stamp_ns, travelled))
-
-    def nose(stamps: Ints) -> Complexes:
-        # The sample at hand is near enough for steps of centimetres, and needs no unwrapping of all the others.
-        row = np.minimum(np.searchsorted(heading.stamp_ns, stamps), len(heading.stamp_ns) - 1)
-        psi = heading.heading_rad[row]
-        return np.asarray(np.exp(1j * ((-psi if mirrored else psi) - offset_rad)), np.complex128)
-
-    laid = distance * nose(gnss.stamp_ns[:-1] + np.diff(gnss.stamp_ns) // 2)
-    swing = np.diff(nose(gnss.stamp_ns))
-    seen = np.diff(gnss.north_m + 1j * gnss.east_m)
-    dt = np.diff(gnss.stamp_ns) / 1e9
+    step, dt = np.diff(place - expected), np.diff(t)
+    if len(step) < 2:
+        unknown = np.full(max(len(step) - 1, 0), np.nan)
+        return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64), np.empty(0, np.complex128))
     usual = float(np.median(dt))
-    some = slice(None, None, max(1, len(seen) // MOST_TO_FIT))
-    along, arm = _explain(laid[some], swing[some], seen[some])
-    step = seen - along * laid - arm * swing
     step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
-    moves = np.abs(distance) > MOVES_MPS * dt
+    moves = np.abs(np.diff(expected)) > MOVES_MPS * dt
     moving = step[moves & np.isfinite(step)]
     scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
     with np.errstate(invalid="ignore"):
@@ -130,7 +106,7 @@ def measure_steps(log: RobotLog, *, mirrored: bool = False, offset_rad: float = 
     return FixSteps(step, product, moves, rows, jumps)
 
 
-def bend_std_m(gnss: PositionFixes) -> float:
+def bend_std_m(gnss: PositionFixes | Fixes) -> float:
     """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
 
     NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the
@@ -141,23 +117,6 @@ def bend_std_m(gnss: PositionFixes) -> float:
         return float("nan")
     bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
     return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
-
-
-def _explain(laid: Complexes, swing: Complexes, seen: Complexes) -> tuple[complex, complex]:
-    """Return the factors of `laid` and `swing` (m,) that explain most of `seen` (m,), wild steps left out."""
-    along, arm = 1.0 + 0.0j, 0.0 + 0.0j
-    for _ in range(2):
-        left = np.abs(seen - along * laid - arm * swing)
-        kept = left <= CLIP_SIGMAS * max(float(np.median(left)), 1e-9)
-        a, b, z = laid[kept], swing[kept], seen[kept]
-        # Normal equations of two unknowns; the sums are written out: BLAS would start its threads for them.
-        aa, bb = float((np.abs(a) ** 2).sum()) + 1e-9, float((np.abs(b) ** 2).sum()) + 1e-9
-        ab, az, bz = (complex((np.conj(one) * other).sum()) for one, other in ((a, b), (a, z), (b, z)))
-        determinant = aa * bb - abs(ab) ** 2
-        if determinant <= 1e-9 * aa * bb:
-            return az / aa, 0.0j
-        along, arm = (bb * az - ab * bz) / determinant, (aa * bz - ab.conjugate() * az) / determinant
-    return along, arm
 
 
 def _scale(step: Complexes) -> float:

@@ -58,7 +58,7 @@ class CourseAngles(NamedTuple):
 
     @property
     def agreement(self) -> float:
-        """Mean resultant length of `angle`: 1 where heading and course are one direction, about 0 at random."""
+        """Mean resultant length of `angle`: 1 where heading and course over ground agree, about 0 at random."""
         return _resultant_length(self.angle)
 
     @property
@@ -269,10 +269,10 @@ def _significant(offset: float, std: float) -> bool:
 
 def refuse_unexplained(log: RobotLog, course: CourseAngles) -> None:
     """Raise where the heading points nowhere, or no convention and no offset makes it follow the course over ground."""
-    windows = len(course.angle)
-    if course.scattered >= FEWEST_WINDOWS and course.scattered > windows:
+    windows, scattered = len(course.angle), course.scattered
+    if scattered >= FEWEST_WINDOWS and scattered > windows:
         raise _no_heading(
-            log, "scatters so much that it points nowhere", f"in {course.scattered} of the windows it was averaged over"
+            log, "scatters so much that it points nowhere", f"in {scattered} of the windows it was averaged over"
         )
     if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
         return

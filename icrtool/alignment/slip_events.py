@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.slip_extent import Extent, find_extent
-from icrtool.alignment.wheel_motion import MOVING_SHARE, Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
+from icrtool.alignment.slip_windows import Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData
 from icrtool.records.tables import Bools, Floats, Ints
@@ -53,6 +53,9 @@ JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
 RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
 """A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
 
+MOVING_SHARE = 0.2
+"""Windows in which the wheels do less than this part of the usual show nothing of the model's error."""
+
 TURNING_MPS = 0.05
 """Wheels slower than this do not turn."""
 
@@ -73,14 +76,13 @@ class _Evidence(NamedTuple):
     false_rate: Floats
 
 
-def find_slip_events(sensors: SensorData, width_m: float, motion: Motion | None = None) -> tuple[SlipEvent, ...]:
+def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
     """Find the spans in which the robot did not do what its wheels did.
 
     Parameters
     ----------
     sensors : aligned: sides, signs, scale, conventions and delays corrected
     width_m : distance b between the track centre lines, or what stands for it
-    motion : of the robot without slip; default: fitted to the log itself
 
     Returns
     -------
@@ -98,14 +100,14 @@ def find_slip_events(sensors: SensorData, width_m: float, motion: Motion | None 
     does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
     """
-    knots = lay_knots(sensors, width_m)
+    knots = lay_knots(sensors)
     if knots is None:
         return ()
     knots = _without_jumps(knots)
     quiet = np.ones(len(knots.t), np.bool_)
     events: list[SlipEvent] = []
     for quantile in (FIRST_QUANTILE, LATER_QUANTILE):
-        model = motion if motion is not None else fit_motion(knots, quiet)
+        model = fit_motion(knots, width_m, quiet)
         if model is None:
             return ()
         evidence, error = _weigh(knots, model, quiet, quantile)
@@ -259,7 +261,7 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
 
 
 def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
-    """Return whether the reference makes up, shortly before or after, for the distance that the event misses.
+    """Return whether the reference makes up, shortly before or after, for the distance that is missing in the event.
 
     A position that is wrong for a while comes back; distance lost by slip does not.
     """

@@ -1,7 +1,7 @@
 """Begin, end, kind and size of one slip event, from the steps between neighbouring fixes.
 
-A step between two fixes shows little, and a sum of them much: the log likelihood ratio of "each side misses this share
-of its motion" over "none is missed" grows through an event and falls outside it (Page 1954).
+A step between two fixes shows little, and a sum of them much: the log likelihood ratio of "this share of each side's
+motion is missing" over "none is" grows through an event and falls outside it (Page 1954).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.wheel_motion import Windows
+from icrtool.alignment.slip_windows import Windows
 from icrtool.records.events import SlipKind
 from icrtool.records.tables import Bools, Floats
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.alignment.estimator import SLIPPING, USUAL_APART_S, AlignmentFit
+from icrtool.alignment.estimator import PRIOR_STD, SLIPPING, TP, AlignmentFit
 from icrtool.config import Config
 from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
 
-SIGNIFICANT_SIGMAS, APART_SIGMAS = 2.5, 2.0
+SIGNIFICANT_SIGMAS = 2.5
 SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1
 """A robot follows its wheels by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
@@ -23,14 +23,15 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
-    def differs_from(self, usual_s: float, sigmas: float = SIGNIFICANT_SIGMAS) -> bool:
-        """Return whether it is known well, and is not the usual one."""
-        return self.std_s < LARGEST_STD_S and abs(self.value_s - usual_s) > sigmas * self.std_s
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is known well, and is not zero."""
+        return self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
 
     @property
     def is_clear(self) -> bool:
         """Whether it is certain and more than a robot's response to its wheels."""
-        return self.differs_from(0.0) and (self.value_s > SMALLEST_LAG_S or self.value_s < -SMALLEST_LEAD_S)
+        return self.is_significant and _is_large(self.value_s)
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -55,6 +56,21 @@ class StreamDelays:
     applied_heading_s: float
     applied_gnss_s: float
     warnings: tuple[str, ...]
+
+    @property
+    def clock_std_s(self) -> float:
+        """What remains unknown of the time between position and heading, where nothing or some of it was corrected [s].
+
+        Clocks agree as often as not. Where they were taken to agree, the deviation is that of the other case, times its
+        probability (Bayes factor of Dickey 1971: densities at zero after and before the drive).
+        """
+        value, std = self.apart
+        if self.together or not math.isfinite(std):
+            return 0.0
+        if self.applied_gnss_s != self.applied_heading_s:
+            return std
+        agree = PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
+        return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
     def heading_summary(self) -> dict[str, Any]:
         """Return the heading's numbers for run.json."""
@@ -124,19 +140,30 @@ def delayed(log: RobotLog, delay_s: float) -> RobotLog:
 
 
 def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> dict[str, float]:
-    """Return the delays to correct: that against the wheels, and that of position and heading against each other.
+    """Return the delays to correct: of the ways in which streams lag, the likeliest.
 
-    Of two streams that are apart, the one that lags the wheels is moved: stamps that lead need a clock that is wrong.
+    Twice the negative log-likelihood, with a penalty for each delay that is not zero (`SIGNIFICANT_SIGMAS` squared).
     """
     if together:
         common = position.value_s if position.is_clear else 0.0
         return {"heading": common, "position": common}
-    is_apart = apart.differs_from(USUAL_APART_S, APART_SIGMAS)
-    if is_apart and apart.value_s < 0.0:
-        late = position.value_s if position.is_clear else 0.0
-        return {"heading": late - apart.value_s, "position": late}
-    late = heading.value_s if heading.is_clear else 0.0
-    return {"heading": late, "position": late + (apart.value_s if is_apart else 0.0)}
+    if not heading.std_s < LARGEST_STD_S:
+        return {"heading": 0.0, "position": 0.0}
+    lag, after = heading.value_s, apart.value_s
+    # as stamped; both alike; the heading alone; the position alone; each by itself
+    free = {(0.0, 0.0): 0, (lag, lag): 1, (lag, 0.0): 1, (0.0, after): 1, (lag, lag + after): 2}
+
+    def cost(delays: tuple[float, float]) -> float:
+        misfits = (lag - delays[0]) / heading.std_s, (after - delays[1] + delays[0]) / apart.std_s
+        return misfits[0] ** 2 + misfits[1] ** 2 + SIGNIFICANT_SIGMAS**2 * free[delays]
+
+    chosen = min((one for one in free if all(value == 0.0 or _is_large(value) for value in one)), key=cost)
+    return dict(zip(("heading", "position"), chosen, strict=True))
+
+
+def _is_large(delay_s: float) -> bool:
+    """Return whether a delay is more than a robot's response to its wheels."""
+    return delay_s > SMALLEST_LAG_S or delay_s < -SMALLEST_LEAD_S
 
 
 def _delay_notes(
@@ -154,6 +181,6 @@ def _delay_notes(
             continue
         subject = "the position and its heading" if together else f"the {what}"
         lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
-        std = (found[what] if found[what].differs_from(0.0) else found["apart"]).std_s
+        std = (found[what] if found[what].is_significant else found["apart"]).std_s
         notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
     return notes

@@ -21,8 +21,8 @@ FEWEST_WINDOWS = 8
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 
-SMALLEST_SCALE_ERROR, SCALE_SIGMAS, USUAL_SCALE_STD = 0.01, 2.0, 0.04
-"""A scale is corrected by what remains of it beside a prior: wheels roll at their nominal radius to 4 %."""
+SMALLEST_SCALE_ERROR, SCALE_SIGMAS, LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.01, 2.0, 0.1, 0.04
+"""A scale that is shown is corrected by what remains of it beside a prior: wheels roll at their radius to 4 %."""
 
 SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
@@ -164,12 +164,8 @@ def refuse_standing(log: RobotLog, drive: DriveArrays, windows: DriveWindows) ->
         return
     turned = np.abs(np.interp(drive.fix_t[end], drive.heading_t, drive.heading)
                     - np.interp(drive.fix_t[begin], drive.heading_t, drive.heading))  # fmt: skip
-    v, w = drive.v_left + drive.v_right, drive.v_left - drive.v_right
-    nose = np.exp(1j * np.interp(drive.wheel_t, drive.heading_t, drive.heading))
-    laid, apart = (np.concatenate([[0.0], np.cumsum((rate / 2 * drive.wheel_dt)[:-1])]) for rate in (v * nose, w))
     laid, apart = (
-        np.abs(np.interp(drive.fix_t[end], drive.wheel_t, one) - np.interp(drive.fix_t[begin], drive.wheel_t, one))
-        for one in (laid, apart)
+        np.abs(at[end] - at[begin]) for at in (drive.laid_until_fixes(), drive.until_fixes(drive.half_difference))
     )
     went = np.abs(drive.fix[end] - drive.fix[begin])
     moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
@@ -226,7 +222,7 @@ def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
     scale, std = fit.estimate("scale")
     error = abs(scale - 1.0)
     # a heading that scatters makes the path along it shorter by half its variance
-    if error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
+    if std > LARGEST_SCALE_STD or error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
         return 1.0, []
     if error <= LARGEST_SCALE_CORRECTION:
         scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.calibration.held_out import Fold, HeldOut
-from icrtool.calibration.measured_errors import ControllerErrors
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
 from icrtool.motion.fit import PooledFit
-from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_parameters, track_geometry
-from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import drawn_path, twist_rates
+from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_model, track_geometry
+from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
+from icrtool.motion.trials import predicted_path
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Floats
 
@@ -33,7 +32,7 @@ class ExportNumbers:
 
     Attributes
     ----------
-    log : what it was fitted to; begin_ns : stamp of the first state; way_m : driven
+    log : what it was fitted to; begin_ns : stamp of the first state; distance_m : driven
     model, created : what is recommended, and when it was fitted
     separation_multiplier : (y_r - y_l) / b of the recommended model
     twist_width_m : separation with which the log's odometry was made, its multiplier included; None where it is not
@@ -50,7 +49,7 @@ class ExportNumbers:
 
     log: str
     begin_ns: int
-    way_m: float
+    distance_m: float
     robot: str | None
     track_width_m: float
     wheel_radius_m: float | None
@@ -148,7 +147,7 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
     -------
     None where too few windows were left out.
     """
-    far, near = (_misses(recordings, length, table) for length in (POSE_AFTER_M, TWIST_OVER_M))
+    far, near = (_window_errors(recordings, length, table) for length in (POSE_AFTER_M, TWIST_OVER_M))
     if min(len(far), len(near)) < FEWEST_WINDOWS or POSE_AFTER_M not in table.horizons_m:
         return None
     h = table.horizons_m.index(POSE_AFTER_M)
@@ -162,16 +161,16 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
     )
 
 
-def _misses(recordings: Sequence[Recording], length_m: float, table: HeldOut) -> Floats:
+def _window_errors(recordings: Sequence[Recording], length_m: float, table: HeldOut) -> Floats:
     """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
     rows = [np.empty((0, 6))]
     windows: dict[int, Windows | None] = {}
-    for fold, fit in zip(table.folds, table.without, strict=True):
+    for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
         recording = recordings[fold.recording]
         if fold.recording not in windows:
             windows[fold.recording] = _windows(recording, length_m)
         if (found := windows[fold.recording]) is not None:
-            rows.append(_fold_misses(recording, found, fold, fit, table.typical))
+            rows.append(_fold_errors(recording, found, fold, fit, own, table.typical))
     return np.concatenate(rows)
 
 
@@ -183,24 +182,24 @@ def _windows(recording: Recording, length_m: float) -> Windows | None:
         return None
 
 
-def _fold_misses(recording: Recording, windows: Windows, fold: Fold, fit: PooledFit, typical: TypicalDrive) -> Floats:
-    t = recording.t_s
-    row = np.searchsorted(t, windows.knot_t)
+def _fold_errors(
+    recording: Recording, windows: Windows, fold: Fold, fit: PooledFit, own: LogConstants, typical: TypicalDrive
+) -> Floats:
+    row = np.searchsorted(recording.t_s, windows.knot_t)
     mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
     s, e = windows.start[mine], windows.end[mine]
-    geometry = track_geometry(fit.model, fit.parameters, recording.width_m, typical)
-    rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=windows.steps)
-    theta, place = drawn_path(windows.steps, rates)(windows.knot_t)
-    miss = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
+    expressed = controller_model(track_geometry(fit.model, fit.parameters, recording.width_m, typical))
+    theta, place = predicted_path(recording, expressed, own, windows.steps)(windows.knot_t)
+    error = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
     turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]
     turned = theta[e] - theta[s] - turn
     lasting = windows.knot_t[e] - windows.knot_t[s]
-    return np.column_stack([miss.real, miss.imag, turned, lasting, turn, windows.length_m[mine]])
+    return np.column_stack([error.real, error.imag, turned, lasting, turn, windows.length_m[mine]])
 
 
-def _variances(misses: Floats) -> tuple[float, float, float]:
+def _variances(errors: Floats) -> tuple[float, float, float]:
     """Return mean squares (3,), never zero."""
-    along, across, heading = (max(float(value), SMALLEST_VARIANCE) for value in (misses**2).mean(axis=0))
+    along, across, heading = (max(float(value), SMALLEST_VARIANCE) for value in (errors**2).mean(axis=0))
     return along, across, heading
 
 

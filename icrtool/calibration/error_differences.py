@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.trials import Drive
 from icrtool.records.tables import Floats, Ints
 
 RESAMPLES, LEVEL = 300, 0.95
@@ -20,8 +21,8 @@ SAME_ROUTE_M = 1.0
 """Two drives took the same route where they are nowhere further apart at the same distance."""
 
 
-class ErrorDifference(NamedTuple):
-    """Errors of a second kind minus those of a first, with 95 % intervals [m]; NaN where there is none."""
+class ErrorEstimate(NamedTuple):
+    """Errors, or differences of errors, with 95 % intervals [m]; NaN where there is none."""
 
     p95_m: float
     p95_low_m: float
@@ -33,7 +34,7 @@ class ErrorDifference(NamedTuple):
 
 def compare_errors(
     first: Floats, first_block: Ints, second: Floats, second_block: Ints, *, paired: bool, seed: int
-) -> ErrorDifference:
+) -> ErrorEstimate:
     """Return p95 and mean of errors, second minus first.
 
     Parameters
@@ -52,10 +53,10 @@ def compare_errors(
         shared = sorted(sides[0].keys() & sides[1].keys())
         sides = [{block: side[block] for block in shared} for side in sides]
     if not all(sides):
-        return ErrorDifference(*([float("nan")] * 6))
+        return ErrorEstimate(*([float("nan")] * 6))
     p95, mean = _difference([np.concatenate(list(side.values())) for side in sides])
     if min(len(side) for side in sides) < FEWEST_BLOCKS:
-        return ErrorDifference(p95, np.nan, np.nan, mean, np.nan, np.nan)
+        return ErrorEstimate(p95, np.nan, np.nan, mean, np.nan, np.nan)
     rng = np.random.default_rng(seed)
     lists = [list(side.values()) for side in sides]
     found = np.empty((RESAMPLES, 2))
@@ -66,7 +67,7 @@ def compare_errors(
             [np.concatenate([side[i] for i in rows]) for side, rows in zip(lists, drawn, strict=True)]
         )
     low, high = np.percentile(found, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)], axis=0)
-    return ErrorDifference(p95, float(low[0]), float(high[0]), mean, float(low[1]), float(high[1]))
+    return ErrorEstimate(p95, float(low[0]), float(high[0]), mean, float(low[1]), float(high[1]))
 
 
 def blocks_of(path_m: Floats, horizon_m: float) -> Ints:
@@ -74,13 +75,14 @@ def blocks_of(path_m: Floats, horizon_m: float) -> Ints:
     return np.floor(path_m / max(horizon_m, SHORTEST_BLOCK_M)).astype(np.int64)
 
 
-def same_route(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, Floats]) -> bool:
-    """Return whether two drives, each distance, north, east (n,) [m], took the same route at the same distance."""
-    end = min(float(first[0][-1]), float(second[0][-1]))
-    if abs(float(first[0][-1]) - float(second[0][-1])) > 0.05 * end:
+def same_route(first: Drive, second: Drive) -> bool:
+    """Return whether two drives took the same route at the same distance."""
+    ends = [float(one.distance[-1]) for one in (first, second)]
+    if abs(ends[1] - ends[0]) > 0.05 * min(ends):
         return False
-    at = np.arange(0.0, end, 1.0)
-    places = [np.interp(at, one[0], one[1]) + 1j * np.interp(at, one[0], one[2]) for one in (first, second)]
+    at = np.arange(0.0, min(ends), 1.0)
+    places = [np.interp(at, one.distance, one.north) + 1j * np.interp(at, one.distance, one.east)
+              for one in (first, second)]  # fmt: skip
     return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
 
 

@@ -15,10 +15,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icrtool.calibration.held_out import HeldOut
-from icrtool.calibration.measured_errors import ErrorSources
+from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import sums_at_knots
-from icrtool.motion.models import MotionModel, model_columns, wheel_motion
+from icrtool.motion.models import FittedModel, model_columns, wheel_motion
 from icrtool.motion.recording import Recording, Steps, cut_windows
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Complexes, Floats, Ints
@@ -27,7 +27,7 @@ LENGTHS_M = (2.0, 5.0, 10.0, 20.0)
 """Held-out windows of these lengths are compared."""
 
 SCALED_FROM_M = 5.0
-"""Shorter windows say more of the reference's noise than of the model; they do not scale the quantiles."""
+"""Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
 
 FEWEST_WINDOWS = 20
 
@@ -90,23 +90,21 @@ class PathErrors(NamedTuple):
     of_sources: Spread
 
 
-def path_errors(
-    steps: Steps, ends: Ends, model: MotionModel, parameters: Floats, covariance: Floats, width_m: float,
-    delay_s: float = 0.0,
-) -> PathErrors:  # fmt: skip
+def path_errors(steps: Steps, ends: Ends, fitted: FittedModel, width_m: float, delay_s: float = 0.0) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
     Parameters
     ----------
     delay_s : of the wheels relative to the times of the knots
     """
-    fixed, axes, columns = model_columns(model, wheel_motion(steps.v_left, steps.v_right, width_m))
+    motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
+    fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     # the sources act all along the path, not at the ends of windows alone
     at = np.union1d(ends.knot_t + delay_s, steps.t)
     row, share = steps.locate(at)
-    knots, k = len(row), len(parameters)
+    knots, k = len(row), len(fitted.parameters)
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
-    sums_at_knots(fixed, columns, axes, parameters, steps.held, steps.into, row, share, rate, sums, by)
+    sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, row, share, rate, sums, by)
     theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
     s, e = (np.searchsorted(at, ends.knot_t[rows] + delay_s) for rows in (ends.start, ends.end))
     back = np.exp(-1j * theta[s])
@@ -115,7 +113,7 @@ def path_errors(
     place_by = by[:, :, 1] + 1j * by[:, :, 2]
     moved_by = back * (place_by[:, e] - place_by[:, s] - 1j * by[:, s, 0] * went)
     of_parameters = Spread(
-        *(np.einsum("kw,kl,lw->w", a, covariance, b)[:, None]
+        *(np.einsum("kw,kl,lw->w", a, fitted.covariance, b)[:, None]
           for a, b in ((turned_by, turned_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
                        (moved_by.imag, moved_by.imag)))
     )  # fmt: skip
@@ -203,7 +201,7 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     """
     stretches = 0
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    for fold, fit, delay in zip(table.folds, table.without, table.delays_s, strict=True):
+    for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
         recording = recordings[fold.recording]
         try:
             windows = cut_windows(recording, LENGTHS_M, recordings)
@@ -211,14 +209,19 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
             continue
         mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
         ends = Ends(windows.knot_t, windows.start[mine], windows.end[mine])
-        errors = path_errors(
-            windows.steps, ends, fit.model, fit.parameters, fit.covariance, recording.width_m, delay
-        )  # fmt: skip
+        errors = path_errors(windows.steps, ends, fit, recording.width_m, own.wheels_later_s)
         row = np.searchsorted(recording.t_s, windows.knot_t)
         heading = recording.drive.heading[row]
         turned = errors.turned - (heading[ends.end] - heading[ends.start])
         stretches += len(np.unique(np.floor(windows.start_m[mine] / CHOICE_HORIZON_M)))
-        found.append((windows.length_m[mine], errors, turned, errors.moved - windows.reference[mine]))
+        found.append(
+            (
+                windows.length_m[mine],
+                errors,
+                turned,
+                errors.moved - np.exp(-1j * own.heading_offset_rad) * windows.reference[mine],
+            )
+        )
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
         return None

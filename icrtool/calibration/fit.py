@@ -9,7 +9,7 @@ from typing import Any
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import recommend
 from icrtool.calibration.pooled import recording_of
-from icrtool.calibration.record import FittedModel, fitted_document
+from icrtool.calibration.record import fitted_document
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit as fit_filter
@@ -70,6 +70,5 @@ def recommendation(run: Run) -> dict[str, Any] | None:
         found = recommend([recording])
     except DataError:
         return None
-    fitted = FittedModel(found.fit.model, found.fit.parameters, found.fit.covariance)
     robot = robot_of(run) | {"track_width_m": recording.width_m}
-    return {"label": fitted.model.label, "why": found.why} | fitted_document(fitted, robot, found.typical)
+    return {"label": found.fit.model.label, "why": found.why} | fitted_document(found.fit, robot, found.typical)

@@ -9,7 +9,8 @@ import numpy as np
 from icrtool.calibration.error_growth import SOURCES, Ends, PathErrors, Spread, mean_error, path_errors, radius
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
-from icrtool.motion.models import MotionModel, model_columns, wheel_motion
+from icrtool.kernels.window_residuals import OMEGA, VX
+from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
 from icrtool.motion.trials import Trials
 from icrtool.records.tables import Complexes, Floats, Ints
@@ -74,9 +75,7 @@ def forecast_plan(
     speed = np.maximum(speed, SLOWEST_MPS)
     held = np.abs(step) / speed
     turn = np.append(np.diff(direction), 0.0) / held
-    left, right = wheel_speeds(
-        calibration.fitted.model, calibration.fitted.parameters, calibration.width_m, speed, turn
-    )
+    left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
     t = np.concatenate([[0.0], np.cumsum(held)])
     steps = Steps(t[:-1], held, left, right, np.zeros(len(held)), held / 2.0)
     length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
@@ -104,9 +103,7 @@ def forecast_trials(calibration: Calibration, recording: Recording, trials: Tria
     return found[0], found[1]
 
 
-def wheel_speeds(
-    model: MotionModel, parameters: Floats, width_m: float, speed: Floats, turn: Floats
-) -> tuple[Floats, Floats]:
+def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
     """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
 
     Notes
@@ -115,9 +112,9 @@ def wheel_speeds(
     """
     v, w = speed.copy(), turn.copy()
     for _ in range(INVERSIONS):
-        made = _ahead_and_turn(model, parameters, width_m, v, w)
-        by_v = (_ahead_and_turn(model, parameters, width_m, v + 1e-4, w) - made) / 1e-4
-        by_w = (_ahead_and_turn(model, parameters, width_m, v, w + 1e-4) - made) / 1e-4
+        made = _ahead_and_turn(fitted, width_m, v, w)
+        by_v = (_ahead_and_turn(fitted, width_m, v + 1e-4, w) - made) / 1e-4
+        by_w = (_ahead_and_turn(fitted, width_m, v, w + 1e-4) - made) / 1e-4
         off = np.array([speed, turn]) - made
         size = by_v[0] * by_w[1] - by_v[1] * by_w[0]
         size = np.where(np.abs(size) > 1e-3, size, 1e-3)
@@ -126,12 +123,8 @@ def wheel_speeds(
     return v + w * width_m / 2.0, v - w * width_m / 2.0
 
 
-def _ahead_and_turn(model: MotionModel, parameters: Floats, width_m: float, v: Floats, w: Floats) -> Floats:
-    motion = wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m)
-    made, axes, columns = model_columns(model, motion)
-    for axis, parameter, column in zip(axes, parameters, columns, strict=True):
-        made[axis] += parameter * column
-    return made[[0, 2]]
+def _ahead_and_turn(fitted: FittedModel, width_m: float, v: Floats, w: Floats) -> Floats:
+    return fitted.twist(wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m))[[VX, OMEGA]]
 
 
 def _resampled(points: Complexes) -> tuple[Complexes, Ints]:
@@ -179,8 +172,6 @@ def _errors(calibration: Calibration, steps: Steps, ends: Ends) -> tuple[Spread,
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    found: PathErrors = path_errors(
-        steps, ends, fitted.model, fitted.parameters, fitted.covariance, calibration.width_m
-    )  # fmt: skip
+    found: PathErrors = path_errors(steps, ends, fitted, calibration.width_m)
     spread = found.of_sources.combined(np.array(sources[:SOURCES])).plus(found.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,17 +30,24 @@ def calibrate(runs: Run | Sequence[Run]) -> Calibration:
     return calibrate_runs([runs] if isinstance(runs, Run) else runs).calibration
 
 
-def calibrate_runs(runs: Sequence[Run]) -> CalibrationResult:
-    """Calibrate as `calibrate` does, with the tables by which the model was chosen."""
-    if not runs:
-        raise ConfigError("runs", "none is given", "name at least one run or log")
-    robots = [robot_of(run) for run in runs]
+def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
+    """Calibrate as `calibrate` does, with the tables by which the model was chosen; one run at a time is held."""
+    recordings, robots = [], []
+    alone: tuple[str, ...] = ()
+    warnings: list[str] = []
+    for run in runs:
+        recordings.append(gyro_recording_of(run))
+        robots.append(robot_of(run))
+        alone = use_warnings(run)
+        warnings += use_warnings(run, alone=False)
+    if not recordings:
+        raise ConfigError("runs", "no usable one is given", "name at least one run or log")
     if len(found := {robot["wheel_radius_m"] for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
-    result = calibrate_recordings([gyro_recording_of(run) for run in runs], robots[0])
-    warnings = tuple(dict.fromkeys(warning for run in runs for warning in use_warnings(run, alone=len(runs) == 1)))
-    return replace(result, calibration=replace(result.calibration, warnings=warnings))
+    result = calibrate_recordings(recordings, robots[0])
+    known = alone if len(recordings) == 1 else tuple(dict.fromkeys(warnings))
+    return replace(result, calibration=replace(result.calibration, warnings=known))
 
 
 def robot_of(run: Run) -> dict[str, Any]:

@@ -22,15 +22,16 @@ from icrtool.motion.fit import Pool, PooledFit
 from icrtool.motion.models import (
     CONTROLLER,
     MODELS,
+    FittedModel,
     MotionModel,
     TypicalDrive,
-    controller_parameters,
+    controller_model,
     track_geometry,
     typical_drive,
     wheel_motion,
 )
-from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import Trials, cut_trials, trial_errors, twist_rates
+from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
+from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.tables import Bools, Floats
 
@@ -90,7 +91,7 @@ class HeldOut:
     scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
         what a controller makes of that
     fits : of everything, by model name
-    without : by fold, the model chosen without it and fitted without it; delays_s : of the wheels in it
+    without : by fold, the model chosen without it and fitted without it; own : constants of its recording for that
     typical : curvature and speed at which ICRs and multiplier are stated
     recommended : name of the model chosen with all folds
     chosen : by fold, the model chosen without it
@@ -102,7 +103,7 @@ class HeldOut:
     scores: tuple[HeldOutRow, ...]
     fits: dict[str, PooledFit]
     without: tuple[PooledFit, ...]
-    delays_s: tuple[float, ...]
+    own: tuple[LogConstants, ...]
     typical: TypicalDrive
     recommended: str
     chosen: tuple[str, ...]
@@ -163,7 +164,9 @@ def hold_out(
 
     def job(fitted: _Fitted) -> list[_Tested]:
         alone = tester.test(fitted)
-        return [alone, tester.test(tester.fit(fitted.model.with_gyro(), fitted.whole), alone)] if gyro else [alone]
+        return (
+            [alone, tester.test(tester.fit(fitted.model.with_gyro(), fitted.whole.fitted), alone)] if gyro else [alone]
+        )
 
     with ThreadPoolExecutor(AT_ONCE) as threads:
         fitted = list(threads.map(tester.fit, tuple(MODELS.values()) if models is None else models))
@@ -220,13 +223,13 @@ class _Fitted(NamedTuple):
 
 
 class _Tested(NamedTuple):
-    """A model's fits, whole and without each fold; by fold trial errors and the wheels' delay [s]."""
+    """A model's fits, whole and without each fold; by fold trial errors and constants of the recording."""
 
     model: MotionModel
     whole: PooledFit
     fits: list[PooledFit]
     errors: list[Floats]
-    delays: list[float]
+    own: list[LogConstants]
 
 
 class _Tester:
@@ -257,9 +260,9 @@ class _Tester:
             for fold in self.folds
         ]  # fmt: skip
 
-    def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> _Fitted:
+    def fit(self, model: MotionModel, wheels: FittedModel | None = None) -> _Fitted:
         """Fit a model to everything; one with a gyro weighs the turn rate of a fit for wheels alone."""
-        pool = Pool(self._windows, self._widths, model, None if wheels is None else wheels.turning)
+        pool = Pool(self._windows, self._widths, model, wheels)
         whole, count = pool.fit(), len(self.folds)
         inner = np.full((count, count), np.nan)
         for f in range(count):
@@ -272,56 +275,40 @@ class _Tester:
 
     def test(self, fitted: _Fitted, wheels: _Tested | None = None) -> _Tested:
         """Test a model; one with a gyro weighs the turn rates of the fits for wheels alone without the same folds."""
-        model, pool, fits, errors, delays = fitted.model, fitted.pool, [], [], []
-        for f in range(len(self.folds)):
+        model, pool, fits, errors, constants = fitted.model, fitted.pool, [], [], []
+        for f, fold in enumerate(self.folds):
             if wheels is not None:
-                pool = Pool(self._windows, self._widths, model, wheels.fits[f].turning)
+                pool = Pool(self._windows, self._widths, model, wheels.fits[f].fitted)
             fit = pool.fit(self._clear[f], fitted.pool.without(fitted.whole, ~self._clear[f]))
-            found, delay = self._trial_errors(pool, fit, f, None if wheels is None else wheels.fits[f])
+            # from what is left of a recording, or, where all of it is left out, from itself with the others' parameters
+            i = fold.recording
+            own = pool.own_constants(i, fit.parameters) if fold.whole else fit.constants[i]
             fits.append(fit)
-            errors.append(found)
-            delays.append(delay)
-        return _Tested(model, fitted.whole, fits, errors, delays)
+            errors.append(self.trial_errors(fit, f, own))
+            constants.append(own)
+        return _Tested(model, fitted.whole, fits, errors, constants)
 
     def _window_error(self, fit: PooledFit, f: int, x: Floats) -> float:
-        """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit.
-
-        Notes
-        -----
-        Without the recording's heading offset: trials start with the heading of the reference as it is.
-        """
-        rows, offset = self._inside[f], len(fit.model.terms) + 3 * self.folds[f].recording
-        away = x - fit.solution.x
-        away[offset] = -fit.solution.x[offset]
-        residuals = fit.residuals[rows] + fit.jacobian[rows] @ away
+        """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit."""
+        rows = self._inside[f]
+        residuals = fit.residuals[rows] + fit.jacobian[rows] @ (x - fit.solution.x)
         half = len(residuals) // 2
         if not half:
             return float("nan")
         return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
-    def _trial_errors(self, pool: Pool, fit: PooledFit, f: int, wheels: PooledFit | None) -> tuple[Floats, float]:
-        """Return the errors of a fold's trials, and the delay of the wheels [s] that they hold for.
-
-        Notes
-        -----
-        Delay and gyro bias are constants of a recording: from what is left of it, or, where all of it is left out,
-        from itself with the parameters of the others.
-        """
-        fold = self.folds[f]
-        i = fold.recording
-        own = pool.own_constants(i, fit.parameters) if fold.whole else fit.constants[i]
-        turn = None if wheels is None else wheels.turning
-        recording, steps = self._recordings[i], self._windows[i].steps
-        rates = twist_rates(recording, fit.model, fit.parameters, turn, float(own[2]), steps)
-        return trial_errors(recording, self._trials[f], rates, float(own[1]), steps), float(own[1])
-
-    def controller_errors(self, fit: PooledFit, f: int, delay_s: float) -> Floats:
-        """Return the errors of a fold's trials with what a controller can express of a fit without the fold."""
+    def trial_errors(self, fitted: FittedModel, f: int, own: LogConstants) -> Floats:
+        """Return the errors of a fold's trials."""
         i = self.folds[f].recording
-        recording, steps = self._recordings[i], self._windows[i].steps
-        geometry = track_geometry(fit.model, fit.parameters, recording.width_m, self.typical)
-        rates = twist_rates(recording, CONTROLLER, controller_parameters(geometry), steps=steps)
-        return trial_errors(recording, self._trials[f], rates, delay_s, steps)
+        path = predicted_path(self._recordings[i], fitted, own, self._windows[i].steps)
+        return trial_errors(self._recordings[i], self._trials[f], path)
+
+    def controller_errors(self, fit: PooledFit, f: int, own: LogConstants) -> Floats:
+        """Return the errors of a fold's trials with what a controller can express of a fit without the fold."""
+        width_m = self._recordings[self.folds[f].recording].width_m
+        return self.trial_errors(
+            controller_model(track_geometry(fit.model, fit.parameters, width_m, self.typical)), f, own
+        )
 
 
 def block_trials(recording: Recording, folds: Sequence[Fold], horizons_m: Sequence[float]) -> Trials:
@@ -348,12 +335,12 @@ def _table(
     )
     fits = {name: one.whole for name, one in by_name.items()}
     without = tuple(by_name[name].fits[f] for f, name in enumerate(choice.chosen))
-    delays = tuple(by_name[name].delays[f] for f, name in enumerate(choice.chosen))
+    own = tuple(by_name[name].own[f] for f, name in enumerate(choice.chosen))
     if not any(fit.model.uses_gyro for fit in without):
-        errors = [tester.controller_errors(fit, f, delays[f]) for f, fit in enumerate(without)]
+        errors = [tester.controller_errors(fit, f, own[f]) for f, fit in enumerate(without)]
         rows.append(_scores(CONTROLLER.name, CONTROLLER.label, errors))
     return HeldOut(
-        tuple(horizons_m), tester.folds, tuple(rows), fits, without, delays, tester.typical, choice.recommended,
+        tuple(horizons_m), tester.folds, tuple(rows), fits, without, own, tester.typical, choice.recommended,
         choice.chosen, choice.why,
     )  # fmt: skip
 

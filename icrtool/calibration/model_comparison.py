@@ -15,11 +15,12 @@ import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
-from icrtool.calibration.pooled import ErrorsOf, block_predictor, calibration_from, recording_of, scaled_gyro
-from icrtool.calibration.record import Calibration, FittedModel
+from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
+from icrtool.calibration.record import Calibration
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import FrozenIcrs, Summary
+from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
@@ -83,7 +84,7 @@ class ModelComparison:
 
 
 class ComparedModels(NamedTuple):
-    """The table, and what gives the errors of the recommended model in any trials (see `block_predictor`)."""
+    """The table, and what gives the errors of the recommended model in any trials (see `held_out_predictor`)."""
 
     table: ModelComparison
     recommended: ErrorsOf
@@ -129,14 +130,14 @@ def compare_models(
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         scores=tuple(scores),
         chosen=wheels.chosen,
-        fits={name: FittedModel(fit.model, fit.parameters, fit.covariance) for name, fit in wheels.fits.items()},
+        fits={name: fit.fitted for name, fit in wheels.fits.items()},
         best=wheels.recommended,
         width_m=recording.width_m,
         heading=heading,
         notes=notes,
         calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
     )
-    return ComparedModels(table, block_predictor(recording, wheels))
+    return ComparedModels(table, held_out_predictor([recording], wheels, 0))
 
 
 def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:
@@ -155,7 +156,7 @@ def _with_heading(run: Run, headings: Sequence[MeasuredHeading]) -> tuple[Record
         found = recording_of(run, one, width_m=plain.width_m)
         if found.gyro_radps is not None:
             if found.gyro_reversed:
-                notes.append(f"the {one.kind} counts turns the other way: its sign was turned")
+                notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
             return found, one.kind, tuple(notes)
         notes.append(f"the {one.kind} does not turn with the robot: rows with it are left out")
     if not headings:
@@ -187,7 +188,7 @@ def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOu
 def _turned_scores(
     run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
 ) -> Iterator[ModelScore]:  # fmt: skip
-    """Yield the models that turn by wheels and a measured heading; a multiplier alone says nothing of the path."""
+    """Yield the models that turn by wheels and a measured heading; a multiplier alone gives no path."""
     for name in MODELS:
         if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
             continue

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records.run import Run
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
@@ -49,9 +50,8 @@ KINDS = (
 WEAK = 3.0
 """A standard deviation up to so many times the useful one is weak; above it, the drive does not show the parameter."""
 
-TURNS_NEEDED_RAD = math.pi
-ONE_SIDED = 0.15
-"""Turns are one-sided where those in the other direction sum to less than this share."""
+SHOWN_STRAIGHT = ("left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg")
+"""What driving straight on shows."""
 
 STEADY = 0.15
 """A speed is steady where its standard deviation is less than this share of its mean."""
@@ -216,18 +216,12 @@ def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
 
 def _reason(kind: _Kind, facts: DriveFacts) -> str:
     """Return why the drive does not determine a parameter well, and what to drive."""
-    right, left = facts.turned_right_rad, facts.turned_left_rad
-    total = right + left
-    if kind.key not in {"left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg"} and total < TURNS_NEEDED_RAD:
-        return (
-            f"hardly any turns ({math.degrees(total):.0f}° in all, {math.degrees(facts.turn_rate_radps):.0f} deg/s):"
-            " add two spins or tight circles in each direction"
-        )
     if kind.key.startswith("gnss_delay") and facts.speed_std_mps < STEADY * facts.speed_mps:
         return f"speed hardly changes ({facts.speed_mps:.2f} ± {facts.speed_std_mps:.2f} m/s): add stops and starts"
-    if total >= TURNS_NEEDED_RAD and min(right, left) < ONE_SIDED * max(right, left):
-        side = "left" if right > left else "right"
-        return f"turns in one direction only: add as many turns to the {side}"
+    right, left = facts.turned_right_rad, facts.turned_left_rad
+    lacks = lacking_turns(right, left)
+    if lacks and (kind.key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
+        return lacks
     return f"too short a drive for this noise: {facts.distance_m:.0f} m"
 
 

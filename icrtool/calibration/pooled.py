@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,15 +15,14 @@ from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import measure_error_sources
 from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_out, mask_windows
-from icrtool.calibration.record import Calibration, CalibrationLog, FittedModel, HeldOutScore
+from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
-from icrtool.motion.fit import Pool, PooledFit
-from icrtool.motion.models import GYRO_TERMS
-from icrtool.motion.recording import Recording, Windows, cut_windows
-from icrtool.motion.trials import Trials, trial_errors, twist_rates
+from icrtool.motion.fit import Pool
+from icrtool.motion.recording import Recording, cut_windows
+from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Floats
@@ -30,7 +31,7 @@ GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
 GYRO_PRIOR_STD = np.array([10.0, 0.02])
-"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this tells one from the other."""
+"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this separates the two."""
 
 GYRO_SCALE_RANGE = 0.1
 """A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
@@ -151,8 +152,8 @@ def calibration_from(
             one.path,
             one.sha256,
             float(one.drive.distance[-1]),
-            float(np.degrees(own[0])),
-            -float(own[1]),
+            math.degrees(own.heading_offset_rad),
+            -own.wheels_later_s,
             one.begin_ns,
         )
         for one, own in zip(recordings, best.constants, strict=True)
@@ -160,9 +161,9 @@ def calibration_from(
     scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
     return Calibration(
         robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
-        fitted=_fitted(best),
-        others={name: _fitted(fit) for name, fit in wheels.fits.items()},
-        gyro=None if gyro is None else _fitted(gyro.fits[gyro.recommended]),
+        fitted=best.fitted,
+        others={name: fit.fitted for name, fit in wheels.fits.items()},
+        gyro=None if gyro is None else gyro.fits[gyro.recommended].fitted,
         typical=wheels.typical,
         why=wheels.why,
         logs=logs,
@@ -178,10 +179,6 @@ def calibration_from(
 def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
     without = [one.name for one in recordings if one.gyro_radps is None]
     return () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
-
-
-def _fitted(fit: PooledFit) -> FittedModel:
-    return FittedModel(fit.model, fit.parameters, fit.covariance)
 
 
 def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
@@ -200,7 +197,13 @@ ErrorsOf = Callable[[Trials], Floats]
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return what gives the errors of a calibration in any trials of a recording.
+    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated_path`."""
+    path = calibrated_path(calibration, recording, with_gyro=with_gyro)
+    return lambda trials: trial_errors(recording, trials, path)
+
+
+def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> PathAt:
+    """Return the path that a calibration makes of a recording.
 
     Parameters
     ----------
@@ -215,16 +218,7 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
 
     Notes
     -----
-    Delay of the wheels and bias of the gyro are the recording's own, found with the parameters held.
-    """
-    rates, wheels_delay_s = recorded_rates(calibration, recording, with_gyro=with_gyro)
-    return lambda trials: trial_errors(recording, trials, rates, wheels_delay_s)
-
-
-def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> tuple[Floats, float]:
-    """Return the body twist (3, n) of each wheel sample by a calibration, and the delay of the wheels [s].
-
-    Parameters, errors and notes are those of `predictor`.
+    Constants of the recording are found in it with the parameters held.
     """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
@@ -232,43 +226,35 @@ def recorded_rates(calibration: Calibration, recording: Recording, *, with_gyro:
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
-    windows: list[Windows] = [cut_windows(recording)]
-    wheels = (calibration.fitted.model, calibration.fitted.parameters) if GYRO_TERMS[0] in fitted.model.terms else None
-    pool = Pool(windows, [recording.width_m], fitted.model, wheels)
-    own = pool.own_constants(0, fitted.parameters)
-    return twist_rates(recording, fitted.model, fitted.parameters, wheels, float(own[2])), float(own[1])
+    pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
+    return predicted_path(recording, fitted, pool.own_constants(0, fitted.parameters))
 
 
-def fixed_predictor(recording: Recording, fit: PooledFit) -> ErrorsOf:
-    """Return what gives the errors of a fit to other recordings, with the delay of this recording's own wheels."""
-    own = Pool([cut_windows(recording)], [recording.width_m], fit.model).own_constants(0, fit.parameters)
-    rates = twist_rates(recording, fit.model, fit.parameters)
-    return lambda trials: trial_errors(recording, trials, rates, float(own[1]))
-
-
-def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
-    """Return what gives the errors of the recommended model, each trial predicted without the blocks that it touches.
+def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
+    """Return what gives the errors of the recommended model in recording i, predicted without what a trial touches.
 
     Notes
     -----
-    The parameters, and the delay of the wheels, are fitted to windows that share no distance with any block from a
-    trial's start to its end; the model is the one chosen without the block of the start. Trials for which too little
-    is left to fit to have no error.
+    The parameters are fitted to windows that share no distance with any fold, recording or block, from a trial's start
+    to its end; the model is the one chosen without the fold of the start. Trials for which too little is left to fit to
+    have no error.
     """
-    windows = [cut_windows(recording)]
-    edges = np.array([fold.begin_m for fold in table.folds])
-    pools = {name: Pool(windows, [recording.width_m], table.fits[name].model) for name in set(table.chosen)}
-    found: dict[tuple[int, int], tuple[Floats, float] | None] = {}
+    recording = recordings[i]
+    mine = [f for f, fold in enumerate(table.folds) if fold.recording == i]
+    edges = np.array([table.folds[f].begin_m for f in mine])
 
-    def rates_without(first: int, last: int) -> tuple[Floats, float] | None:
-        fit = table.without[first]
+    @cache
+    def path_without(first: int, last: int) -> PathAt | None:
+        fit, own = table.without[mine[first]], table.own[mine[first]]
         if first != last:
-            fold = Fold("", 0, table.folds[first].begin_m, table.folds[last].end_m)
+            windows = [cut_windows(recording)]
+            fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
             (kept,), _ = mask_windows(windows, [fold])
             if np.count_nonzero(kept) < FEWEST_RESIDUALS:
                 return None
-            fit = pools[table.chosen[first]].fit(kept, fit.solution.x)
-        return twist_rates(recording, fit.model, fit.parameters), float(fit.constants[0, 1])
+            fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
+            own = fit.constants[0]
+        return predicted_path(recording, fit, own)
 
     def errors_of(trials: Trials) -> Floats:
         errors: Floats = np.full(trials.ends.shape, np.nan)
@@ -276,20 +262,18 @@ def block_predictor(recording: Recording, table: HeldOut) -> ErrorsOf:
         first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
         # Block by block of the start: tables of all trials would need more memory than their errors.
         for a in np.flatnonzero(np.bincount(first)).tolist():
-            mine = np.flatnonzero(first == a)
-            ends = trials.ends[mine]
+            begun = np.flatnonzero(first == a)
+            ends = trials.ends[begun]
             # a trial that ends where a block does touches no more of it
             last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
             last[ends < 0] = -1
             for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
-                if (a, b) not in found:
-                    found[a, b] = rates_without(a, b)
-                if (known := found[a, b]) is not None:
+                if (path := path_without(a, b)) is not None:
                     of_pair = last == b
                     kept = of_pair.any(axis=1)
-                    rows, there = mine[kept], of_pair[kept]
+                    rows, there = begun[kept], of_pair[kept]
                     part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
-                    errors[rows] = np.where(there, trial_errors(recording, part, *known), errors[rows])
+                    errors[rows] = np.where(there, trial_errors(recording, part, path), errors[rows])
         return errors
 
     return errors_of

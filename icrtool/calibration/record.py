@@ -13,66 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.measured_errors import (
-    ControllerErrors,
-    ErrorSources,
-)
-from icrtool.motion.models import (
-    MotionModel,
-    TrackGeometry,
-    TypicalDrive,
-    track_geometry,
-    twist,
-    wheel_motion,
-)
+from icrtool.motion.models import FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import Floats, Ints, RobotLog
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
-
-NOT_SHOWN = 0.7
-"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
-
-STEP = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class FittedModel:
-    """A model of the family with its parameters.
-
-    Attributes
-    ----------
-    parameters : (k,), in the order of the model's terms; covariance : (k, k)
-    """
-
-    model: MotionModel
-    parameters: Floats
-    covariance: Floats
-
-    @property
-    def std(self) -> Floats:
-        """One standard deviation of each parameter (k,)."""
-        deviations: Floats = np.sqrt(np.diag(self.covariance))
-        return deviations
-
-    @property
-    def not_shown(self) -> tuple[str, ...]:
-        """Names of the terms that the data did not show: they rest on the prior."""
-        share = self.std / self.model.prior_std
-        return tuple(name for name, left in zip(self.model.terms, share, strict=True) if left > NOT_SHOWN)
-
-    def geometry(self, width_m: float, typical: TypicalDrive) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs, multipliers and radius factors, and their covariance (7, 7)."""
-        at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
-        slopes = np.zeros((len(at), len(self.parameters)))
-        for k in range(len(self.parameters)):
-            moved = self.parameters.copy()
-            moved[k] += STEP
-            slopes[:, k] = (np.array(track_geometry(self.model, moved, width_m, typical)) - at) / STEP
-        covariance: Floats = slopes @ self.covariance @ slopes.T
-        return TrackGeometry(*at.tolist()), covariance
 
 
 class HeldOutScore(NamedTuple):
@@ -119,6 +66,52 @@ class ControllerNumbers(NamedTuple):
     left_radius_std: float
     right_radius: float
     right_radius_std: float
+
+
+class ControllerErrors(NamedTuple):
+    """Errors of what a controller can express of the recommended model, on distance it was not fitted to.
+
+    Attributes
+    ----------
+    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
+    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
+    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
+    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; NaN without a trial of 10 m
+    """
+
+    pose_variance: tuple[float, float, float]
+    twist_variance: tuple[float, float, float]
+    turn_noise: tuple[float, float]
+    way_noise: tuple[float, float]
+    p95_m: float
+    full_p95_m: float
+
+
+class ErrorSources(NamedTuple):
+    """Variances of what a model leaves out, and what its quantiles are scaled by.
+
+    Attributes
+    ----------
+    heading_start_rad2 : of the heading at the start
+    heading_rate_rad2pm2 : of a turn per metre that stays the same along the path
+    turn_share : of the share by which every turn is off
+    heading_wander_rad2pm : of the heading, for each metre
+    speed_share : of the share by which the distance is off
+    distance_wander_m2pm : of the distance, for each metre
+    heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
+    p95_factor, expected_factor : measured over predicted
+    """
+
+    heading_start_rad2: float
+    heading_rate_rad2pm2: float
+    turn_share: float
+    heading_wander_rad2pm: float
+    speed_share: float
+    distance_wander_m2pm: float
+    heading_noise_rad2: float
+    position_noise_m2: float
+    p95_factor: float
+    expected_factor: float
 
 
 class Odometry(NamedTuple):
@@ -202,7 +195,7 @@ class Calibration:
         x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
         """
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
-        found = twist(self.fitted.model, self.fitted.parameters, wheel_motion(left, right, self.width_m))
+        found = self.fitted.twist(wheel_motion(left, right, self.width_m))
         return found[:, 0] if np.ndim(v_left) == 0 else found
 
     def odometry(self, log: RobotLog) -> Odometry:

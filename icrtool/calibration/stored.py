@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, TypedDict, TypeVar
 
 import msgspec
 import numpy as np
 
-from icrtool.calibration.measured_errors import controller_errors_of, error_sources_of
 from icrtool.calibration.record import (
     CALIBRATION_SCHEMA,
     Calibration,
     CalibrationLog,
-    FittedModel,
+    ControllerErrors,
+    ErrorSources,
     HeldOutScore,
 )
-from icrtool.motion.models import TypicalDrive, find_model
+from icrtool.motion.models import FittedModel, TypicalDrive, find_model
 from icrtool.records.text import escaped
 
 WIDEST_M = 20.0
@@ -25,7 +26,7 @@ WIDEST_M = 20.0
 LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
-Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore)
+Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore, ControllerErrors, ErrorSources)
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
@@ -54,27 +55,30 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
     """
     if document["schema"] != CALIBRATION_SCHEMA:
         raise ValueError(f"schema {document['schema']!r}")
-    gyro = document["gyro"]
+    gyro, controller, sources = document["gyro"], document["controller"], document.get("error_sources")
+    fitted = _fitted(document["model"], document)
     try:
         found = Calibration(
             robot=_robot(document["robot"]),
-            fitted=_fitted(document["model"], document),
+            fitted=fitted,
             others={name: _fitted(name, one) for name, one in document["models"].items()},
-            gyro=None if gyro is None else _fitted(gyro["model"], gyro),
+            gyro=None if gyro is None else replace(_fitted(gyro["model"], gyro), wheels=fitted),
             typical=_record(TypicalDrive, document["typical"]),
             why=_text(document["why"]),
             logs=tuple(_record(CalibrationLog, log) for log in document["logs"]),
             held_out=tuple(_record(HeldOutScore, score) for score in document["held_out"]),
-            controller=controller_errors_of(document["controller"]),
+            controller=_record(ControllerErrors, controller) if "pose_variance" in controller else None,
             warnings=tuple(map(_text, document["warnings"])),
             created=_text(document["created"]),
             tool_version=_text(document["tool_version"]),
-            sources=error_sources_of(document.get("error_sources")),
+            sources=None if sources is None else _record(ErrorSources, sources),
         )
     except msgspec.ValidationError as err:
         raise ValueError(str(err)) from err
     if not np.isfinite(list(found.typical)).all():
         raise ValueError("typical")
+    if found.sources is not None and not all(0.0 <= value < np.inf for value in found.sources):
+        raise ValueError("error sources")
     with np.errstate(all="ignore"):
         geometry, covariance = found.geometry()
         if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
@@ -93,8 +97,8 @@ def _robot(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _record(kind: type[Record], document: Mapping[str, Any]) -> Record:
-    """Return a record of plain data; null is a number that is not known."""
-    given: tuple[Any, ...] = kind(**document)
+    """Return a record from the keys of plain data that it has; null is a number that is not known."""
+    given: tuple[Any, ...] = kind(**{name: value for name, value in document.items() if name in kind._fields})
     values = [float("nan") if value is None else escaped(value) if isinstance(value, str) else value for value in given]
     return msgspec.convert(values, kind)
 

@@ -14,22 +14,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_differences import ErrorDifference, blocks_of, compare_errors, same_route
+from icrtool.calibration.error_differences import (
+    LEVEL,
+    RESAMPLES,
+    ErrorEstimate,
+    blocks_of,
+    compare_errors,
+    same_route,
+)
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, block_predictor, fixed_predictor, gyro_recording_of, predictor
+from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, held_out_predictor, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
-from icrtool.motion.trials import Trials, cut_trials
+from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import CHOICE_HORIZON_M, DEFAULT_SEED
 from icrtool.records.run import Run
 from icrtool.records.tables import Floats
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
-
-RESAMPLES, LEVEL = 300, 0.95
 
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
@@ -53,54 +58,31 @@ class Difference(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Errors at one horizon of the calibration of one group in the runs of another, with 95 % intervals [m]."""
+    """Errors at one horizon of the calibration of one group in the runs of another.
+
+    `cost` are these errors minus those of the tested group's own held-out calibration in the same trials; None on the
+    diagonal.
+    """
 
     calibrated_on: str
     tested_on: str
     horizon_m: float
     trials: int
-    p95_m: float
-    p95_low_m: float
-    p95_high_m: float
-    expected_m: float
-    expected_low_m: float
-    expected_high_m: float
-
-
-class ErrorChange(NamedTuple):
-    """Errors of the second group's held-out calibration minus those of the first's; `paired`: on the same route."""
-
-    horizon_m: float
-    p95_m: float
-    p95_low_m: float
-    p95_high_m: float
-    expected_m: float
-    expected_low_m: float
-    expected_high_m: float
-    paired: bool
-
-
-class TransferCost(NamedTuple):
-    """Errors of the calibration of one group minus those of the tested group's own, held out, in the same trials."""
-
-    calibrated_on: str
-    tested_on: str
-    horizon_m: float
-    p95_m: float
-    p95_low_m: float
-    p95_high_m: float
-    expected_m: float
-    expected_low_m: float
-    expected_high_m: float
+    errors: ErrorEstimate
+    cost: ErrorEstimate | None
 
 
 class Pair(NamedTuple):
-    """Two groups: how their parameters differ, and their errors, each held out."""
+    """Two groups: how their parameters differ, and their held-out errors at each horizon [m], second minus first.
+
+    `paired`: both drove the same route, and trials at the same distance are compared.
+    """
 
     first: str
     second: str
     parameters: tuple[Difference, ...]
-    errors: tuple[ErrorChange, ...]
+    errors: dict[float, ErrorEstimate]
+    paired: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,18 +94,11 @@ class Transfer:
     calibrations : by group
     pairs : the first group with each of the others
     cells : the transfer matrix, by row, column and horizon
-    costs : of each cell beside the diagonal, against the diagonal of its column
     """
 
     calibrations: Mapping[str, Calibration]
     pairs: tuple[Pair, ...]
     cells: tuple[Cell, ...]
-    costs: tuple[TransferCost, ...]
-
-    def cost(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCost:
-        """Return what a calibration of one group costs on another."""
-        where = (calibrated_on, tested_on, horizon_m)
-        return next(one for one in self.costs if one[:3] == where)
 
     def cell(self, calibrated_on: str, tested_on: str, horizon_m: float) -> Cell:
         """Return a cell of the matrix."""
@@ -164,59 +139,65 @@ def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]], *, seed: int = DEFAULT_SEED
 ) -> Transfer:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
-    calibrations = {name: result.calibration for name, result in results.items()}
-    cells: list[Cell] = []
-    errors_of_cell: dict[tuple[str, str], tuple[Floats, Floats]] = {}
-    for row, calibration in calibrations.items():
-        for column, tested in recordings.items():
-            if row == column and len(tested) == 1:
-                predictors = [block_predictor(tested[0], results[row].wheels)]
-            elif row == column:
-                without = results[row].wheels.without
-                predictors = [fixed_predictor(one, fit) for one, fit in zip(tested, without, strict=True)]
-            else:
-                predictors = [predictor(calibration, one) for one in tested]
-            errors: list[Floats] = []
-            path: list[Floats] = []
-            for one, errors_of in zip(tested, predictors, strict=True):
-                trials = cut_trials(one, HORIZONS_M)
-                errors.append(errors_of(trials))
-                path.append(_path(one, trials, path[-1][-1] if path else 0.0))
-            errors_of_cell[row, column] = np.concatenate(errors), np.concatenate(path)
-            cells += _cells(row, column, *errors_of_cell[row, column], seed)
+    tested = {
+        (row, column): _test(result, recordings[column], own=row == column)
+        for row, result in results.items() for column in recordings
+    }  # fmt: skip
+    cells = (cell for row, column in tested for cell in _cells(row, column, tested, seed))
     first, *others = results
     pairs = []
     for other in others:
-        alike = len(recordings[first]) == len(recordings[other]) == 1 and same_route(
-            *(_route(recordings[name][0]) for name in (first, other))
-        )
-        own = errors_of_cell[first, first], errors_of_cell[other, other]
-        changes = tuple(
-            ErrorChange(h, *difference, alike) for h, difference in _differences(*own, paired=alike, seed=seed)
-        )
-        pairs.append(Pair(first, other, _parameter_differences(first, other, calibrations), changes))
-    costs = tuple(
-        TransferCost(row, column, horizon, *difference)
-        for (row, column), foreign in errors_of_cell.items() if row != column
-        for horizon, difference in _differences(errors_of_cell[column, column], foreign, paired=True, seed=seed)
-    )  # fmt: skip
-    return Transfer(calibrations, tuple(pairs), tuple(cells), costs)
+        (one, *_), (two, *_) = groups = recordings[first], recordings[other]
+        paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.drive, two.drive)
+        parameters = _parameter_differences(results[first].calibration, results[other].calibration)
+        errors = _differences(tested[first, first], tested[other, other], paired=paired, seed=seed)
+        pairs.append(Pair(first, other, parameters, dict(zip(HORIZONS_M, errors, strict=True)), paired))
+    return Transfer({name: one.calibration for name, one in results.items()}, tuple(pairs), tuple(cells))
 
 
-def _route(recording: Recording) -> tuple[Floats, Floats, Floats]:
-    drive = recording.drive
-    return drive.distance, drive.north, drive.east
+class _Tested(NamedTuple):
+    """Errors (k, h) [m] of trials, and path lengths (k,) [m] at their starts; recordings one behind the other."""
+
+    errors: Floats
+    path: Floats
 
 
-def _differences(
-    first: tuple[Floats, Floats], second: tuple[Floats, Floats], *, paired: bool, seed: int
-) -> Iterator[tuple[float, ErrorDifference]]:
-    """Yield each horizon with the difference of errors (k, h), each given with the path length at its start (k,)."""
+def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
+    """Test a calibration in recordings; those of its own are predicted by what was not fitted to them."""
+    errors, path, before = [], [], 0.0
+    for i, one in enumerate(recordings):
+        trials = cut_trials(one, HORIZONS_M)
+        errors_of = held_out_predictor(recordings, result.wheels, i) if own else predictor(result.calibration, one)
+        errors.append(errors_of(trials))
+        path.append(before + one.drive.distance[trials.starts])
+        before = path[-1][-1]
+    return _Tested(np.concatenate(errors), np.concatenate(path))
+
+
+def _differences(first: _Tested, second: _Tested, *, paired: bool, seed: int) -> list[ErrorEstimate]:
+    """Return the difference of errors at each horizon, second minus first."""
+    found = []
     for h, horizon in enumerate(HORIZONS_M):
-        blocks = [blocks_of(path, horizon) for _, path in (first, second)]
-        yield horizon, compare_errors(
-            first[0][:, h], blocks[0], second[0][:, h], blocks[1], paired=paired, seed=seed
-        )  # fmt: skip
+        blocks = [blocks_of(one.path, horizon) for one in (first, second)]
+        sides = first.errors[:, h], blocks[0], second.errors[:, h], blocks[1]
+        found.append(compare_errors(*sides, paired=paired, seed=seed))
+    return found
+
+
+def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], seed: int) -> Iterator[Cell]:
+    """Yield the cells of one row and column, a horizon each."""
+    errors, path = tested[row, column]
+    summary = summarise(errors)
+    blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
+    interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
+    own, foreign = tested[column, column], tested[row, column]
+    costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True, seed=seed)
+    of_horizons = np.column_stack([
+        summary.p95, interval.p95_low, interval.p95_high, summary.expected, interval.expected_low,
+        interval.expected_high,
+    ])  # fmt: skip
+    for horizon, trials, values, cost in zip(HORIZONS_M, summary.trials, of_horizons.tolist(), costs, strict=True):
+        yield Cell(row, column, horizon, int(trials), ErrorEstimate(*values), cost)
 
 
 def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
@@ -228,28 +209,8 @@ def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
                 raise ConfigError(one.name, why, "a calibration would be tested on what it was fitted to")
 
 
-def _path(recording: Recording, trials: Trials, before_m: float) -> Floats:
-    """Return the path length at each start, behind that of the recordings before."""
-    path: Floats = before_m + recording.drive.distance[trials.starts]
-    return path
-
-
-def _cells(row: str, column: str, errors: Floats, path: Floats, seed: int) -> list[Cell]:
-    summary = summarise(errors)
-    blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
-    interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
-    return [
-        Cell(
-            row, column, horizon, int(summary.trials[h]),
-            float(summary.p95[h]), float(interval.p95_low[h]), float(interval.p95_high[h]),
-            float(summary.expected[h]), float(interval.expected_low[h]), float(interval.expected_high[h]),
-        )
-        for h, horizon in enumerate(HORIZONS_M)
-    ]  # fmt: skip
-
-
-def _parameter_differences(first: str, second: str, calibrations: Mapping[str, Calibration]) -> tuple[Difference, ...]:
-    (before, covariance_before), (after, covariance_after) = (calibrations[name].geometry() for name in (first, second))
+def _parameter_differences(first: Calibration, second: Calibration) -> tuple[Difference, ...]:
+    (before, covariance_before), (after, covariance_after) = first.geometry(), second.geometry()
     places = [TrackGeometry._fields.index(name) for name in COMPARED]
     return tuple(
         Difference(

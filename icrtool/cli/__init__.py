@@ -13,8 +13,7 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
-    # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save
-    # there, and a process with threads should not be forked.
+    # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.

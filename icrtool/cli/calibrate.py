@@ -9,6 +9,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.terminal import show
 
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
@@ -75,7 +76,7 @@ def command(
         if sensors is None:
             raise
         options.warn([f"no motion model: {err}"], quiet=quiet)
-    texts = [format_result(result)] if result is not None else []
+    texts: list[str] = [format_result(result)] if result is not None else []
     document = result.calibration.summary() if result is not None else {}
     if sensors is not None:
         texts.append(format_calibration(sensors))
@@ -88,7 +89,10 @@ def command(
     if as_json:
         print_json("calibrate", {"calibration": document})
     elif not quiet:
-        click.echo("\n\n".join(texts))
+        show(texts[0])
+        for text in texts[1:]:
+            click.echo()
+            show(text)
 
 
 def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:

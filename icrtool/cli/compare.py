@@ -9,6 +9,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def command(
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
-    from icrtool.output.run_directory import json_bytes
+    from icrtool.output.json_file import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
@@ -65,11 +66,11 @@ def command(
             with atomic_file(file) as partial:
                 partial.write_bytes(content)
     if plot is not None:
-        write_transfer_picture(transfer, plot)
+        write_transfer_picture(document, plot)
     if as_json:
         print_json("compare", document)
     elif not quiet:
-        click.echo(format_transfer(transfer))
+        show(format_transfer(transfer))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS, logs_of, plot_formats, run_directories
+from icrtool.cli.fit import RUNS, FitRequest, fit_log, logs_of, plot_formats, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.options import POSITIVE
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.output.baseline_file import Baseline
     from icrtool.output.exports.acceptance import Outcome
-    from icrtool.output.figures.drawing_process import DrawingProcess
     from icrtool.records.dropout import Gate
     from icrtool.records.run import Run
 
@@ -138,8 +138,7 @@ def command(
         prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
-    with picture_process(formats, fits=bool(places)) as drawer:
-        outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request, drawer)]
+    outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request)]
     if as_json:
         print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
     leave(outcomes, junit=junit, markdown=markdown)
@@ -153,14 +152,6 @@ def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
     if isinstance(outcome, IcrToolError):
         return {"source": escaped(source), "status": "failed", "reason": str(outcome)}
     return {"source": escaped(source), "status": "done", "report": report_document(outcome)}
-
-
-def picture_process(formats: tuple[str, ...], *, fits: bool) -> DrawingProcess:
-    """Return a process for the pictures; unless logs are to be fitted it starts before the analysis is loaded."""
-    from icrtool.output.figures.drawing_process import DrawingProcess
-    from icrtool.output.figures.dropout_figures import load_figures
-
-    return options.drawing_process(formats) if fits else DrawingProcess(formats, load_figures)
 
 
 def parse_horizons(text: str) -> tuple[float, ...]:
@@ -207,9 +198,7 @@ def plan_sources(
     return sources, dict(zip(logs, run_directories(logs, output, into), strict=True)) if logs else {}
 
 
-def report_all(
-    sources: tuple[Path, ...], places: dict[Path, Path], request: Request, drawer: DrawingProcess
-) -> Iterator[tuple[Path, Outcome]]:
+def report_all(sources: tuple[Path, ...], places: dict[Path, Path], request: Request) -> Iterator[tuple[Path, Outcome]]:
     """Report on each source in turn; one that cannot be used does not stop the others."""
     from icrtool.errors import IcrToolError
 
@@ -217,7 +206,7 @@ def report_all(
         if number and request.prints:
             click.echo()
         try:
-            yield source, _report_one(source, places.get(source), request, drawer)
+            yield source, _report_one(source, places.get(source), request)
         except IcrToolError as err:
             options.report_error(err, source)
             yield source, err
@@ -251,13 +240,19 @@ def check_configuration(config: Config, *, runs_only: bool, output: Path | None)
         raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
 
 
-def _report_one(source: Path, place: Path | None, request: Request, drawer: DrawingProcess) -> DropoutReport:
+def _report_one(source: Path, place: Path | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
     from icrtool.output.run_directory import PAGE_FILE
 
-    run = _read(source) if place is None else _fit(source, place, request, drawer)
+    if place is None:
+        run = _read(source)
+    else:
+        run = fit_log(source, place, FitRequest(
+            request.config, formats=request.formats, smooths=request.smoothed, overwrite=request.overwrite,
+            quiet=request.quiet, verbose=request.verbose,
+        ))  # fmt: skip
     directory = source if place is None else place
-    report = _analyse(run, directory, request, drawer)
+    report = _analyse(run, directory, request)
     if request.page:
         from icrtool.output.page.run_page import write_page
 
@@ -265,7 +260,7 @@ def _report_one(source: Path, place: Path | None, request: Request, drawer: Draw
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
-        click.echo(format_dropout(report))
+        show(format_dropout(report))
         page = f"; page: {directory / PAGE_FILE}" if request.page else ""
         click.echo(f"\nwritten to {directory / 'dropout'}{page}")
     else:
@@ -296,35 +291,8 @@ def _read(directory: Path) -> Run:
         return reading.result()
 
 
-def _fit(log: Path, directory: Path, request: Request, drawer: DrawingProcess) -> Run:
-    """Fit a log and write its run directory, as `icrtool fit` does."""
-    from icrtool.output.run_directory import check_target, replaced_log, write_run
-
-    check_target(directory, log, overwrite=request.overwrite)
-    notes: list[str] = []
-    with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        from icrtool.logs.read_log import read_log
-
-        stages.begin("reading")
-        logs = [read_log(log, request.config, stages.share)]
-        from icrtool.calibration.fit import fit
-
-        run = fit(logs.pop(), request.config, smooth=request.smoothed, watch=stages.begin)
-        if (before := replaced_log(directory, run)) is not None:
-            notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
-        stages.begin("writing, pictures" if request.formats else "writing")
-        write_run(run, directory, drawer=drawer, note=notes.append)
-    options.warn((*run.warnings, *notes), quiet=request.quiet)
-    if request.verbose:
-        from icrtool.records.samples import ROLE_WORDS
-
-        for stream in run.summary["streams"]:
-            click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
-    return run
-
-
-def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess) -> DropoutReport:
-    """Compute the report of a run, have its figures drawn meanwhile, and write it all."""
+def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
+    """Compute the report of a run and write it."""
     from icrtool.dropout_analysis.dropout_report import dropout_report, forced_lengths_s
     from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, report_writer
 
@@ -338,7 +306,7 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
     baseline = request.baseline.find(run.name, inputs) if request.baseline is not None else None
     with (
         Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages,
-        report_writer(directory / DROPOUT_DIRECTORY, drawer, stamps) as writer,
+        report_writer(directory / DROPOUT_DIRECTORY, request.formats, stamps) as writer,
     ):
         stages.begin("dropout analysis")
         report = dropout_report(
@@ -357,7 +325,6 @@ def _analyse(run: Run, directory: Path, request: Request, drawer: DrawingProcess
             reference="smoothed" if request.smoothed else "filter",
             seed=request.seed,
             sink=writer.sink,
-            watch=writer.watch,
         )
         stages.begin("dropout report, pictures" if request.formats else "dropout report")
         writer.finish(report)

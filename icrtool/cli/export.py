@@ -119,7 +119,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
     from icrtool.output.atomic_file import atomic_file, check_place
     from icrtool.output.exports.foxglove import write_foxglove
     from icrtool.output.exports.foxglove_layout import foxglove_layout
-    from icrtool.output.run_directory import json_bytes
+    from icrtool.output.json_file import json_bytes
 
     layout = output.with_name(f"{output.stem}.layout.json")
     check_place(layout)

@@ -11,11 +11,11 @@ import click
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.output.figures.drawing_process import DrawingProcess
     from icrtool.records.run import Run, WarmStart
 
 RUNS = Path("icrtool-runs")
@@ -25,15 +25,14 @@ class FitRequest(NamedTuple):
     """What the options ask for, the same for every log."""
 
     config: Config
-    states: Literal["csv", "parquet"] | None
-    formats: tuple[str, ...]
-    warm_start: Path | None
-    changes_s: tuple[float, ...]
-    smooths: bool
-    overwrite: bool
-    quiet: bool
-    prints_nothing: bool
-    verbose: bool
+    states: Literal["csv", "parquet"] | None = None
+    formats: tuple[str, ...] = ()
+    warm_start: Path | None = None
+    changes_s: tuple[float, ...] = ()
+    smooths: bool = False
+    overwrite: bool = False
+    quiet: bool = False
+    verbose: bool = False
     start: str | None = None
     end: str | None = None
 
@@ -88,23 +87,27 @@ def command(
     config = options.load(config_file, robot, sets)
     request = FitRequest(
         config, states, plot_formats(plots), warm_start,
-        check_times(changes), smooths, overwrite, quiet, quiet or as_json, verbose, start, end,
+        check_times(changes), smooths, overwrite, quiet, verbose, start, end,
     )  # fmt: skip
     logs = logs_of(logs, quiet=quiet)
     directories = run_directories(logs, output, into)
     documents: list[dict[str, Any]] = []
     failed: list[Path] = []
-    with options.drawing_process(request.formats) as drawer:
-        for log, directory in zip(logs, directories, strict=True):
-            try:
-                run = _fit_one(log, directory, request, drawer)
-            except IcrToolError as err:
-                failed.append(log)
-                options.report_error(err, log)
-                documents.append({"log": escaped(str(log)), "status": "failed", "reason": str(err)})
-            else:
-                place = escaped(str(directory))
-                documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
+    for log, directory in zip(logs, directories, strict=True):
+        try:
+            run = fit_log(log, directory, request)
+        except IcrToolError as err:
+            failed.append(log)
+            options.report_error(err, log)
+            documents.append({"log": escaped(str(log)), "status": "failed", "reason": str(err)})
+            continue
+        place = escaped(str(directory))
+        documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
+        if not (quiet or as_json):
+            from icrtool.output.tables.run import format_run
+
+            show(format_run(run))
+            click.echo(f"\nwritten to {place}{_beside(request)}")
     if as_json:
         print_json("fit", {"logs": documents})
     options.leave(failed, len(logs), "logs")
@@ -186,7 +189,8 @@ def _warm_start(source: Path) -> WarmStart:
     return open_run(source).ended_with
 
 
-def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingProcess) -> Run:
+def fit_log(log: Path, directory: Path, request: FitRequest) -> Run:
+    """Fit a log, write its run directory, and print warnings and chosen streams on stderr."""
     from icrtool.output.run_directory import check_target, replaced_log, write_run
 
     check_target(directory, log, overwrite=request.overwrite)
@@ -196,7 +200,6 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         from icrtool.logs.read_log import read_log
 
         stages.begin("reading")
-        options.load_ahead("pymap3d", "icrtool.calibration.fit")
         logs = [read_log(log, request.config, stages.share, start=request.start, end=request.end)]
         from icrtool.calibration.fit import fit
 
@@ -211,13 +214,8 @@ def _fit_one(log: Path, directory: Path, request: FitRequest, drawer: DrawingPro
         if (before := replaced_log(directory, run)) is not None:
             notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
         stages.begin("writing, pictures" if request.formats else "writing")
-        write_run(run, directory, states=request.states, drawer=drawer, note=notes.append)
+        write_run(run, directory, states=request.states, plots=request.formats, note=notes.append)
     options.warn((*run.warnings, *_other_robot(request, start), *notes), quiet=request.quiet)
-    if not request.prints_nothing:
-        from icrtool.output.tables.run import format_run
-
-        click.echo(format_run(run))
-        click.echo(f"\nwritten to {escaped(str(directory))}{_beside(request)}")
     from icrtool.records.samples import ROLE_WORDS
 
     for stream in run.summary["streams"]:

@@ -9,6 +9,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.terminal import show
 
 if TYPE_CHECKING:
     from icrtool.calibration.forecast import Forecast
@@ -60,7 +61,7 @@ def command(
     if as_json:
         print_json("forecast", forecast_document(forecast, calibration, budgets))
     elif not quiet:
-        click.echo(format_forecast(forecast, calibration, budgets))
+        show(format_forecast(forecast, calibration, budgets))
 
 
 def _forecast(calibration: Calibration, path: Path) -> Forecast:

@@ -13,6 +13,7 @@ from icrtool.cli import options
 from icrtool.cli.fit import logs_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
+from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def command(
             failed.append(log)
             options.report_error(found.problem, log)
         if as_json:
-            documents.append(_document(found))
+            documents.append(_document(found, _options(config_file, robot, sets, start, end)))
     if as_json:
         print_json("info", {"logs": documents})
     options.leave(failed, len(logs), "logs")
@@ -113,16 +114,18 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
 def _print(found: Found, config: Config, given: Sequence[str], *, everything: bool) -> None:
     """Print what a log holds, whether it can be fitted, and the command to run next."""
     from icrtool.logs.describe import describe_log, describe_survey
-    from icrtool.output.tables.overview import next_line, overview_lines, verdict_lines
+    from icrtool.output.tables.overview import next_command, overview_rows, verdict_rows
+    from icrtool.output.text_blocks import Line, Text, labelled
 
     if found.survey is not None:
         click.echo(describe_survey(found.survey, found.measured, everything=everything))
     elif found.measured is not None:
         click.echo(describe_log(found.measured))
-    lines = overview_lines(found.measured, found.run) if found.measured is not None else []
-    lines += verdict_lines(found.run, found.problem, config)
-    command = next_line(escaped(str(found.log)), given, found.run)
-    click.echo("\n".join(["", *lines, *([command] if command is not None else [])]))
+    rows = overview_rows(found.measured, found.run) if found.measured is not None else []
+    rows += verdict_rows(found.run, found.problem, config)
+    command = next_command(escaped(str(found.log)), given, found.run)
+    last = [Line(f"{'next':<12}{command}", "as is")] if command is not None else []
+    show(Text(["", *labelled(rows), *last]))
 
 
 def _options(
@@ -134,9 +137,10 @@ def _options(
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]
 
 
-def _document(found: Found) -> dict[str, Any]:
+def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
     """Return what a log holds as plain data; ``run`` as in run.json, null where the log cannot be fitted."""
     from icrtool.logs.survey_document import streams_document, survey_document
+    from icrtool.output.tables.overview import next_command, verdict
 
     return {
         "log": escaped(str(found.log)),
@@ -145,5 +149,7 @@ def _document(found: Found) -> dict[str, Any]:
         **(survey_document(found.survey) if found.survey is not None else {}),
         "streams": streams_document(found.measured) if found.measured is not None else [],
         "warnings": list(found.warnings),
+        "verdict": verdict(found.run, found.problem),
+        "next": next_command(escaped(str(found.log)), given, found.run),
         "run": found.run.summary if found.run is not None else None,
     }

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,7 +18,6 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
     from icrtool.output.baseline_file import Baseline
-    from icrtool.output.figures.drawing_process import DrawingProcess
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -172,34 +169,9 @@ def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = F
         raise SystemExit(3 if gate_failed else 1)
 
 
-def drawing_process(formats: tuple[str, ...]) -> DrawingProcess:
-    """Return a process for the figures of logs to be fitted; where it is forked, it has what is loaded here first."""
-    from icrtool.output.figures.drawing_process import DrawingProcess
-
-    if not formats:
-        return DrawingProcess(())
-    importlib.import_module("icrtool.calibration.fit")
-    importlib.import_module("icrtool.logs.read_log")
-    from icrtool.output.run_directory import load_figures
-
-    return DrawingProcess(formats, load_figures)
-
-
 @contextmanager
 def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
     """Give a function that shows the share done of work of one stage; None where there is no terminal."""
     with Stages(label, quiet=quiet) as stages:
         stages.begin("")
         yield stages.share if stages.on_terminal else None
-
-
-def load_ahead(*modules: str) -> None:
-    """Import modules in a thread, for what follows reading; that leaves the interpreter free at times."""
-
-    def load() -> None:
-        for module in modules:
-            # An import that fails here fails again where the module is used, and is reported there.
-            with suppress(ImportError):
-                importlib.import_module(module)
-
-    threading.Thread(target=load).start()

@@ -55,14 +55,15 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     import json
 
     from icrtool.errors import RunError
-    from icrtool.output.page.comparison_page import comparison_in, comparison_page, schema_of
+    from icrtool.output.json_file import schema_of
+    from icrtool.output.page.comparison_page import comparison_in, comparison_page
     from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
     from icrtool.output.page.render import write_html
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
         page = _page_of_run(source, coordinates=coordinates)
-    elif (schema_of(source / FLEET_FILE) or "").startswith(FLEET_FAMILY):
+    elif schema_of(source / FLEET_FILE).startswith(FLEET_FAMILY):
         with _as_written(source / FLEET_FILE, "run icrtool batch again"):
             page = fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source)
     elif (file := comparison_in(source)) is not None:

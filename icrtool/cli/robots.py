@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
-
 import click
 
 from icrtool.cli.json_output import json_option, print_json
-
-SOURCE_WIDTH = 96
+from icrtool.cli.terminal import show
+from icrtool.output.text_blocks import Line, Table, Text
 
 
 @click.command("robots")
@@ -27,11 +25,13 @@ def command(as_json: bool) -> None:
         listed = [{"name": name} | {key: robot.get(key) for key in keys} for name, robot in robots.items()]
         print_json("robots", {"robots": listed})
         return
-    width = max(len(name) for name in robots)
-    click.echo(f"{'robot':<{width}}  track width  wheel radius  counts per turn")
-    for name, robot in robots.items():
-        counts = f"{robot['encoder_counts_per_rev']:,}" if "encoder_counts_per_rev" in robot else "-"
-        numbers = f"{robot['track_width_m']:9.3f} m  {robot['wheel_radius_m']:10.4f} m  {counts:>15}"
-        click.echo(f"{name:<{width}}  {numbers}")
-        source = textwrap.wrap(robot["source"], SOURCE_WIDTH, initial_indent="  ", subsequent_indent="  ")
-        click.echo("\n".join(source))
+    rows = [
+        (
+            name, f"{robot['track_width_m']:.3f} m", f"{robot['wheel_radius_m']:.4f} m",
+            f"{robot['encoder_counts_per_rev']:,}" if "encoder_counts_per_rev" in robot else "-",
+        )
+        for name, robot in robots.items()
+    ]  # fmt: skip
+    head = ("robot", "track width", "wheel radius", "counts per turn")
+    sources = Table("l", [(f"  {name}", robot["source"]) for name, robot in robots.items()])
+    show(Text([Table("lr", rows, head), "", Line("Sources", "title"), sources]))

@@ -14,6 +14,7 @@ from icrtool.cli.drive_options import CHANGE, PATHS, check_changes, gnss_text, i
 from icrtool.cli.fit import RUNS, plot_formats
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 from icrtool.cli.simulate import default_icrs, encoder_counts
+from icrtool.cli.terminal import show
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -132,7 +133,7 @@ def command(
         result = run_study(request, progress)
     write_study(result, directory, plots=formats)
     if not quiet:
-        click.echo(format_study(result))
+        show(format_study(result))
         click.echo(f"\nwritten to {directory}")
     if verbose:
         click.echo(f"settings: {request.settings()}", err=True)

@@ -20,7 +20,7 @@ from icrtool.dropout_analysis.slip_events import leave_out_events, with_event_co
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
-from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, ReportWatch, configured_horizons_m, dropout
+from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, configured_horizons_m, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
@@ -44,7 +44,6 @@ def dropout_report(
     strict: bool = False,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-    watch: ReportWatch | None = None,
 ) -> DropoutReport:
     """Return how far a robot can go without GNSS, with all that ``icrtool dropout-report`` gives.
 
@@ -66,7 +65,6 @@ def dropout_report(
     strict : such limits are missed by the number alone, not only beyond the confidence interval of the difference
     seed : of the bootstrap
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
-    watch : called with the report as it grows: with outages and single trials before the first model, after each model
 
     Raises
     ------
@@ -82,32 +80,22 @@ def dropout_report(
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
-    # Single trials come first: whoever watches can draw them while the many are driven.
-    examples, worst = example_trials(compared), worst_trials(compared, starts=starts)
-    outages = (*forced, *real_outages(compared))
     used, further = _calibration_rows(compared, calibrations)
     found, why = _compare(compared, run) if comparison else (None, "")
     if found is not None:
         further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 
-    def with_single(report: DropoutReport) -> DropoutReport:
-        smoothed = reference == "smoothed"
-        expected = tuple(model.name for model in further)
-        return replace(
-            report, smoothed=smoothed, examples=examples, worst=worst, outages=outages, expected=expected
-        )  # fmt: skip
-
-    def grown(report: DropoutReport) -> None:
-        if watch is not None:
-            watch(with_single(report))
-
     horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
-    report = with_single(dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink, watch=grown))
+    report = dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink)
     if without_events:
         report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
     report = replace(report, comparison=found.table if found is not None else None, calibrations=used)
     return replace(
         report,
+        smoothed=reference == "smoothed",
+        examples=example_trials(compared),
+        worst=worst_trials(compared, starts=starts),
+        outages=(*forced, *real_outages(compared)),
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),
         baseline=baseline,
@@ -153,11 +141,13 @@ def _calibration_rows(
         if recording is not None:
             models.append(ConstantModel(name, label, predictor(one, recording)))
             seen = one.fitted_to(recording.sha256)
-            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created))
+            kept = one.summary() | {"models": {}, "held_out": []}
+            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created, False, kept))
             if one.gyro is not None and recording.gyro_radps is not None:
                 name, label = f"{name}_gyro", f"{label} + gyro"
                 models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=True)))
-                used.append(UsedCalibration(name, label, one.gyro.model.name, len(one.logs), seen, one.created))
+                model = one.gyro.model.name
+                used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, True, kept))
     return tuple(used), models
 
 

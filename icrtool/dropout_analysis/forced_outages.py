@@ -74,7 +74,7 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
     DataError
         The run cannot be made again.
     """
-    setup = set_up_again(run, run.config, tuple(spans_ns))
+    setup = set_up_again(run, tuple(spans_ns))
     output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
     rows = min(len(output.x), len(run.table))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.kernels.filter_records import RECOVERED, USED
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.trials import OpenLoopPath
 from icrtool.records.dropout import Outage
@@ -53,9 +52,9 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
 
 def _end_error_m(run: Run, path: OpenLoopPath, stamp_ns: Ints, end_ns: int) -> float:
     """Return how far the antenna on a path, with its stamps (m,), is from the used fixes since the outage's end."""
-    fixes, code = run.sensors.fixes, run.gnss.code
-    used = (code == USED) | (code == RECOVERED)
-    rows = np.flatnonzero(used & (fixes.stamp_ns >= end_ns) & (fixes.stamp_ns <= max(end_ns, int(stamp_ns[-1]))))
+    fixes = run.sensors.fixes
+    after = (fixes.stamp_ns >= end_ns) & (fixes.stamp_ns <= max(end_ns, int(stamp_ns[-1])))
+    rows = np.flatnonzero(run.gnss.used & after)
     forward, right = run.sensors.antenna_m
     cos, sin = np.cos(path.heading), np.sin(path.heading)
     at, of = (fixes.stamp_ns[rows] - stamp_ns[0]) / 1e9, (stamp_ns - stamp_ns[0]) / 1e9

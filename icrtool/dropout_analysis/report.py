@@ -55,7 +55,7 @@ class DropoutReport:
     run_summary : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
     starts : ``moving``: each standstill is one start; ``all``: every state is one
-    reference_error : what a perfect model would show, None until the trials are driven
+    reference_error : what a perfect model would show
     by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
     smoothed : the reference is the smoother's trajectory, not the filter's
@@ -69,7 +69,6 @@ class DropoutReport:
     calibrations : those with a row of their own
     baseline : an earlier report that this one is compared with
     event_cost : what slip events cost, where trials that cross one were left out; None where they count
-    expected : names of the rows beside those of the filter's models, whether they are there already or not
     """
 
     name: str
@@ -96,7 +95,6 @@ class DropoutReport:
     comparison: ModelComparison | None = None
     no_comparison: str = ""
     calibrations: tuple[UsedCalibration, ...] = ()
-    expected: tuple[str, ...] = ()
     baseline: BaselineReport | None = None
     event_cost: EventCost | None = None
 

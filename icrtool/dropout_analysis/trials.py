@@ -76,9 +76,6 @@ class ConstantModel(NamedTuple):
 ErrorSink = Callable[[str, Floats, Floats], None]
 """Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
 
-ReportWatch = Callable[[DropoutReport], None]
-"""Called with a report that holds all horizons of some of the models, those that are done."""
-
 
 def dropout(
     run: Run,
@@ -89,7 +86,6 @@ def dropout(
     further: Sequence[ConstantModel] = (),
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-    watch: ReportWatch | None = None,
 ) -> DropoutReport:
     """Return how far off the robot is after driving without GNSS.
 
@@ -102,7 +98,6 @@ def dropout(
     further : models of constant parameters, beside those
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
-    watch : called with the report as it grows: before the first model, without any result, and after each
 
     Raises
     ------
@@ -136,29 +131,6 @@ def dropout(
     parts: dict[str, list[ModelResult]] = {model.name: [] for model in predictors}
     if len(parts) < len(predictors):
         raise ValueError("two models have the same name")
-
-    none = TrialCounts(*np.zeros((5, len(horizons)), np.int64))
-
-    def done() -> DropoutReport:
-        return DropoutReport(
-            name=run.name,
-            horizons_m=horizons,
-            results=tuple(_joined(part) for part in parts.values() if len(part) == len(groups)),
-            counts=TrialCounts(*_columns(counts)) if counts else none,
-            states=len(run.table),
-            standing=int(np.count_nonzero(standing)),
-            starts=starts,
-            reference_error=ReferenceErrors(*_columns(reference)) if len(reference) == len(groups) else None,
-            by_learning=_learned_split(run, learned, before, after) if len(before) == len(groups) else None,
-            seed=seed,
-            run_summary=run.summary,
-            run_directory=run.directory,
-            reference_north_m=run.table.north_m,
-            reference_east_m=run.table.east_m,
-        )
-
-    if watch is not None:
-        watch(done())
     with ThreadPoolExecutor(THREADS) as pool:
         for group in groups:
             ends, count = _ends(drive, horizons[group], left_out, pool)
@@ -176,9 +148,22 @@ def dropout(
                 if model.name == "icr":
                     before.append(summarise(errors[:learned]))
                     after.append(summarise(errors[learned:] if learned is not None else errors[:0]))
-                if watch is not None and group is groups[-1]:
-                    watch(done())
-    return done()
+    return DropoutReport(
+        name=run.name,
+        horizons_m=horizons,
+        results=tuple(_joined(part) for part in parts.values()),
+        counts=TrialCounts(*_columns(counts)),
+        states=len(run.table),
+        standing=int(np.count_nonzero(standing)),
+        starts=starts,
+        reference_error=ReferenceErrors(*_columns(reference)),
+        by_learning=_learned_split(run, learned, before, after) if before else None,
+        seed=seed,
+        run_summary=run.summary,
+        run_directory=run.directory,
+        reference_north_m=run.table.north_m,
+        reference_east_m=run.table.east_m,
+    )
 
 
 def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:

@@ -26,7 +26,7 @@ class ProcessNoise(NamedTuple):
 
 
 PAPER_NOISE = ProcessNoise(0.2, 5.0)
-"""Pentzer 2014, Eq. 30; its text says 0.1 m/s, its matrix prints 0.2 squared: the matrix is used."""
+"""Pentzer 2014, Eq. 30; 0.1 m/s in its text, 0.2 squared in its matrix: the matrix is used."""
 
 FIELD_NOISE = ProcessNoise(0.3, 7.0)
 """Preset ``field``: with the paper's 0.2 and 5 the 2-sigma bands hold only 83 % (position) and 86 % (heading) of the
@@ -41,7 +41,7 @@ FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
 
 GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
-"""How the pose may move through a gap in the wheel data, as a random walk over one second."""
+"""Standard deviation of how far the pose may move in the first second of a gap in the wheel data."""
 
 GAP_IN_INTERVALS = 2.5
 """Slow wheel streams: an interval is a gap only when it is this many times the usual one."""
@@ -54,7 +54,7 @@ EVENT_MARGIN_S = 0.2
 
 RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
-"""Rejected measurements that agree with each other for this long are believed."""
+"""The filter accepts rejected measurements again when so many agree with each other for this long."""
 
 MIDDLE_OF_THE_TURN = 0.5
 """Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and
@@ -283,7 +283,7 @@ def configured_noise(config: Config) -> ProcessNoise:
 
 
 def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
-    """Return 2 tau / interval, at least 1: the number of samples that together tell what one independent one would.
+    """Return 2 tau / interval, at least 1: the number of samples with as much information as one independent sample.
 
     Notes
     -----

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from icrtool.alignment.align import align
 from icrtool.alignment.reference_choice import choose_reference
@@ -23,28 +24,9 @@ def fit(
     smooth: bool = False,
     watch: Callable[[str], None] | None = None,
 ) -> Run:
-    """Learn a robot's track ICRs from a log.
+    """Align the sensors of a log, run the filter, summarise: `icrtool.fit` without its recommendation.
 
-    Parameters
-    ----------
-    log : as `icrtool.read_log` returns it
-    config : default: all defaults
-    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
-    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
-    smooth : also make the states of the RTS smoother
-    watch : called with the name of each stage when it begins
-
-    Returns
-    -------
-    Run
-        No file is touched.
-
-    Raises
-    ------
-    DataError
-        Streams that cannot be used together, or hold values that are not finite numbers.
-    ConfigError
-        A start that preset ``field`` does not take.
+    Parameters, return value and errors are those of `icrtool.calibration.fit.fit`.
 
     Notes
     -----
@@ -61,9 +43,8 @@ def fit(
     del log
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
-    smoothed = smoother.smooth(filtered, config) if smooth else None
     begin("summary")
-    return Run(
+    run = Run(
         name=name,
         config=config,
         table=filtered.table,
@@ -72,9 +53,10 @@ def fit(
         sensors=filtered.sensors,
         gnss=filtered.gnss,
         heading=filtered.heading,
-        smoothed=smoothed,
+        smoothed=None,
         summary=summarise(measurements, filtered, config, inputs=inputs, datum=datum, rejected_fixes=rejected),
     )
+    return replace(run, smoothed=smoother.smooth(run)) if smooth else run
 
 
 def _ignore(stage: str) -> None:

@@ -11,7 +11,8 @@ from icrtool.kernels.ekf import REFERENCE_STEP_S
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import displace, integrate
+from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
+from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.tables import Floats, Ints, States
 
 WINDOW_M = 2.0
@@ -19,6 +20,9 @@ WINDOW_M = 2.0
 
 STRETCH_M = 20.0
 """Windows of one stretch err alike: slip, ground and heading errors last for some metres."""
+
+WIDTH_M = 1.0
+"""Track width of the terms here: any will do, the ICRs do not depend on it."""
 
 HEADING_BIAS_RAD = math.radians(1.0)
 SCALE_ERROR = 0.02
@@ -47,25 +51,39 @@ class DriveWindows(NamedTuple):
     distance_m: float
 
 
-def cut_drive(table: States, drive: Drive, parameters: Floats) -> DriveWindows:
-    """Return the windows of a drive, with the motion by parameters (7,) of `icrtool.kernels.window_errors`."""
+def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
+    """Return the windows of a drive, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
     dt = np.where(drive.gap, 0.0, drive.dt_s)
     distance = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
     rows = rows_at_steps(distance, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
-    motion = integrate(table.t_s, dt, drive.v_left, drive.v_right, parameters, table.t_s[rows])
-    d, d_by, _ = displace(motion, start, end)
-    turn_by = motion.theta_by[end] - motion.theta_by[start]
-    turned = motion.theta[end] - motion.theta[start]
+    parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
+    fixed, axes, columns = model_columns(MODELS["full_linear"], wheel_motion(drive.v_left, drive.v_right, WIDTH_M))
+    knots, terms = len(rows), len(parameters)
+    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
+    none = np.zeros(len(dt))
+    sums_at_knots(fixed, columns, axes, parameters, dt, none, rows, np.zeros(knots), rate, sums, by)
     place, heading = (table.north_m + 1j * table.east_m)[rows], table.heading_rad[rows]
-    missed = d - (place[end] - place[start]) * np.exp(-1j * heading[start])
-    both, difference = d_by[:, 3] + d_by[:, 4], (d_by[:, 3] - d_by[:, 4]) / 2
-    d_slopes = np.column_stack([d_by[:, :3], 1j * d, both, difference])
-    turn_both, turn_difference = turn_by[:, 3] + turn_by[:, 4], (turn_by[:, 3] - turn_by[:, 4]) / 2
-    turn_slopes = np.column_stack([turn_by[:, :3], np.zeros(len(turned)), turn_both, turn_difference])
+    moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
+    missed, jacobian = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
+    window_residuals(
+        rate,
+        sums,
+        by,
+        start,
+        end,
+        np.column_stack([moved.real, moved.imag]),
+        0.0,
+        np.ones(len(start)),
+        missed,
+        jacobian,
+    )
+    turned = np.diff(sums[:, 0])
+    by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
+    by_terms = np.concatenate([jacobian[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
     return DriveWindows(
-        residuals=np.concatenate([missed.real, missed.imag, turned - (heading[end] - heading[start])]),
-        jacobian=np.concatenate([d_slopes.real, d_slopes.imag, turn_slopes]),
+        residuals=np.concatenate([missed, turned - np.diff(heading)]),
+        jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
         length_m=np.diff(distance[rows]),
         turned_rad=turned,
         end_s=table.t_s[rows[1:]],
@@ -97,7 +115,7 @@ def final_covariance(
     heading offset and a wrong wheel scale are not in it. They are in the sandwich covariance (Liang and Zeger 1986) of
     a fit over the windows, clustered by stretches of `STRETCH_M`, heading offset and wheel scales marginalised. Its
     residuals are those of the final ICRs, so that a fit that would end elsewhere counts too. A window weighs
-    exp(-age / T): T = P / q is what a Kalman filter with variance P and random walk q remembers.
+    exp(-age / T): T = P / q is the memory of a Kalman filter with variance P and process noise q.
 
     Coverage of 2 standard deviations of the difference, per ICR. Four recorded Warthog drives on grass, wheel scale
     corrected: 18 of 18 pairs of logs (61 % with the filter's own), 88 % of 72 pairs of halves of different logs (58 %).

@@ -10,7 +10,8 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.ekf import run_filter
-from icrtool.kernels.filter_records import UNSEEN, FilterOutput
+from icrtool.kernels.filter_records import FilterOutput
+from icrtool.kernels.measurement_codes import UNSEEN
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import Floats

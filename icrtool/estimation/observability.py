@@ -8,19 +8,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.estimation.icr_uncertainty import DriveWindows, cut_drive, prior_std
+from icrtool.estimation.icr_uncertainty import DriveWindows, prior_std
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
-from icrtool.kernels.window_errors import NEUTRAL
-from icrtool.records.run import ICR_COLUMNS, half_width_m
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
 from icrtool.records.tables import Floats, States
 
 Excited = Literal["shown", "weak", "not shown"]
 
-WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
 
 SLIP_SHARE = 0.03
-"""Part of way and of turn that slips differently from one window to the next."""
+"""Part of distance and of turn that slips differently from one window to the next."""
 
 SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
 """Standard deviations in parts of y right - y left up to which an ICR is shown, and weakly."""
@@ -32,7 +31,8 @@ UNLEARNED = 0.7
 """An ICR whose standard deviation is still more than this share of the start's was not learned."""
 
 TURNS_NEEDED_RAD = math.pi
-ONE_WAY = 0.15
+ONE_DIRECTION = 0.15
+"""Turns are in one direction where those to the other side are less than this share of them."""
 SPIN_RATIO = 3.0
 """A turn counts as a spin where the sides differ by this many times their mean."""
 
@@ -45,7 +45,7 @@ class Excitation:
     ----------
     std_m : by ICR, the standard deviation that the drive's information allows (Cramer-Rao, constants, `SLIP_SHARE`)
     verdicts : by ICR
-    turned_right_rad, turned_left_rad : heading changes summed either way; spun_*: of these, on the spot
+    turned_right_rad, turned_left_rad : heading changes summed to either side; spun_*: of these, on the spot
     sentences : the verdict in words, and what to drive next; empty where all is shown
     """
 
@@ -56,11 +56,6 @@ class Excitation:
     spun_right_rad: float
     spun_left_rad: float
     sentences: tuple[str, ...]
-
-    @property
-    def sufficient(self) -> bool:
-        """Whether all three ICRs are shown."""
-        return all(verdict == "shown" for verdict in self.verdicts.values())
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for run.json."""
@@ -75,9 +70,7 @@ class Excitation:
         }
 
 
-def find_excitation(
-    table: States, drive: Drive, track_width_m: float | None, windows: DriveWindows | None = None
-) -> Excitation:
+def find_excitation(table: States, drive: Drive, track_width_m: float | None, windows: DriveWindows) -> Excitation:
     """Return which ICRs a drive could show.
 
     Parameters
@@ -85,7 +78,7 @@ def find_excitation(
     table : the recorded states
     drive : the same for the kernels
     track_width_m : b, None where not known
-    windows : of the drive, with `nominal_parameters`, where they are there already
+    windows : of the drive, with `nominal_icrs`
 
     Returns
     -------
@@ -93,13 +86,12 @@ def find_excitation(
 
     Notes
     -----
-    The Fisher information of constant ICRs in displacements and heading changes over windows of way, with the filter's
-    own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are marginalised. It
-    says what a drive could tell at best, not what the filter made of it.
+    The Fisher information of constant ICRs in displacements and heading changes over windows of distance, with the
+    filter's own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are
+    marginalised. It is what a drive could show at best, not what the filter learned.
     """
-    p = nominal_parameters(table, track_width_m)
+    p = nominal_icrs(table, track_width_m)
     width = float(p[0] - p[1])
-    windows = cut_drive(table, drive, p) if windows is None else windows
     std = _posterior(
         windows,
         position_std=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
@@ -155,18 +147,18 @@ def withhold_unlearned(
         else:
             continue
         if verdicts[name] != "not shown":
-            sentences.append(f"{WORDS[name]} is not shown: {why}")
+            sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
         verdicts[name] = "not shown"
     return replace(found, verdicts=verdicts, sentences=tuple(sentences))
 
 
-def nominal_parameters(table: States, track_width_m: float | None) -> Floats:
-    """Return parameters (7,) near which to ask: the run's final ICRs where they can be, else those of the width."""
+def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
+    """Return ICRs (3,) [m] near which to ask: the run's final ones where they can be, else those of the width."""
     right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     half = half_width_m(track_width_m)
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
-    return np.array([right, left, x, *NEUTRAL[3:]])
+    return np.array([right, left, x])
 
 
 def _posterior(windows: DriveWindows, *, position_std: float, heading_std: float, width: float) -> Floats:
@@ -186,18 +178,25 @@ def _verdict(share: float) -> Excited:
 
 
 def _sentences(
-    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, way_m: float
+    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, distance_m: float
 ) -> tuple[str, ...]:
-    """Say what is not shown, why, and what to drive."""
+    """Return sentences: what is not shown, why, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
-    said = ", ".join(f"{WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
-    first = f"this drive could not show the ICRs well: {said}"
-    total = right + left
+    unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
+    first = f"this drive could not show the ICRs well: {unshown}"
+    if lacks := lacking_turns(right, left):
+        return (first, lacks)
+    return (first, f"too few turns in {distance_m:.0f} m for this measurement noise: {SPIN_BOTH}")
+
+
+def lacking_turns(right_rad: float, left_rad: float) -> str:
+    """Return which turns a drive lacks and what to drive, from its turns to either side; empty where it has enough."""
+    total = right_rad + left_rad
     if total < TURNS_NEEDED_RAD:
-        return (first, f"hardly any turns ({math.degrees(total):.0f}° in all): add two spins each way")
-    if min(right, left) < ONE_WAY * max(right, left):
-        side = "left" if right > left else "right"
-        return (first, f"turns one way only: add two spins, or circles, to the {side}")
-    return (first, f"too few turns in {way_m:.0f} m of way for this noise: add two spins each way")
+        return f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}"
+    if min(right_rad, left_rad) < ONE_DIRECTION * max(right_rad, left_rad):
+        side = "left" if right_rad > left_rad else "right"
+        return f"turned in one direction only: drive two full turns on the spot, or circles, to the {side}"
+    return ""

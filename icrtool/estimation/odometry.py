@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.kernels.open_loop import open_loop_path
-from icrtool.records.run import Run, make_drive, straight_drive
+from icrtool.records.run import Run, make_drive
 from icrtool.records.tables import Bools, Floats, States
 
 
@@ -53,11 +53,6 @@ def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) ->
     icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     b = track_width_m
     return Odometry(_path(table, in_gap, *icrs), _path(table, in_gap, b / 2, -b / 2, 0.0) if b is not None else None)
-
-
-def load_kernels() -> None:
-    """Have the compiled kernel ready, before there is a run."""
-    open_loop_path(straight_drive(), 1.0, -1.0, 0.0, 0, 1)
 
 
 def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:

@@ -17,7 +17,7 @@ from icrtool.estimation.filter_setup import (
     wheel_gap_s,
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
-from icrtool.kernels.filter_records import RECOVERED, USED, Codes, FilterOutput
+from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples
@@ -132,11 +132,11 @@ def _check_motion(sensors: SensorData) -> None:
     raise DataError(sensors.name, why, "use a log in which it drives and turns")
 
 
-def set_up_again(run: Run | Filtered, config: Config, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
+def set_up_again(run: Run, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
     """Prepare the filter run that gave `run`, to smooth it, or to take GNSS and heading away in some spans."""
     return set_up_filter(
         run.sensors,
-        config,
+        run.config,
         noise=noise_of(run),
         changes_s=run.changes_s,
         warm_start=run.began_with,
@@ -144,10 +144,8 @@ def set_up_again(run: Run | Filtered, config: Config, outages_ns: tuple[tuple[in
     )
 
 
-def noise_of(run: Run | Filtered) -> ProcessNoise:
+def noise_of(run: Run) -> ProcessNoise:
     """Return the process noise of the pose that a run was made with."""
-    if isinstance(run, Filtered):
-        return run.noise
     facts = run.summary["filter"]
     return ProcessNoise(float(facts["process_position_mps"]), float(facts["process_heading_degps"]))
 
@@ -172,7 +170,7 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 def _outcome(
     stamps: Ints, index: Ints | slice, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
-    """Put what the kernel said of the measurements it was given back in the rows of the stream."""
+    """Return the kernel's outcomes in the rows of the stream: it was given some of the measurements."""
     t_s = (stamps - table.stamp_ns[0]) / 1e9
     if isinstance(index, slice):
         return MeasurementOutcome(stamps, t_s, nis, code, difference)
@@ -194,7 +192,7 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     lost = np.zeros(len(gnss.stamp_ns), np.bool_)
     for begin, end in rtk_losses_ns:
         lost |= (gnss.stamp_ns > begin) & (gnss.stamp_ns < end)
-    used = gnss.stamp_ns[((gnss.code == USED) | (gnss.code == RECOVERED)) & ~lost]
+    used = gnss.stamp_ns[gnss.used & ~lost]
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)

@@ -9,10 +9,10 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
-from icrtool.estimation.observability import WORDS, Excitation
-from icrtool.kernels.filter_records import GATED, UNSEEN
+from icrtool.estimation.observability import Excitation
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.run import MeasurementOutcome
+from icrtool.kernels.measurement_codes import UNSEEN
+from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import Floats, States
 
 SHORT_DRIVE_M, SMALL_TURN_RAD = 1.0, math.radians(20.0)
@@ -34,7 +34,7 @@ def unusable_reasons(
     excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome, noise: ProcessNoise
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be."""
-    hidden = [WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
+    hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
         share = rejected_share(outcome)
@@ -48,7 +48,7 @@ def unusable_reasons(
 def rejected_share(outcome: MeasurementOutcome) -> float:
     """Return the share of the measurements within the run that the innovation gate rejected; 0 for none."""
     seen = int(np.count_nonzero(outcome.code > UNSEEN))
-    return int(np.count_nonzero(outcome.code == GATED)) / seen if seen else 0.0
+    return int(np.count_nonzero(outcome.rejected)) / seen if seen else 0.0
 
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
@@ -57,12 +57,12 @@ def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
     configured = configured_noise(config)
     if noise.position_mps != configured.position_mps:
         found.append(
-            f"{name}: the wheels contradict the position reference (held samples, clock offsets, slip): "
+            f"{name}: the wheels contradict the position reference (repeated samples, clock offsets, slip): "
             f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
         )
     if noise.heading_degps != configured.heading_degps:
         found.append(
-            f"{name}: the wheels contradict the heading (held samples, clock offsets, slip): "
+            f"{name}: the wheels contradict the heading (repeated samples, clock offsets, slip): "
             f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
         )
     return found
@@ -88,7 +88,7 @@ def run_warnings(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
     for word, outcome, why in (
-        ("fixes", gnss, "clocks, antenna place or fix quality do not fit the wheels"),
+        ("fixes", gnss, "clocks, antenna place or quality of the fixes do not fit the wheels"),
         ("headings", heading, "clocks, mounting or quality of the heading do not fit the wheels"),
     ):
         if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
@@ -105,7 +105,7 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
 
     Notes
     -----
-    The drive cannot tell an antenna off the centre line from sides that slip unequally: only the difference shows
+    An antenna off the centre line and sides that slip unequally look the same: only the difference shows
     (`icrtool.calibration.one_log`). So nothing is moved.
     """
     if not _turns(table):
@@ -119,17 +119,18 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
     where = f"{abs(middle):.2f} m"
     return [
         (
-            f"{name}: both ICRs lie {where} to the {side} of the antenna (the position's sensor): it is {other} of "
-            f"the centre line, or the sides slip unequally; if it is {where} {other}, set "
-            f"frames.antenna_right_m={-middle:.2f} (and antenna_forward_m: x_icr is counted from it too)"
+            f"{name}: both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {other} of "
+            f"the centre line, or the sides slip unequally. If it is {where} {other} of it, set "
+            f"frames.antenna_right_m={-middle:.2f}, and frames.antenna_forward_m, from which x_icr is counted"
         )
     ]
 
 
 def _turns(table: States) -> bool:
-    """Say whether the robot turned enough to show its ICRs: by the heading and, if it went nowhere, by the wheels too.
+    """Return whether the robot turned enough to show its ICRs.
 
-    A parked robot whose heading drifts has learned nothing, and one that spun on the spot has.
+    By the heading and, where it went nowhere, by the wheels too: a parked robot whose heading drifts has learned
+    nothing, and one that turned on the spot has.
     """
     turned = float(np.ptp(table.heading_rad))
     if float(table.distance_m[-1]) < SHORT_DRIVE_M:

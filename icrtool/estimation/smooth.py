@@ -6,20 +6,19 @@ from dataclasses import fields
 
 import numpy as np
 
-from icrtool.config import Config
-from icrtool.estimation.run_filter import Filtered, set_up_again
+from icrtool.estimation.run_filter import set_up_again
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.smoother import run_smoother
 from icrtool.records.run import STATE_COLUMNS, Run
 from icrtool.records.tables import Floats, States
 
 
-def smooth(run: Run | Filtered, config: Config) -> States:
+def smooth(run: Run) -> States:
     """Run the RTS smoother over a finished run.
 
     Parameters
     ----------
-    run : what `icrtool.fit` returned, or the filter stage within it
-    config : that of the run
+    run : what `icrtool.fit` returned
 
     Returns
     -------
@@ -31,7 +30,7 @@ def smooth(run: Run | Filtered, config: Config) -> States:
     The filter's noises are the smoother's: where the wheels contradict the reference, the smoothed ICRs still follow
     process noise of `filter.process_icr_mps`.
     """
-    setup = set_up_again(run, config)
+    setup = set_up_again(run)
     smoothed = run_smoother(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     std = np.sqrt(np.maximum(smoothed.variance, 0.0))
     columns: dict[str, Floats] = {}
@@ -42,11 +41,11 @@ def smooth(run: Run | Filtered, config: Config) -> States:
     return States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
 
 
-def _distance(run: Run | Filtered, x: Floats) -> Floats:
+def _distance(run: Run, x: Floats) -> Floats:
     """Return the path length (n,) [m] with the smoothed ICRs, as Eqs. 8-12 have it; gaps add nothing."""
     table = run.table
     right, left, ahead = x[:, 3], x[:, 4], x[:, 5]
-    width = np.maximum(np.abs(left - right), 1e-6)
+    width = np.maximum(np.abs(left - right), MIN_ICR_SEPARATION_M)
     omega = (table.v_left_mps - table.v_right_mps) / width
     forward = (table.v_left_mps * right - table.v_right_mps * left) / width
     dt = np.where(run.in_gap, 0.0, np.append(np.diff(table.t_s), 0.0))

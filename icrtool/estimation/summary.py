@@ -12,13 +12,13 @@ from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
-from icrtool.estimation.observability import Excitation, find_excitation, nominal_parameters, withhold_unlearned
+from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.chords import chord_rows
-from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.kernels.measurement_codes import RECOVERED
 from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
@@ -60,8 +60,7 @@ def summarise(
     name = sensors.name
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    apart = measurements.findings.get("position_delay_against_heading_s")
-    covariance, excitation = learned(filtered, config, 0.0 if apart is None or apart.std is None else apart.std)
+    covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
     warnings = [
@@ -140,7 +139,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     """
     table, width = filtered.table, config.robot.track_width_m
     drive = make_drive(table, filtered.in_gap, filtered.outages_ns)
-    p = nominal_parameters(table, width)
+    p = nominal_icrs(table, width)
     windows, own = cut_drive(table, drive, p), filtered.covariance[3:, 3:]
     excitation = find_excitation(table, drive, width, windows)
     if config.filter.preset == "paper":
@@ -195,11 +194,11 @@ def warm_start_summary(warm_start: WarmStart | None) -> dict[str, Any] | None:
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
     """Return how many fixes of each class there were and what became of them, and the jumps of the position."""
-    classes, (used, rejected) = {}, used_and_rejected(outcome)
+    classes = {}
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
         if rows.any():
-            counted = {"fixes": rows, "used": rows & used, "rejected": rows & rejected}
+            counted = {"fixes": rows, "used": rows & outcome.used, "rejected": rows & outcome.rejected}
             counted |= {"down_weighted": rows & fixes.down_weighted, "sold_as_fixed": rows & fixes.misreported}
             counts = {key: int(np.count_nonzero(marked)) for key, marked in counted.items()}
             classes[name] = counts | {"std_m": statistics.std_m[name], "step_std_m": statistics.step_std_m[name]}
@@ -212,7 +211,7 @@ def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementO
 
 
 def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:
-    """Time the rise of each ICR estimate, up to a time where one is given.
+    """Find when each ICR estimate converged, up to a time where one is given.
 
     Returns
     -------
@@ -225,7 +224,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     -----
     Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
     """
-    rises: dict[str, tuple[float, float] | None] = {}
+    spans: dict[str, tuple[float, float] | None] = {}
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
     settled_by = np.searchsorted(t_s, t_s + SETTLED_S)
@@ -234,13 +233,13 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
         settled = float(np.median(estimate[len(estimate) // 2 :]))
         change = settled - float(estimate[0])
         if abs(change) < SMALLEST_CHANGE_M:
-            rises[column] = None
+            spans[column] = None
             continue
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
         last = _first_stay(settled_by, np.abs(gone - 1.0) <= 0.1)
-        rises[column] = (float(t_s[first]), float(t_s[last])) if last is not None else None
-    return rises
+        spans[column] = (float(t_s[first]), float(t_s[last])) if last is not None else None
+    return spans
 
 
 def _first_stay(until: Ints, inside: Bools) -> int | None:
@@ -299,7 +298,7 @@ def icr_summary(
 
     `covariance` (3, 3) is that of the final ICRs.
     """
-    settled = max((rise[1] for rise in convergence.values() if rise is not None), default=0.0)
+    settled = max((span[1] for span in convergence.values() if span is not None), default=0.0)
     after = table.t_s >= settled
     columns: dict[str, Floats] = {column: getattr(table, column) for column in ICR_COLUMNS}
     return {
@@ -308,7 +307,7 @@ def icr_summary(
         "mean": {column: float(values[after].mean()) for column, values in columns.items()},
         "std": {column: float(values[after].std()) for column, values in columns.items()},
         "convergence_s": {
-            column: rise[1] - rise[0] if rise is not None else None for column, rise in convergence.items()
+            column: span[1] - span[0] if span is not None else None for column, span in convergence.items()
         },
         "convergence_span_s": dict(convergence),
     }
@@ -340,28 +339,21 @@ def separation_multiplier(table: States, track_width_m: float) -> float:
     return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
 
 
-def used_and_rejected(outcome: MeasurementOutcome) -> tuple[Bools, Bools]:
-    """Return which measurements (m,) moved the filter, and which its gate refused."""
-    rejected = outcome.code == GATED
-    return (outcome.code > UNSEEN) & ~rejected, rejected
-
-
 def counts(outcome: MeasurementOutcome) -> dict[str, int]:
     """Return how many measurements were used, and rejected by the innovation gate."""
-    used, rejected = used_and_rejected(outcome)
-    return {"used": int(np.count_nonzero(used)), "rejected": int(np.count_nonzero(rejected))}
+    return {"used": int(np.count_nonzero(outcome.used)), "rejected": int(np.count_nonzero(outcome.rejected))}
 
 
 def gnss_summary(
     datum: Datum | None, rejected_fixes: dict[str, int], gnss: MeasurementOutcome, down_weighted: Bools
 ) -> dict[str, Any]:
     """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
-    used, _ = used_and_rejected(gnss)
-    difference = gnss.difference[used & ~down_weighted]
+    by_gate = int(np.count_nonzero(gnss.rejected))
+    difference = gnss.difference[gnss.used & ~down_weighted]
     return {
-        "used": int(np.count_nonzero(used)),
-        "rejected": int(np.count_nonzero(gnss.code == GATED)) + sum(rejected_fixes.values()),
-        "rejected_by_gate": int(np.count_nonzero(gnss.code == GATED)),
+        "used": int(np.count_nonzero(gnss.used)),
+        "rejected": by_gate + sum(rejected_fixes.values()),
+        "rejected_by_gate": by_gate,
         "rejected_by_reason": dict(rejected_fixes),
         "recoveries": int(np.count_nonzero(gnss.code == RECOVERED)),
         "mean_difference_m": float(difference.mean()) if len(difference) else None,
@@ -374,7 +366,7 @@ def nis_summary(gnss: MeasurementOutcome, heading: MeasurementOutcome) -> dict[s
     """Return mean NIS (2 and 1 expected where the noise is right) and rejections, over measurements not gated."""
     summary: dict[str, Any] = {}
     for name, outcome in (("gnss", gnss), ("heading", heading)):
-        used = (outcome.code > UNSEEN) & (outcome.code != GATED)
-        summary[f"nis_{name}_mean"] = float(outcome.nis[used].mean()) if used.any() else None
-        summary[f"{name}_rejected"] = int(np.count_nonzero(outcome.code == GATED))
+        nis = outcome.nis[outcome.used]
+        summary[f"nis_{name}_mean"] = float(nis.mean()) if len(nis) else None
+        summary[f"{name}_rejected"] = int(np.count_nonzero(outcome.rejected))
     return summary

@@ -15,7 +15,7 @@ from icrtool import __version__
 from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
 from icrtool.fleet.row import Row, columns_of
 from icrtool.output.atomic_file import atomic_file
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
 from icrtool.records.text import table_cell
 
 FLEET_SCHEMA = "icrtool/fleet/1"

@@ -15,7 +15,7 @@ import msgspec
 from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
-from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text, multiplier_of
+from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text
 from icrtool.logs.containers.split_files import files_of_log
 
 if TYPE_CHECKING:
@@ -153,7 +153,6 @@ def _results(request: Request, stage: Stage) -> Row:
 
 def _row(request: Request, summary: dict[str, Any], first_ns: int, report: DropoutReport) -> Row:
     icr = summary["icr"]
-    multiplier, multiplier_std = multiplier_of(summary)
     final, std = icr.get("final") or {}, icr.get("final_std") or {}
     return replace(
         request.row,
@@ -163,8 +162,8 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
         duration_s=summary["drive"]["duration_s"],
         distance_m=summary["drive"]["distance_m"],
         icr={name: final.get(name) for name in ICRS} | {f"std_{name}": std.get(name) for name in ICRS},
-        multiplier=multiplier,
-        multiplier_std=multiplier_std,
+        multiplier=icr["separation_multiplier"],
+        multiplier_std=icr["separation_multiplier_std"],
         errors=_errors(report),
         events=len(summary["events"]),
         outages=len(report.outages),

@@ -12,10 +12,11 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
-from icrtool.errors import ConfigError, IcrToolError, LogError
+from icrtool.errors import IcrToolError, LogError
 from icrtool.fleet.row import Row
 from icrtool.output.atomic_file import atomic_file
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
+from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
@@ -114,13 +115,14 @@ def calibration_documents(found: Sequence[PooledCalibration]) -> list[dict[str, 
 
 
 def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, name: str) -> PooledCalibration:
-    from icrtool.calibration.from_runs import robot_of
-    from icrtool.calibration.pooled import calibrate, gyro_recording_of
+    from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.output.stored_run import open_run
-    from icrtool.output.tables.held_out import format_held_out
+    from icrtool.output.tables.held_out import held_out_blocks
+    from icrtool.output.text_blocks import Text
 
-    recordings, robots, left_out, seen = [], [], [], set()
-    try:
+    left_out, seen = [], set()
+
+    def usable() -> Iterator[Run]:
         for row in members:
             run = open_run(directory / row.run)
             files = tuple(file["sha256"] for file in run.summary["inputs"])
@@ -129,13 +131,10 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
                 left_out.append(row.log)
                 continue
             seen.add(files)
-            recordings.append(gyro_recording_of(run))
-            robots.append(robot_of(run))
-        if not recordings:
-            raise ConfigError("calibration", "no log of it is usable")
-        if len({robot["wheel_radius_m"] for robot in robots}) > 1:
-            raise ConfigError("robot.wheel_radius_m", "differs between the logs", "parameters refer to it")
-        result = calibrate(recordings, robots[0])
+            yield run
+
+    try:
+        result = calibrate_runs(usable())
     except IcrToolError as err:
         return _without(one, tuple(left_out), str(err))
     (directory / CALIBRATIONS).mkdir(exist_ok=True)
@@ -143,7 +142,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     with atomic_file(directory / file) as partial:
         partial.write_bytes(json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
-    table = "\n".join(format_held_out(result.wheels))
+    table = str(Text(held_out_blocks(result.wheels)))
     used = tuple(log for log in one.logs if log not in left_out)
     return PooledCalibration(one.robot, one.group, used, tuple(left_out), file, "", result.calibration.recommended,
                              float(numbers.multiplier), float(numbers.multiplier_std), table, one.key)  # fmt: skip

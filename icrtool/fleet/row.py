@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -129,19 +128,6 @@ class Row:
 def as_text(path: object) -> str:
     """Return a path as text that every file takes: bytes of its name that are no UTF-8 as escapes."""
     return str(path).encode("utf-8", errors="backslashreplace").decode()
-
-
-def multiplier_of(summary: dict[str, Any]) -> tuple[float | None, float | None]:
-    """Return (y_r - y_l)/b of a run and its standard deviation, from the final covariance; None without b or ICRs."""
-    width = summary["config"]["robot"]["track_width_m"]
-    final, covariance = summary["icr"].get("final"), summary["icr"].get("final_covariance_m2")
-    if not width or not final or final.get("y_icr_right_m") is None:
-        return None, None
-    multiplier = (final["y_icr_right_m"] - final["y_icr_left_m"]) / width
-    if not covariance:
-        return multiplier, None
-    variance = covariance[0][0] + covariance[1][1] - 2.0 * covariance[0][1]
-    return multiplier, math.sqrt(variance) / width if variance >= 0 else None
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:

@@ -14,17 +14,9 @@ import numpy as np
 
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, keep_sides, measured_column, predict, wrap
-from icrtool.kernels.filter_records import (
-    GATED,
-    RECOVERED,
-    USED,
-    FilterOutput,
-    FilterParameters,
-    FilterState,
-    Measurements,
-    Nodes,
-)
+from icrtool.kernels.filter_records import FilterOutput, FilterParameters, FilterState, Measurements, Nodes
 from icrtool.kernels.kinematics import Floats, body_velocity
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""

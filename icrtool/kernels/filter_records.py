@@ -13,9 +13,6 @@ Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""Codes of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
-
 
 class FilterParameters(NamedTuple):
     """Constants of one run.

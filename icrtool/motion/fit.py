@@ -3,8 +3,7 @@
 Heading and place are sums over the wheel samples, and so are their derivatives: all windows of a recording cost one
 pass over its samples (`icrtool.kernels.window_residuals`).
 
-Each recording has constants of its own, which are not part of a calibration: the offset of its reference heading, the
-delay of its wheels relative to its poses, the bias of its gyro.
+Each recording has constants of its own, which are not part of a calibration (`icrtool.motion.recording.LogConstants`).
 """
 
 from __future__ import annotations
@@ -16,47 +15,39 @@ import numpy as np
 
 from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
-from icrtool.motion.models import MotionModel, model_columns, twist, wheel_motion
-from icrtool.motion.recording import STRETCH_M, Windows
+from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
+from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
 from icrtool.records.tables import Bools, Floats
 
-CONSTANTS = ("heading_offset_rad", "wheels_read_later_s", "gyro_bias_radps")
-"""Constants of each recording: offset added to the reference heading; delay of the wheels; added to the turn rate."""
+CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
+"""Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
 
-CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02])
-"""Prior of `CONSTANTS` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
+OF_WHEELS = 2
+"""So many of them, the first, are there without a gyro, too."""
 
 
-@dataclass(frozen=True, slots=True)
-class PooledFit:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PooledFit(FittedModel):
     """A model fitted to windows of several recordings.
 
     Attributes
     ----------
-    parameters : (k,) of the model's terms; covariance : (k, k)
-    constants : (recordings, 3), see `CONSTANTS`
-    solution : of all parameters, those of the model first, then three a recording
-    residuals, jacobian : of all windows (m,), (m, k + 3 recordings), at the minimum
+    constants : of each recording
+    solution : of all parameters, those of the model first, then those of each recording
+    residuals, jacobian : of all windows (m,), (m, parameters), at the minimum
     kept : (m,) the residuals that were fitted
     """
 
-    model: MotionModel
-    parameters: Floats
-    covariance: Floats
-    constants: Floats
+    constants: tuple[LogConstants, ...]
     solution: RobustFit
     residuals: Floats
     jacobian: Floats
     kept: Bools
 
     @property
-    def turning(self) -> Turning:
-        """The model and parameters whose turn rate a model with a gyro combines with the gyro's."""
-        return self.model, self.parameters
-
-
-Turning = tuple[MotionModel, Floats]
-"""A wheels-only model and its parameters."""
+    def fitted(self) -> FittedModel:
+        """The model and its parameters alone."""
+        return FittedModel(self.model, self.parameters, self.covariance, self.wheels)
 
 
 class WindowResiduals:
@@ -66,40 +57,47 @@ class WindowResiduals:
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
+    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
     """
 
-    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: Turning | None = None) -> None:
+    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None) -> None:
         steps = windows.steps
-        motion = wheel_motion(steps.v_left, steps.v_right, width_m)
+        self._motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
         if wheels is not None:
-            motion = motion._replace(gyro=steps.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
-        self._fixed, axes, columns = model_columns(model, motion)
-        # the gyro's bias is one more column of the turn rate
-        self._axes = np.append(axes, OMEGA)
-        self._columns = np.concatenate([columns, np.full((1, len(steps.t)), float(model.uses_gyro))])
-        self._windows = windows
+            self._motion = self._motion._replace(turn=wheels.twist(self._motion)[OMEGA])
+        self._model, self._windows = model, windows
+        self._fixed, self._axes, self._columns = model_columns(model, self._motion)
         self._reference = np.column_stack([windows.reference.real, windows.reference.imag])
         self._root = np.sqrt(windows.length_m)
 
     def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
-        """Return residuals (2 w,), forward then right [m per root metre], and derivatives (2 w, k + 3)."""
-        windows, steps = self._windows, self._windows.steps
-        offset, delay, bias = constants.tolist()
+        """Return residuals (2 w,), forward then right [m per root metre], and derivatives (2 w, k + c).
+
+        Parameters
+        ----------
+        constants : (c,) `LogConstants`, those of a gyro only for a model with one
+        """
+        windows, steps, k = self._windows, self._windows.steps, len(parameters)
+        offset, delay = constants[:OF_WHEELS].tolist()
+        fixed, axes, columns, values = self._fixed, self._axes, self._columns, parameters
+        if self._model.uses_gyro:
+            bias, later = constants[OF_WHEELS:].tolist()
+            gyro, by_time = steps.gyro_read(later)
+            fixed, axes, columns = model_columns(self._model, self._motion._replace(gyro=gyro))
+            by_gyro = 1.0 + parameters @ gyro_gains(self._model)
+            # the gyro's bias and time are two more columns of the turn rate
+            columns = np.concatenate([columns, [np.ones(len(gyro)), by_gyro * by_time]])
+            axes, values = np.append(axes, [OMEGA, OMEGA]), np.concatenate([parameters, [bias, 0.0]])
         row, share = steps.locate(windows.knot_t + delay)
-        terms, knots, count = len(self._axes), len(row), len(windows.start)
+        terms, knots, count = len(axes), len(row), len(windows.start)
         rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-        sums_at_knots(
-            self._fixed, self._columns, self._axes, np.append(parameters, bias), steps.held, steps.into, row, share,
-            rate, sums, by,
-        )  # fmt: skip
-        residual, jacobian = np.empty(2 * count), np.empty((2 * count, terms + 2))
+        sums_at_knots(fixed, columns, axes, values, steps.held, steps.into, row, share, rate, sums, by)
+        residual, jacobian = np.empty(2 * count), np.empty((2 * count, terms + OF_WHEELS))
         window_residuals(
             rate, sums, by, windows.start, windows.end, self._reference, offset, self._root, residual, jacobian
         )
-        # terms, bias, offset, delay: to terms, then `CONSTANTS`
-        order = [*range(terms - 1), terms, terms + 1, terms - 1]
-        return residual, jacobian[:, order]
+        # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
+        return residual, jacobian[:, [*range(k), terms, terms + 1, *range(k, terms)]]
 
 
 class Pool:
@@ -108,13 +106,17 @@ class Pool:
     Parameters
     ----------
     windows, widths_m : by recording
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
+    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
     """
 
     def __init__(
-        self, windows: Sequence[Windows], widths_m: Sequence[float], model: MotionModel, wheels: Turning | None = None
+        self,
+        windows: Sequence[Windows],
+        widths_m: Sequence[float],
+        model: MotionModel,
+        wheels: FittedModel | None = None,
     ) -> None:
-        self.model = model
+        self.model, self._wheels = model, wheels
         self._parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(windows, widths_m, strict=True)]
         self._windows = windows
         groups, offset = [], 0
@@ -125,36 +127,35 @@ class Pool:
         self.group = np.concatenate(groups)
         self.length_m = np.concatenate([np.tile(w.length_m, 2) for w in windows])
 
-    def own_constants(self, recording: int, parameters: Floats) -> Floats:
-        """Return the constants (3,) of one recording for given parameters of the model."""
-        part, free = self._parts[recording], self._constant_std()
-        kept = np.ones(len(self._windows[recording].start) * 2, np.bool_)
+    def own_constants(self, recording: int, parameters: Floats) -> LogConstants:
+        """Return the constants of one recording for given parameters of the model."""
+        part, std, k = self._parts[recording], self._constant_std, len(parameters)
 
         def evaluate(constants: Floats) -> tuple[Floats, Floats]:
             residuals, by = part(parameters, constants)
-            return residuals, by[:, -3:]
+            return residuals, by[:, k:]
 
-        return robust_least_squares(evaluate, np.zeros(3), np.zeros(3), free, overlap=len(kept) / 10.0).x
+        zero = np.zeros(len(std))
+        overlap = len(self._windows[recording].start) / 5.0
+        return LogConstants(*robust_least_squares(evaluate, zero, zero, std, overlap=overlap).x.tolist())
 
+    @property
     def _constant_std(self) -> Floats:
-        free = CONSTANT_STD.copy()
-        if not self.model.uses_gyro:
-            free[2] = 1e-9
-        return free
+        return CONSTANT_STD if self.model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
 
     @property
     def prior(self) -> tuple[Floats, Floats]:
         """Mean and standard deviation of all parameters, model first, then the constants of each recording."""
-        count = len(self._parts)
-        mean = np.concatenate([self.model.prior_mean, np.zeros(3 * count)])
-        return mean, np.concatenate([self.model.prior_std, np.tile(self._constant_std(), count)])
+        own = np.tile(self._constant_std, len(self._parts))
+        mean = np.concatenate([self.model.prior_mean, np.zeros(len(own))])
+        return mean, np.concatenate([self.model.prior_std, own])
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return residuals (m,) of all windows of all recordings and their derivatives (m, k + 3 recordings)."""
-        k = len(self.model.terms)
+        """Return residuals (m,) of all windows of all recordings and their derivatives (m, parameters)."""
+        k, own = len(self.model.terms), len(self._constant_std)
         residuals, jacobians = [], []
         for i, part in enumerate(self._parts):
-            columns = slice(k + 3 * i, k + 3 * i + 3)
+            columns = slice(k + own * i, k + own * (i + 1))
             residual, by = part(x[:k], x[columns])
             jacobian = np.zeros((len(residual), len(x)))
             jacobian[:, :k], jacobian[:, columns] = by[:, :k], by[:, k:]
@@ -186,11 +187,13 @@ class Pool:
         found = robust_least_squares(
             evaluate, mean if start is None else start, mean, std, group=self.group[rows], overlap=self.overlap(rows)
         )
-        k = len(self.model.terms)
+        k, own = len(self.model.terms), len(self._constant_std)
+        constants = (LogConstants(*one) for one in found.x[k:].reshape(-1, own).tolist())
         at, residuals, jacobian = last[0]
         return PooledFit(
-            self.model, found.x[:k], found.covariance[:k, :k], found.x[k:].reshape(-1, 3), found,
-            residuals + jacobian @ (found.x - at), jacobian, rows,
+            self.model, found.x[:k], found.covariance[:k, :k], self._wheels,
+            constants=tuple(constants), solution=found, residuals=residuals + jacobian @ (found.x - at),
+            jacobian=jacobian, kept=rows,
         )  # fmt: skip
 
     def without(self, fit: PooledFit, dropped: Bools) -> Floats:

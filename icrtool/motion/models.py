@@ -42,12 +42,13 @@ class WheelMotion(NamedTuple):
     turn: Floats
 
 
-def wheel_motion(v_left: Floats, v_right: Floats, width_m: float) -> WheelMotion:
+def wheel_motion(v_left: Floats, v_right: Floats, width_m: float, gyro: Floats | None = None) -> WheelMotion:
     """Return what the terms are made of, from speeds at the configured wheel radius (n,) [m/s]."""
     both = np.abs(v_left) + np.abs(v_right)
     spin = np.divide(np.abs(v_left - v_right), both, out=np.zeros_like(both), where=both > 0.0)
     none = np.zeros_like(both)
-    return WheelMotion((v_left + v_right) / 2.0, (v_left - v_right) / width_m, spin, width_m, none, none)
+    measured = none if gyro is None else gyro
+    return WheelMotion((v_left + v_right) / 2.0, (v_left - v_right) / width_m, spin, width_m, measured, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,9 @@ TERMS: dict[str, Term] = {
         Term("vy_v", VY, lambda m: m.v, 0.0, 0.0, 0.02, "sideways while driving ahead (Anousaki 2004)"),
         Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, 0.0, 0.0, 0.1, "drag in turns (Seegmiller 2014)"),
         Term("gyro_scale", OMEGA, lambda m: m.gyro, 0.0, 0.0, 0.02, "scale error of the gyro"),
-        Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.5, "weight of the wheels in the turn rate"),
+        Term(
+            "wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.15, "weight of the wheels in the turn rate"
+        ),
     )
 }
 """Every term by name."""
@@ -172,6 +175,11 @@ def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints
     return fixed, axes, columns
 
 
+def gyro_gains(model: MotionModel) -> Floats:
+    """Return by how much each parameter (k,) of a model with a gyro raises the gyro's share of the turn rate."""
+    return np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
+
+
 def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
     """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
     result, axes, columns = model_columns(model, motion)
@@ -251,6 +259,94 @@ def track_geometry(
     )
 
 
+def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
+    """Return the parameters of model ``full_linear`` with given track ICRs, and their derivatives.
+
+    Parameters
+    ----------
+    icrs_m : y_icr_right, y_icr_left, x_icr
+    width_m : track width b of the terms
+
+    Returns
+    -------
+    parameters : (6,) of the terms, for wheels of the configured radius
+    by : (6, 5) derivatives by the three ICRs [1/m], by a scale of both wheel speeds, and by the scale of the left less
+        that of the right
+
+    Notes
+    -----
+    With scales s_l, s_r and W = y_r - y_l: v_x = (s_l V_l y_r - s_r V_r y_l) / W, omega = (s_l V_l - s_r V_r) / W,
+    v_y = -x omega (Pentzer 2014, Eqs. 8-12).
+    """
+    right, left, x = icrs_m.tolist()
+    W = right - left
+    middle, gain, aside = (right + left) / W, width_m / W, -2.0 * x / W
+    by = {
+        "vx_v": (0.0, 0.0, 0.0, 1.0, middle / 2),
+        "vx_w": (-2.0 * left / W**2, 2.0 * right / W**2, 0.0, middle, 0.5),
+        "omega_w": (-gain / W, gain / W, 0.0, gain, 0.0),
+        "omega_v": (0.0, 0.0, 0.0, 0.0, gain),
+        "vy_w": (-aside / W, aside / W, -2.0 / W, aside, 0.0),
+        "vy_v": (0.0, 0.0, 0.0, 0.0, aside / 2),
+    }
+    value = {"vx_v": 1.0, "vx_w": middle, "omega_w": gain, "omega_v": 0.0, "vy_w": aside, "vy_v": 0.0}
+    terms = MODELS["full_linear"].terms
+    return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
+
+
+NOT_SHOWN = 0.7
+"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
+
+STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class FittedModel:
+    """A model of the family with its parameters.
+
+    Attributes
+    ----------
+    parameters : (k,), in the order of the model's terms; covariance : (k, k)
+    wheels : of a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+    """
+
+    model: MotionModel
+    parameters: Floats
+    covariance: Floats
+    wheels: FittedModel | None = None
+
+    @property
+    def std(self) -> Floats:
+        """One standard deviation of each parameter (k,)."""
+        deviations: Floats = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+    @property
+    def not_shown(self) -> tuple[str, ...]:
+        """Names of the terms that the data did not show: they rest on the prior."""
+        share = self.std / self.model.prior_std
+        return tuple(name for name, left in zip(self.model.terms, share, strict=True) if left > NOT_SHOWN)
+
+    def complete(self, motion: WheelMotion) -> WheelMotion:
+        """Return a motion with the turn rate of the wheels-only model, where the model has one."""
+        return motion if self.wheels is None else motion._replace(turn=self.wheels.twist(motion)[OMEGA])
+
+    def twist(self, motion: WheelMotion) -> Floats:
+        """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
+        return twist(self.model, self.parameters, self.complete(motion))
+
+    def geometry(self, width_m: float, typical: TypicalDrive) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs, multipliers and radius factors, and their covariance (7, 7)."""
+        at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
+        by_parameter = np.zeros((len(at), len(self.parameters)))
+        for k in range(len(self.parameters)):
+            moved = self.parameters.copy()
+            moved[k] += STEP
+            by_parameter[:, k] = (np.array(track_geometry(self.model, moved, width_m, typical)) - at) / STEP
+        covariance: Floats = by_parameter @ self.covariance @ by_parameter.T
+        return TrackGeometry(*at.tolist()), covariance
+
+
 CONTROLLER = MotionModel(
     "controller", "separation and radii", ("vx_v", "vx_w", "omega_w", "omega_v"),
     "diff_drive_controller of ros2_controllers",
@@ -258,15 +354,16 @@ CONTROLLER = MotionModel(
 """What a differential-drive controller can express; it follows from another model's geometry and is never fitted."""
 
 
-def controller_parameters(geometry: TrackGeometry) -> Floats:
-    """Return the parameters of `CONTROLLER` (4,) with the multiplier and radius factors of a geometry.
+def controller_model(geometry: TrackGeometry) -> FittedModel:
+    """Return `CONTROLLER` with the multiplier and radius factors of a geometry.
 
     Notes
     -----
     v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b) with V_l = v + w b / 2, V_r = v - w b / 2.
     """
     left, right, m = geometry.radius_left, geometry.radius_right, geometry.multiplier
-    return np.array([(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m])
+    values = [(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m]
+    return FittedModel(CONTROLLER, np.array(values), np.zeros((4, 4)))
 
 
 def find_model(name: str) -> MotionModel:

@@ -34,6 +34,9 @@ STRETCH_M = 20.0
 
 FEWEST_WINDOWS = 10
 
+AFTER_S = 1e-7
+"""A rate at a step's end is that of the next step, whatever the rounding of its time."""
+
 MOVING_MPS = 0.01
 """Slower than this the robot stands: its starts are copies of one another."""
 
@@ -77,6 +80,26 @@ class Recording:
         return replace(self, t_s=self.t_s[rows], drive=Drive._make(c[rows] for c in self.drive), gyro_radps=gyro)
 
 
+class LogConstants(NamedTuple):
+    """What is a recording's own, beside the parameters of its robot.
+
+    Attributes
+    ----------
+    heading_offset_rad : added to the heading of the reference
+    wheels_later_s : the wheels are read this much later than the poses
+    gyro_bias_radps : added to the turn rate of a model with a gyro
+    gyro_later_s : the gyro is read this much later than the wheels
+    """
+
+    heading_offset_rad: float = 0.0
+    wheels_later_s: float = 0.0
+    gyro_bias_radps: float = 0.0
+    gyro_later_s: float = 0.0
+
+
+NO_CONSTANTS = LogConstants()
+
+
 class Steps(NamedTuple):
     """Wheel samples of a recording, joined; (n,) each.
 
@@ -103,6 +126,16 @@ class Steps(NamedTuple):
         held = self.held[row]
         passed = np.clip(at - t[row], 0.0, held)
         return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
+
+    def gyro_read(self, later_s: float) -> tuple[Floats, Floats]:
+        """Return the mean turn rate (n,) of the gyro read later, and its derivative by that time, after steps' ends."""
+        turned, ends = np.concatenate([[0.0], np.cumsum(self.held * self.gyro)]), []
+        for begin in (self.t, self.t + self.held):
+            row, share = self.locate(begin + later_s)
+            rate = self.gyro[self.locate(begin + later_s + AFTER_S)[0]]
+            ends.append((turned[row] + share * self.held[row] * self.gyro[row], rate))
+        share_s = np.where(self.held > 0.0, self.held, np.inf)
+        return (ends[1][0] - ends[0][0]) / share_s, (ends[1][1] - ends[0][1]) / share_s
 
 
 class Windows(NamedTuple):

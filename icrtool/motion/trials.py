@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.open_loop import trial_ends
-from icrtool.motion.fit import Turning
-from icrtool.motion.models import MotionModel, twist, wheel_motion
-from icrtool.motion.recording import MOVING_MPS, Recording, Steps, joined_steps, samples_a_step
+from icrtool.motion.models import FittedModel, wheel_motion
+from icrtool.motion.recording import (
+    MOVING_MPS,
+    NO_CONSTANTS,
+    LogConstants,
+    Recording,
+    Steps,
+    joined_steps,
+    samples_a_step,
+)
 from icrtool.records.tables import Complexes, Floats, Ints
 
 
@@ -50,106 +57,62 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     return Trials(starts, trial_ends(drive, np.array(horizons_m, np.float64))[starts])
 
 
-def trial_errors(
-    recording: Recording, trials: Trials, rates: Floats, wheels_delay_s: float = 0.0, steps: Steps | None = None
-) -> Floats:
-    """Return the distance (k, h) [m] between open-loop position and reference at each trial's end, NaN for no trial.
+PathAt = Callable[[Floats], tuple[Floats, Complexes]]
+"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]."""
 
-    Parameters
-    ----------
-    rates : (3, n) body twist of each step, of `twist_rates`
-    wheels_delay_s : delay of the wheels relative to the poses, a constant of the recording
-    steps : the wheel samples joined, of which `rates` are; default single samples
+
+def trial_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
+    """Return the distance (k, h) [m] between open-loop position and reference at each trial's end, NaN for no trial.
 
     Notes
     -----
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
-    drive = recording.drive
+    drive, t = recording.drive, recording.t_s
     reference = drive.north + 1j * drive.east
-    errors: Floats = np.full(trials.ends.shape, np.nan)
-    if steps is None:
-        places, headings = wheels_path(recording, rates, wheels_delay_s)
-        path: PathAt = lambda rows: (headings[rows], places[rows])  # noqa: E731 - one of two
+    if trials.ends.size > len(t):
+        headings, places = path(t)
+        at: Callable[[Ints], tuple[Floats, Complexes]] = lambda rows: (headings[rows], places[rows])  # noqa: E731 - one of two
     else:
-        drawn, read_s = drawn_path(steps, rates), recording.t_s + wheels_delay_s
-        path = lambda rows: drawn(read_s[rows])  # noqa: E731 - the other
-    heading, begin = path(trials.starts)
+        at = lambda rows: path(t[rows])  # noqa: E731 - the other
+    heading, begin = at(trials.starts)
     turn = np.exp(1j * (drive.heading[trials.starts] - heading))
+    errors: Floats = np.full(trials.ends.shape, np.nan)
     for h in range(trials.ends.shape[-1]):
         some = trials.ends[:, h] >= 0
         e = trials.ends[some, h]
-        moved = turn[some] * (path(e)[1] - begin[some])
+        moved = turn[some] * (at(e)[1] - begin[some])
         errors[some, h] = np.abs(moved - (reference[e] - reference[trials.starts[some]]))
     return errors
 
 
-PathAt = Callable[[Any], tuple[Floats, Complexes]]
-"""Gives heading and place of a path at rows or times."""
-
-
-def wheels_path(recording: Recording, rates: Floats, wheels_delay_s: float = 0.0) -> tuple[Complexes, Floats]:
-    """Return the path that a twist makes from the origin, at every state.
+def predicted_path(
+    recording: Recording, fitted: FittedModel, own: LogConstants = NO_CONSTANTS, steps: Steps | None = None
+) -> PathAt:
+    """Return the path that a model makes of a recording's wheels and gyro, at times of its poses.
 
     Parameters
     ----------
-    rates, wheels_delay_s : as in `trial_errors`
-
-    Returns
-    -------
-    complex (n,), forward + j right of the first heading [m]; float64 (n,), clockwise turn since the first state [rad].
+    own : constants of the recording
+    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop`
 
     Notes
     -----
-    Euler steps as in `icrtool.kernels.open_loop`; nothing moves through a gap in the wheel data.
+    Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
-    heading, place = drawn_path(joined_steps(recording, 1), rates)(recording.t_s + wheels_delay_s)
-    return place, heading
-
-
-def drawn_path(steps: Steps, rates: Floats) -> PathAt:
-    """Return what gives heading (m,) [rad] and place (m,) [m], forward + j right, at times (m,) [s], from zero.
-
-    Parameters
-    ----------
-    rates : (3, n) body twist of each step
-    """
-    v_x, v_y, omega = rates
-    turned = steps.held * omega
+    of = steps if steps is not None else joined_steps(recording, 1)
+    gyro = of.gyro_read(own.gyro_later_s)[0] if fitted.model.uses_gyro else of.gyro
+    v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left, of.v_right, recording.width_m, gyro))
+    turned = of.held * (omega + own.gyro_bias_radps)
     heading = np.concatenate([[0.0], np.cumsum(turned)])
-    angle = heading[:-1] + steps.into * omega
+    angle = heading[:-1] + of.into * (omega + own.gyro_bias_radps)
     moved = np.empty(len(turned), np.complex128)
     cos, sin = np.cos(angle), np.sin(angle)
-    moved.real, moved.imag = steps.held * (v_x * cos - v_y * sin), steps.held * (v_x * sin + v_y * cos)
+    moved.real, moved.imag = of.held * (v_x * cos - v_y * sin), of.held * (v_x * sin + v_y * cos)
     place = np.concatenate([[0.0], np.cumsum(moved)])
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
-        row, share = steps.locate(at)
-        return heading[row] + share * turned[row], place[row] + share * moved[row]
+        row, share = of.locate(at + own.wheels_later_s)
+        return heading[row] + share * turned[row] - own.heading_offset_rad, place[row] + share * moved[row]
 
     return at_times
-
-
-def twist_rates(
-    recording: Recording,
-    model: MotionModel,
-    parameters: Floats,
-    wheels: Turning | None = None,
-    gyro_bias: float = 0.0,
-    steps: Steps | None = None,
-) -> Floats:
-    """Return the body twist v_x, v_y, omega (3, n) of each wheel sample, or step of joined ones.
-
-    Parameters
-    ----------
-    wheels : for a model with a gyro, the wheels-only model and its parameters, whose turn rate it uses
-    gyro_bias : added to the turn rate [rad/s]
-    steps : the wheel samples joined; default single samples
-    """
-    of = steps if steps is not None else joined_steps(recording, 1)
-    motion = wheel_motion(of.v_left, of.v_right, recording.width_m)
-    if wheels is not None and recording.gyro_radps is not None:
-        motion = motion._replace(gyro=of.gyro, turn=twist(wheels[0], wheels[1], motion)[2])
-    rates = twist(model, parameters, motion)
-    rates[2] += gyro_bias
-    return rates

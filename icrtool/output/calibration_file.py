@@ -12,7 +12,7 @@ from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import OutputError, RunError
 from icrtool.output.atomic_file import atomic_file
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes, schema_of
 
 FILE_NAME = "calibration.json"
 
@@ -69,13 +69,6 @@ def calibration_file(place: Path) -> Path:
     file = place / FILE_NAME if place.is_dir() else place
     if not file.parent.is_dir():
         raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    if file.exists() and not _is_ours(file):
+    if file.exists() and schema_of(file) != CALIBRATION_SCHEMA:
         raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
     return file
-
-
-def _is_ours(file: Path) -> bool:
-    try:
-        return bool(json.loads(file.read_bytes())["schema"] == CALIBRATION_SCHEMA)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
@@ -20,9 +19,8 @@ from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
-from icrtool.output.figures.drawing_process import Drawer, DrawingHere
-from icrtool.output.figures.dropout_figures import ReportFigures
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
+from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.trials_file import trials_file
@@ -50,13 +48,13 @@ Cell = str | int | float | None
 
 
 @contextmanager
-def report_writer(directory: Path, drawer: Drawer, stamp_ns: Ints | None = None) -> Iterator[ReportWriter]:
+def report_writer(directory: Path, plots: tuple[str, ...], stamp_ns: Ints | None = None) -> Iterator[ReportWriter]:
     """Give a writer of one report; its files appear as `directory` when the block ends well, or not at all.
 
     Parameters
     ----------
     directory : where the report shall appear; an old report there is replaced
-    drawer : what draws the figures
+    plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
 
     Raises
@@ -66,49 +64,45 @@ def report_writer(directory: Path, drawer: Drawer, stamp_ns: Ints | None = None)
     """
     with (
         atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial,
-        drawer.into(partial / "plots") as draw,
         trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink,
     ):
-        yield ReportWriter(partial, ReportFigures(draw), sink)
+        yield ReportWriter(partial, plots, sink)
 
 
 class ReportWriter:
-    """Writes one report as it grows; `report_writer` gives one.
+    """Writes one report; `report_writer` gives one.
 
     Attributes
     ----------
     sink : takes every single trial, None where they are not written
     """
 
-    def __init__(self, directory: Path, figures: ReportFigures, sink: ErrorSink | None) -> None:
+    def __init__(self, directory: Path, plots: tuple[str, ...], sink: ErrorSink | None) -> None:
         self._directory = directory
-        self._figures = figures
+        self._plots = plots
         self.sink = sink
 
-    def watch(self, report: DropoutReport) -> None:
-        """Have those figures drawn whose numbers the growing report holds."""
-        self._figures.draw_ready(report)
-
     def finish(self, report: DropoutReport) -> None:
-        """Have the last figures drawn, and write the tables."""
-        self._figures.draw_rest(report)
+        """Draw the figures and write the tables."""
+        if self._plots:
+            directory = self._directory / "plots"
+            directory.mkdir()
+            with quiet_matplotlib():
+                from icrtool.output.figures.dropout_figures import draw_figures
+
+                draw_figures(report, directory, self._plots)
         write_tables(report, self._directory)
 
 
 def write_report(report: DropoutReport, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
     """Write a finished report, whole or not at all; see `DropoutReport.write`."""
-    with report_writer(directory, DrawingHere(plots)) as writer:
-        writer.watch(report)
+    with report_writer(directory, plots) as writer:
         writer.finish(report)
 
 
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours, of whatever version."""
-    try:
-        schema = json.loads((directory / REPORT_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False
-    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+    return schema_of(directory / REPORT_FILE).startswith(SCHEMA_FAMILY)
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:

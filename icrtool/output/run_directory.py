@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,13 @@ from typing import Any
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
-from icrtool.output.figures.drawing_process import Drawer, DrawingHere
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
+from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.own_files import made_from
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
 from icrtool.records.events import EVENT_COLUMNS
-from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
-from icrtool.records.text import LogText
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -89,7 +88,6 @@ def write_run(
     *,
     states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
-    drawer: Drawer | None = None,
     note: Callable[[str], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
@@ -100,8 +98,6 @@ def write_run(
     directory : where it shall appear; an old run there is replaced, with all that was made from it
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-    drawer : what draws the figures, in its own formats; default: this process, in those of `plots`. Those of a run of
-        more than `MOST_CSV_STATES` states are drawn by this process
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
 
     Raises
@@ -111,9 +107,6 @@ def write_run(
     """
     if unknown := set(plots) - set(PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
-    if drawer is None or len(run.table) > MOST_CSV_STATES:
-        # To another process a run goes as three copies of itself.
-        drawer = DrawingHere(plots if drawer is None else drawer.formats)
     if states is None:
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
@@ -123,12 +116,12 @@ def write_run(
         atomic_directory(
             directory, is_run_directory, kind="run directory", names=LATER_NAMES, made_from=sources, note=note
         ) as partial,
-        drawer.into(partial / "plots") as draw,
         ThreadPoolExecutor(1) as pool,
     ):
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
-        draw(_write_figures, run)
+        if plots:
+            _write_figures(run, partial / "plots", plots)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
@@ -164,11 +157,7 @@ def _inputs_of(directory: Path) -> list[dict[str, Any]]:
 
 def is_run_directory(directory: Path) -> bool:
     """Return whether a directory is a run of ours, of whatever version."""
-    try:
-        schema = json.loads((directory / RUN_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False
-    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+    return schema_of(directory / RUN_FILE).startswith(SCHEMA_FAMILY)
 
 
 def events_csv(events: list[dict[str, Any]]) -> str:
@@ -177,31 +166,9 @@ def events_csv(events: list[dict[str, Any]]) -> str:
     return "".join(f"{','.join(row)}\n" for row in rows)
 
 
-def json_bytes(document: Mapping[str, Any]) -> bytes:
-    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
-    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
-    return (text + "\n").encode("utf-8", errors="backslashreplace")
+def _write_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:
+    directory.mkdir()
+    with quiet_matplotlib():
+        from icrtool.output.figures.run_figures import draw_figures
 
-
-def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
-    if isinstance(value, dict):
-        return {key: _as_in_the_log(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_as_in_the_log(item) for item in value]
-    return value.raw if isinstance(value, LogText) else value
-
-
-def load_figures() -> None:
-    """Load what the figures of a run need, in the process that will draw them."""
-    from icrtool.estimation.odometry import load_kernels
-    from icrtool.output.figures import run_figures  # noqa: F401 - for its own sake
-
-    load_kernels()
-
-
-def _write_figures(directory: Path, formats: tuple[str, ...], run: Run) -> None:
-    from icrtool.output.figures.run_figures import draw_figures
-
-    draw_figures(run, directory, formats)
+        draw_figures(run, directory, formats)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.output.atomic_directory import atomic_directory, check_place
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.simulation.studies import KINDS, Column, StudyResult
 
 STUDY_SCHEMA = "icrtool/study/1"
@@ -56,11 +55,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 
 def is_study_directory(directory: Path) -> bool:
     """Return whether a directory is a study of ours, of whatever version."""
-    try:
-        schema = json.loads((directory / STUDY_FILE).read_bytes())["schema"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return False
-    return isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)
+    return schema_of(directory / STUDY_FILE).startswith(SCHEMA_FAMILY)
 
 
 def study_document(result: StudyResult) -> dict[str, Any]:

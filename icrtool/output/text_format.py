@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-TABLE_WIDTH = 100
-"""Letters in a line of a printed table."""
+from icrtool.output.text_blocks import Line
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -22,11 +20,9 @@ def run_title(summary: Mapping[str, Any]) -> str:
     return f"{log}  ({robot})" if robot else str(log)
 
 
-def unusable_lines(summary: Mapping[str, Any]) -> list[str]:
+def unusable_lines(summary: Mapping[str, Any]) -> list[Line]:
     """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    if summary["usable"]:
-        return []
-    return textwrap.wrap(f"NOT USABLE: {summary['unusable_because']}", TABLE_WIDTH, subsequent_indent="  ")
+    return [] if summary["usable"] else [Line(f"NOT USABLE: {summary['unusable_because']}", "bad")]
 
 
 def position_word(summary: Mapping[str, Any]) -> str:

@@ -6,8 +6,9 @@ No kernel is here: a process that only draws them need not load numba.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
@@ -153,6 +154,8 @@ class UsedCalibration(NamedTuple):
     model : of the calibration
     logs : how many it was fitted to; fitted_to_this : this log is among them
     created : date and time, UTC
+    with_gyro : its row uses the gyro of the log
+    calibration : what its file holds, without the models that were not recommended and without its scores
     """
 
     name: str
@@ -161,6 +164,8 @@ class UsedCalibration(NamedTuple):
     logs: int
     fitted_to_this: bool
     created: str
+    with_gyro: bool = False
+    calibration: Mapping[str, Any] = {}
 
     @property
     def fitted_text(self) -> str:

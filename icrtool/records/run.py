@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icrtool.config import Config
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.trials import Drive
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
 
-ICR_COLUMNS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+ICR_WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
+ICR_COLUMNS = tuple(ICR_WORDS)
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""
@@ -38,7 +40,7 @@ class MeasurementOutcome:
     ----------
     stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
     nis : (m,) normalised innovation squared, NaN where unseen
-    code : uint8 (m,), see `icrtool.kernels.ekf`: UNSEEN, USED, GATED, RECOVERED
+    code : uint8 (m,), see `icrtool.kernels.measurement_codes`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
 
@@ -47,6 +49,18 @@ class MeasurementOutcome:
     nis: Floats
     code: Bytes
     difference: Floats
+
+    @property
+    def used(self) -> Bools:
+        """Which measurements moved the filter (m,)."""
+        moved: Bools = (self.code == USED) | (self.code == RECOVERED)
+        return moved
+
+    @property
+    def rejected(self) -> Bools:
+        """Which measurements the innovation gate rejected (m,)."""
+        gated: Bools = self.code == GATED
+        return gated
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +166,7 @@ class Run:
 
     @property
     def usable(self) -> bool:
-        """Whether the ICRs may be used; `summary` says why not (``unusable_because``)."""
+        """Whether the ICRs may be used; ``unusable_because`` of `summary` is the reason where not."""
         return bool(self.summary["usable"])
 
     def write(

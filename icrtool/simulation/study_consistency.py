@@ -42,7 +42,7 @@ SETTLED_S = 10.0
 PROBABILITY = 0.95
 
 LEAST_STD = 1e-12
-"""Keeps a variance of zero from dividing."""
+"""Avoids division by zero."""
 
 WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of headings"}
 

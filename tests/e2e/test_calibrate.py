@@ -107,7 +107,7 @@ def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> 
     status, out, err = icrtool("info", "straight.mcap", *ROBOT)
     assert status == 0
     assert "y right not shown, y left not shown" in out
-    assert "add two spins each way" in err
+    assert "two full turns on the spot" in err
 
 
 def test_several_runs_are_pooled_and_each_is_left_out(icrtool, tmp_path: Path) -> None:

@@ -62,6 +62,8 @@ def test_info_gives_date_extent_verdict_and_a_next_command_that_works(icrtool) -
     assert "m north-south about 40.79" in lines["area"]
     assert lines["verdict"] == "can be fitted, all ICRs are shown"
     assert "missing" not in lines
+    document = json.loads(icrtool("info", MOWER, "--robot", "segway-rmp400", "--json")[1])["logs"][0]
+    assert (document["verdict"], document["next"]) == (lines["verdict"], lines["next"])
     name, *arguments = shlex.split(lines["next"])
     assert (name, arguments[0]) == ("icrtool", "dropout-report")
     status, out, _ = icrtool(*arguments, "--plots", "none", "--no-ladder")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import sys
 from collections.abc import Iterator
@@ -12,18 +13,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.from_runs import calibrate
+from icrtool.calibration.pooled import gyro_recording_of, predictor, recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
 from icrtool.motion.trials import Trials
 from icrtool.output.dropout_directory import report_document
+from icrtool.output.json_file import json_bytes
 from icrtool.output.page import drive_data
+from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
 from icrtool.records.run import Run, drive_of
+from icrtool.records.samples import GyroSamples
+from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.browser import Browser, Page, browser, chromium
 
@@ -200,6 +206,37 @@ def test_paths_of_joined_samples_are_close_to_those_of_the_library(
             assert errors["icr"][h] == pytest.approx(error, abs=0.01 + 0.02 * error), (start, h)
 
 
+def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_library_do(
+    chrome: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = simulate()
+    turned = np.append(np.diff(np.unwrap(log.heading.heading_rad)), 0.0)
+    stamps = log.heading.stamp_ns
+    smooth = np.convolve(turned / np.append(np.diff(stamps), 1e9) * 1e9, np.ones(25) / 25, "same")
+    run = fit(replace(log, gyro=GyroSamples(LogText("/imu/data"), stamps, smooth)), configured())
+    calibration = calibrate(run)
+    report = dropout_report(run, horizons_m=LENGTHS_M, calibrations=[calibration])
+    names = {"calibration": False, "calibration_gyro": True}
+    assert {one.name: one.with_gyro for one in report.calibrations} == names
+    # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
+    monkeypatch.setattr(drive_data, "MOST_STEPS", 4000)
+    document = json.loads(json_bytes(report_document(report)))
+    file = tmp_path / "calibrations.html"
+    file.write_text(run_page(run, document, {}), encoding="utf-8")
+    page = chrome.page()
+    page.open(file)
+    assert page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)") == [3] * 4
+    ends = trial_ends(drive_of(run), np.array(LENGTHS_M))
+    starts = np.flatnonzero((ends >= 0).all(axis=1))[::300]
+    for name, with_gyro in names.items():
+        expected = predictor(calibration, gyro_recording_of(run), with_gyro=with_gyro)(Trials(starts, ends[starts]))
+        for start, errors in zip(starts.tolist(), expected.tolist(), strict=True):
+            found = page.evaluate(f"icrtoolPage.openLoop({start}).models.find((one) => one.name === '{name}').errors")
+            # Between its points a path is straight, and its heading at a start is known to some 0.0002 rad.
+            assert found == pytest.approx(errors, abs=0.01), (name, start)
+    assert page.complaints() == []
+
+
 @pytest.mark.parametrize("scale", [0.0, 3.7e-4, 0.0954, 0.3, 1.0, 13.0, 950.0])
 def test_the_chart_of_errors_takes_numbers_of_any_size(chrome: Browser, file: Path, scale: float) -> None:
     page = chrome.page()
@@ -264,9 +301,10 @@ def test_print_shows_pictures_in_place_of_what_is_interactive(chrome: Browser, f
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not there: make axe")
 def test_a_checker_of_accessibility_finds_no_error(chrome: Browser, file: Path, tmp_path: Path, *, dark: bool) -> None:
-    fleet = tmp_path / "fleet.html"
+    fleet, comparison = tmp_path / "fleet.html", tmp_path / "comparison.html"
     fleet.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
-    for one in (file, fleet):
+    comparison.write_text(comparison_page(COMPARISON, "c"), encoding="utf-8")
+    for one in (file, fleet, comparison):
         page = chrome.page(dark=dark)
         page.open(one)
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
@@ -293,6 +331,47 @@ FLEET = {
         {**LOG, "log": HOSTILE, "run": "../../etc", "status": "failed", "reason": "no heading", "multiplier": None},
     ],
 }
+
+
+CHANGE = {"p95_m": 0.1, "p95_low_m": None, "p95_high_m": None, "expected_m": 0.05, "expected_low_m": -0.1,
+          "expected_high_m": 0.2}  # fmt: skip
+NAMES = ("grass", HOSTILE)
+COMPARISON = {
+    "schema": "icrtool/compare/1",
+    "groups": {name: {"model": "icr", "logs": [{"name": name, "distance_m": 90.0}]} for name in NAMES},
+    "pairs": [
+        {"first": "grass", "second": HOSTILE, "verdict": f"They differ: {HOSTILE}",
+         "errors": [CHANGE | {"horizon_m": 10.0}],
+         "parameters": [{"quantity": "y_icr_right_m", "first": 0.8, "second": -0.9, "difference": -1.7, "std": 0.1,
+                         "significant": True}]}
+    ],
+    "transfer": [
+        CHANGE | {"calibrated_on": one, "tested_on": other, "horizon_m": h, "p95_m": h / 20, "p95_low_m": h / 30,
+                  "p95_high_m": h / 10}
+        for one in NAMES for other in NAMES for h in (5.0, 10.0, 20.0)
+    ],
+    "costs": [CHANGE | {"calibrated_on": "grass", "tested_on": HOSTILE, "horizon_m": 10.0}],
+}  # fmt: skip
+
+
+def test_the_chart_of_a_comparison_follows_the_group_and_the_measure(chrome: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "comparison.html"
+    file.write_text(comparison_page(COMPARISON, "c"), encoding="utf-8")
+    page = chrome.page(width=360, height=780)
+    page.open(file)
+    labels = "[...document.querySelectorAll('#error-keys label')].map((one) => one.textContent.trim())"
+    assert page.evaluate(labels) == ["calibration of grass (held out)", f"calibration of {HOSTILE}"]
+    page.evaluate("document.getElementById('group').value = '1'")
+    page.evaluate("document.getElementById('group').dispatchEvent(new Event('change')), null")
+    assert page.evaluate(labels)[0] == "calibration of grass"
+    page.evaluate("document.querySelector('input[value=expected]').click()")
+    assert page.evaluate("document.querySelectorAll('#error-chart canvas').length") == 1
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    assert page.evaluate("window.hostile") is None
+    assert page.complaints() == []
+    bare = chrome.page(scripts=False)
+    bare.open(file)
+    assert bare.evaluate("document.querySelector('.picture img').getClientRects().length") == 1
 
 
 def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:

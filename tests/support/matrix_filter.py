@@ -12,8 +12,9 @@ import numpy as np
 
 from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import GATED, RECOVERED, USED, FilterOutput, FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterOutput, FilterParameters, Measurements
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, Floats
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 
 def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:

@@ -13,8 +13,8 @@ from icrtool import __version__
 from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers, export_numbers
 from icrtool.calibration.record import Calibration
 from icrtool.output.exports.twist_model import format_twist
-from icrtool.output.run_directory import json_bytes
-from icrtool.output.text_format import TABLE_WIDTH
+from icrtool.output.json_file import json_bytes
+from icrtool.output.text_blocks import TEXT_WIDTH
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
 TARGETS: tuple[Target, ...] = get_args(Target)
@@ -127,7 +127,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
     right, left, x = numbers.icrs_m
     std_right, std_left, std_x = numbers.icr_std_m
     robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
-    distance_m = numbers.way_m
+    distance_m = numbers.distance_m
     origin = (
         f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {distance_m:.0f} m{robot}, "
         f"fitted {numbers.created[:10]}"
@@ -152,7 +152,7 @@ def _header(numbers: ExportNumbers) -> list[str]:
             f"{numbers.factor_to_old:.4f} times the old"
         )
     sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.warnings]
-    return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TABLE_WIDTH)]
+    return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TEXT_WIDTH)]
 
 
 def _diagonal(planar: tuple[float, float, float]) -> str:

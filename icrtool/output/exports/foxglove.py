@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from icrtool import __version__
 from icrtool.dropout_analysis.trials import errors_from_states
-from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.logs.writing.containers import write_mcap
 from icrtool.logs.writing.messages import (
@@ -194,10 +193,10 @@ def _whole_path(path: ExportPath, store: Typestore) -> TopicMessages:
 
 def _fixes(run: Run, rows: Ints, globe: Globe) -> tuple[TopicPlan, ...]:
     """Return the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
-    table, fixes, code = run.table, run.sensors.fixes, run.gnss.code
+    table, fixes = run.table, run.sensors.fixes
     status = np.where(fixes.fix_class == FIXED_FIX, GBAS_FIX, PLAIN_FIX).astype(np.int8)
     body = np.full(len(rows), PLAIN_FIX, np.int8)
-    used, rejected = np.flatnonzero((code != UNSEEN) & (code != GATED)), np.flatnonzero(code == GATED)
+    used, rejected = np.flatnonzero(run.gnss.used), np.flatnonzero(run.gnss.rejected)
     variances = fixes.var_east_m2, fixes.var_north_m2
     plans = [
         _fix_plan("/filter/fix", BODIES["filter"], table.stamp_ns[rows], (table.east_m[rows], table.north_m[rows]),

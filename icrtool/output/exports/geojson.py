@@ -11,7 +11,7 @@ import orjson
 from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
-from icrtool.kernels.filter_records import GATED, UNSEEN
+from icrtool.kernels.measurement_codes import GATED, UNSEEN
 from icrtool.output.exports.paths import (
     LABELS,
     ExportPath,

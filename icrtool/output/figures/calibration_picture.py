@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.errors import OutputError
 from icrtool.output.atomic_file import atomic_file, check_place
-from icrtool.output.figures.drawing_process import matplotlib_unsaid
+from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.run_directory import PLOT_FORMATS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from icrtool.calibration.forecast import Forecast
-    from icrtool.calibration.transfer import Transfer
 
 
 def check_picture(file: Path) -> None:
@@ -60,13 +59,13 @@ def write_forecast_picture(forecast: Forecast, title: str, budgets_m: tuple[floa
     save_picture(draw, file)
 
 
-def write_transfer_picture(transfer: Transfer, file: Path) -> None:
+def write_transfer_picture(document: Mapping[str, Any], file: Path) -> None:
     """Draw compared groups, as `write_picture`."""
 
     def draw() -> Figure:
         from icrtool.output.figures.transfer import draw_transfer
 
-        return draw_transfer(transfer)
+        return draw_transfer(document)
 
     save_picture(draw, file)
 
@@ -80,7 +79,7 @@ def save_picture(draw: Callable[[], Figure], file: Path) -> None:
         The file cannot be written.
     """
     form = file.suffix.removeprefix(".").lower()
-    with atomic_file(file) as partial, matplotlib_unsaid():
+    with atomic_file(file) as partial, quiet_matplotlib():
         from icrtool.output.figures.style import save, style
 
         with style():

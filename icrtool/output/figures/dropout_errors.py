@@ -39,6 +39,8 @@ LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
 """The histograms of a horizon share one scale: up to the largest p95 and a margin, but at most so many times that of
 the ICRs. The share of trials beyond it is written at its end."""
 
+MOSTLY_BEYOND_PCT = 50.0
+
 
 def draw_summary(title: str, report: DropoutReport) -> Figure:
     """Draw 95 % and expected error over the horizon, with their intervals, and real outages where there were some.
@@ -188,15 +190,14 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     axes.set_title(facts, loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
     beyond = float(bins.percent[bins.left >= end_m].sum())
-    if beyond > 0:
-        where: dict[str, Any] = {
-            "xy": (1.0, 0.9),
-            "xycoords": "axes fraction",
-            "ha": "right",
-            "va": "top",
-            "fontsize": 8.0,
-        }
-        axes.annotate(f"{beyond:.{0 if beyond >= 1 else 2}f} % beyond →", **where, bbox=LABEL_BOX)
+    where: dict[str, Any] = {"transform": axes.transAxes, "bbox": LABEL_BOX}
+    if beyond >= MOSTLY_BEYOND_PCT:
+        # Hardly a bar to see: words in their place.
+        text = f"{beyond:.0f} % of the trials lie beyond this scale →"
+        axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=9.0, **where)
+    elif beyond > 0:
+        text = f"{beyond:.{0 if beyond >= 1 else 2}f} % beyond →"
+        axes.text(1.0, 0.9, text, ha="right", va="top", fontsize=8.0, **where)
     axes.set_ylabel(f"Trials [% per {_width_text(width)}]")
     axes.grid(visible=False, axis="x")
 

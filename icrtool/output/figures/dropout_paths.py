@@ -52,11 +52,11 @@ CELLS = 1500.0
 
 
 def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
-    """Draw a cornering and a straight trial side by side: reference, ICR, no slip."""
+    """Draw a trial of about half a turn and the straightest one side by side: reference, ICR, no slip."""
     horizon = examples[0].horizon_m
     figure = new_figure(
         title,
-        f"Typical trials without GNSS over {horizon:g} m: cornering (left), straight (right)",
+        f"Trials without GNSS over {horizon:g} m: about half a turn (left), as straight as the drive has it (right)",
         width_in=WIDTH_IN,
         height_in=EXAMPLES_HEIGHT_IN,
     )

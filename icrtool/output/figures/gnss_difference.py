@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
@@ -56,8 +55,8 @@ def draw_gnss_difference(run: Run) -> Figure:
     axes = figure.subplots()
     figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
     time = TimeAxis.for_span(float(run.table.t_s[-1]))
-    t, difference, code = run.gnss.t_s / time.seconds, run.gnss.difference, run.gnss.code
-    used, gated = (code > UNSEEN) & (code != GATED), code == GATED
+    t, difference = run.gnss.t_s / time.seconds, run.gnss.difference
+    used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
     if used.any():
         trusted = used & ~run.sensors.fixes.down_weighted

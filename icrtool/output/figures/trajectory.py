@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
-from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
@@ -161,13 +160,14 @@ def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    fixes, code, kind = run.sensors.fixes, run.gnss.code, run.sensors.fixes.fix_class
-    word, used = position_word(run.summary), (code > UNSEEN) & (code != GATED)
+    fixes, kind = run.sensors.fixes, run.sensors.fixes.fix_class
+    word, used = position_word(run.summary), run.gnss.used
     several = len(np.unique(kind)) > 1
     for value, look in FIX_LOOKS.items():
         label = f"{word}, {CLASSES[value]}" if several else word
         _draw_places(axes, fixes, used & (kind == value), (lowest, highest, cell_m), {**look, "label": label})
-    _draw_places(axes, fixes, code == GATED, (lowest, highest, cell_m), {**REJECTED_LOOK, "label": f"{word}, rejected"})
+    rejected = {**REJECTED_LOOK, "label": f"{word}, rejected"}
+    _draw_places(axes, fixes, run.gnss.rejected, (lowest, highest, cell_m), rejected)
 
 
 def _draw_places(

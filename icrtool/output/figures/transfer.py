@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.calibration.transfer import HORIZONS_M, Transfer
 from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, inches, new_figure
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -17,22 +17,25 @@ if TYPE_CHECKING:
 LONGEST_NAME = 14
 
 
-def draw_transfer(transfer: Transfer) -> Figure:
-    """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals."""
-    names = list(transfer.calibrations)
+def draw_transfer(document: Mapping[str, Any]) -> Figure:
+    """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals.
+
+    Parameters
+    ----------
+    document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
+    """
+    names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
     subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
-    figure = new_figure(
-        " · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(transfer.costs)
-    )
+    figure = new_figure(" · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows))
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
     figure.subplots_adjust(wspace=0.75, **inches(figure, left=1.3, right=0.2, top=1.0, bottom=0.65))
-    _draw_matrix(matrix, transfer, names)
-    rows = [one for one in transfer.costs if np.isfinite(one.p95_m)]
+    _draw_matrix(matrix, document, names)
     labels = []
     for y, one in enumerate(rows):
-        labels.append(f"{_short(one.calibrated_on)} on {_short(one.tested_on)}, {one.horizon_m:g} m")
-        costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **ICR.keywords() | {"linestyle": "-"})
-        costs.plot([one.p95_m], [y], "o", color=ICR.color, markersize=4)
+        labels.append(f"{_short(one['calibrated_on'])} on {_short(one['tested_on'])}, {one['horizon_m']:g} m")
+        if _known(one["p95_low_m"]):
+            costs.plot([one["p95_low_m"], one["p95_high_m"]], [y, y], **ICR.keywords() | {"linestyle": "-"})
+        costs.plot([one["p95_m"]], [y], "o", color=ICR.color, markersize=4)
     costs.axvline(0.0, **HALF_WIDTH.keywords())
     costs.set_yticks(range(len(rows)), labels, fontsize=7.5, parse_math=False)
     costs.invert_yaxis()
@@ -40,19 +43,26 @@ def draw_transfer(transfer: Transfer) -> Figure:
     return figure
 
 
-def _draw_matrix(axes: Axes, transfer: Transfer, names: list[str]) -> None:
-    horizon = CHOICE_HORIZON_M if CHOICE_HORIZON_M in HORIZONS_M else HORIZONS_M[-1]
-    values = np.array([[transfer.cell(row, column, horizon).p95_m for column in names] for row in names])
-    axes.imshow(values, cmap="Blues", vmin=0.0, vmax=1.6 * float(np.nanmax(values)))
+def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> None:
+    values = np.full((len(names), len(names)), np.nan)
+    for cell in document["transfer"]:
+        if cell["horizon_m"] == CHOICE_HORIZON_M and cell["p95_m"] is not None:
+            values[names.index(cell["calibrated_on"]), names.index(cell["tested_on"])] = cell["p95_m"]
+    most = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
+    axes.imshow(values, cmap="Blues", vmin=0.0, vmax=1.6 * most)
     for row, column in np.ndindex(values.shape):
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
     short = [_short(name) for name in names]
     axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False)
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
-    axes.set_xlabel(f"tested on, after {horizon:g} m")
+    axes.set_xlabel(f"tested on, after {CHOICE_HORIZON_M:g} m")
     axes.set_ylabel("calibrated on")
     axes.grid(visible=False)
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and bool(np.isfinite(value))
 
 
 def _short(name: str) -> str:

@@ -13,11 +13,11 @@ from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import metres_text, reach_text
 from icrtool.output.text_format import signed
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+from icrtool.records.run import ICR_WORDS
 
 Grade = Literal["good", "care", "bad", "fact"]
 
-NAMES = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
-
+IN_SAMPLE = {"icr_final": "ICR, final (fitted to the same drive)"}
 
 SMALLEST_SHOWN = 0.0005
 """A standard deviation below this would be printed as zero."""
@@ -125,7 +125,7 @@ def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
     for budget_m in dict.fromkeys(one.budget_m for one in known):
         mine = [one for one in known if one.budget_m == budget_m]
         best = next((one for one in mine if one.model == "recommended"), mine[0])
-        others = tuple((one.label, reach_text(one)) for one in mine if one is not best)
+        others = tuple((IN_SAMPLE.get(one.model, one.label), reach_text(one)) for one in mine if one is not best)
         found.append(Reach(budget_m, best.label, reach_text(best), interval_text(best), others))
     return tuple(found)
 
@@ -164,7 +164,7 @@ def _icrs(icr: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     final, std = icr["final"], icr["final_std"]
     return tuple(
         (name, f"{signed(final[column])} ± {std[column]:.3f}" if final[column] is not None else "not shown")
-        for column, name in NAMES.items()
+        for column, name in ICR_WORDS.items()
     )
 
 
@@ -186,7 +186,7 @@ def _checks(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check
 
 def _excitation(summary: Mapping[str, Any]) -> Check:
     shown = summary["excitation"]
-    weak = [f"{NAMES[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
+    weak = [f"{ICR_WORDS[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
     turned = f"it turned {shown['turned_right_deg']:,.0f}° right and {shown['turned_left_deg']:,.0f}° left"
     if weak:
         return Check(
@@ -210,7 +210,8 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
     if events:
         kinds = [one["kind"] for one in events]
         each = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-        found.append(Check("care", f"{_count(len(events), 'slip event')} ({each}); the ICRs are not learned there."))
+        what = "the ICRs are not learned there" + ("" if report["without_events"] else ", but trials across them count")
+        found.append(Check("care", f"{_count(len(events), 'slip event')} ({each}): {what}."))
     real = [one for one in report["outages"] if one["kind"] == "real"]
     if real:
         worst = max(real, key=lambda one: one["end_error_m"] or 0.0)

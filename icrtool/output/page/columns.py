@@ -12,7 +12,7 @@ from icrtool.records.tables import Bools, Bytes, Floats, Ints
 _TYPES = {"f32": "<f4", "f64": "<f8", "i32": "<i4", "u8": "u1"}
 
 LARGEST_STEP = 32_000
-"""Units of the largest step: what 16 bits hold, with room for rounding."""
+"""Units of the largest step: what 16 bits hold, with a margin for rounding."""
 
 SMALLEST_UNIT = 1e-7
 """Metres or radians: finer steps mean nothing."""

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from icrtool.output.json_file import schema_of
+from icrtool.output.page.drive_data import ERROR_KEYS
+from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render
 from icrtool.records.dropout import CHOICE_HORIZON_M
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCRIPTS = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js", "columns.js", "charts.js", "comparison.js")
+
+CELL_KEYS = {**ERROR_KEYS, "expected": "expected_m", "expected_low": "expected_low_m",
+             "expected_high": "expected_high_m"}  # fmt: skip
 
 COMPARISON_FAMILY = "icrtool/compare/"
 
@@ -20,23 +30,39 @@ def comparison_page(document: Mapping[str, Any], title: str) -> str:
     ----------
     document : what `icrtool compare` writes as JSON
     """
-    at_choice = (one for one in document["transfer"] if one["horizon_m"] == CHOICE_HORIZON_M)
+    names, cells = list(document["groups"]), document["transfer"]
+    at_choice = {(one["calibrated_on"], one["tested_on"]): one for one in cells if one["horizon_m"] == CHOICE_HORIZON_M}
+    drawn = drawn_pictures({"transfer": lambda: _figure(document)})["transfer"]
     return render(
-        "comparison.html", (), None, title=title, groups=document["groups"], pairs=document["pairs"],
-        names=list(document["groups"]), cells={(one["calibrated_on"], one["tested_on"]): one for one in at_choice},
-        horizon_m=CHOICE_HORIZON_M,
+        "comparison.html", SCRIPTS, {"by_group": [_errors(cells, names, name) for name in names]}, title=title,
+        groups=document["groups"], pairs=document["pairs"], names=names, cells=at_choice, horizon_m=CHOICE_HORIZON_M,
+        drawn=drawn,
     )  # fmt: skip
+
+
+def _figure(document: Mapping[str, Any]) -> Figure:
+    from icrtool.output.figures.transfer import draw_transfer
+
+    return draw_transfer(document)
+
+
+def _errors(cells: Sequence[Mapping[str, Any]], names: Sequence[str], tested_on: str) -> dict[str, Any]:
+    """Return the errors in the runs of one group over distance, by the group of the calibration."""
+    mine = [one for one in cells if one["tested_on"] == tested_on]
+    horizons = sorted({one["horizon_m"] for one in mine})
+    rows = {(one["calibrated_on"], one["horizon_m"]): one for one in mine}
+    return {
+        "horizons_m": horizons,
+        "models": [
+            {"name": f"of {name}", "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}"}
+            | {key: [rows.get((name, h), {}).get(column) for h in horizons] for key, column in CELL_KEYS.items()}
+            for name in names
+        ],
+        "reference": {"p95": [], "expected": []},
+    }
 
 
 def comparison_in(place: Path) -> Path | None:
     """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
     files = sorted(place.glob("*.json")) if place.is_dir() else [place]
-    return next((file for file in files if (schema_of(file) or "").startswith(COMPARISON_FAMILY)), None)
-
-
-def schema_of(file: Path) -> str | None:
-    """Return the schema that a JSON file states; None where it states none."""
-    try:
-        return str(json.loads(file.read_bytes())["schema"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+    return next((file for file in files if schema_of(file).startswith(COMPARISON_FAMILY)), None)

@@ -6,25 +6,24 @@ open-loop path that the page integrates ends where the library's does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import recorded_rates, recording_of
+from icrtool.calibration.pooled import calibrated_path, gyro_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
-from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.motion.trials import wheels_path
+from icrtool.motion.recording import Recording
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
 from icrtool.records.tables import Bools, Ints
 
 MOST_STEPS = 150_000
-"""Wheel samples of a page; of more, equally many are joined to one."""
+"""Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""
 
 SERIES_POINTS = 16_000
 """Rows of the time series: some ten per pixel column, so that a stretch of a tenth still has its extremes."""
@@ -142,8 +141,8 @@ def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
-    fixes, code = run.sensors.fixes, run.gnss.code
-    groups = {"used": (code > UNSEEN) & (code != GATED), "rejected": code == GATED}
+    fixes = run.sensors.fixes
+    groups = {"used": run.gnss.used, "rejected": run.gnss.rejected}
     found = {}
     for name, chosen in groups.items():
         difference = run.gnss.difference[chosen]
@@ -160,7 +159,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     heading = run.heading
-    used = np.flatnonzero((heading.code > UNSEEN) & (heading.code != GATED))
+    used = np.flatnonzero(heading.used)
     rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
     return {
         "t": packed(heading.t_s[rows], "f64"),
@@ -192,22 +191,43 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
     models: list[dict[str, Any]] = [
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
-    if report["recommended"] is not None and "recommended" in labels:
-        calibration = calibration_of({**report["recommended"], "created": ""})
-        if (path := _calibrated_path(run, calibration, steps)) is not None:
-            models.insert(0, {"name": "recommended", "label": labels["recommended"], "path": path})
+    calibrated = list(_calibrated(report, labels))
+    recording = gyro_recording_of(run) if calibrated else None
+    every = max(-(-len(calibrated) * len(steps.rows) // MOST_STEPS), 1)
+    for name, label, calibration, with_gyro in calibrated:
+        if recording is not None and (path := _path(recording, calibration, steps, every, with_gyro)) is not None:
+            models.insert(0 if name == "recommended" else len(models), {"name": name, "label": label, "path": path})
     return models
 
 
-def _calibrated_path(run: Run, calibration: Calibration, steps: Steps) -> dict[str, Any] | None:
-    recording = recording_of(run)
+def _calibrated(report: Mapping[str, Any], labels: Mapping[str, str]) -> Iterator[tuple[str, str, Calibration, bool]]:
+    """Yield name, label and calibration of each model of constant parameters, and whether it uses the gyro."""
+    if (own := report["recommended"]) is not None and (label := labels.get("recommended")):
+        calibration = calibration_of({**own, "created": ""})
+        yield "recommended", label, calibration, False
+        if calibration.gyro is not None:
+            yield "recommended_gyro", f"{label} + gyro", calibration, True
+    for one in report["calibrations"]:
+        if one.get("calibration"):
+            yield one["name"], one["label"], calibration_of(one["calibration"]), one["with_gyro"]
+
+
+def _path(
+    recording: Recording, calibration: Calibration, steps: Steps, every: int, with_gyro: bool
+) -> dict[str, Any] | None:
+    """Return the path of a calibration through the whole drive: one of `every` steps, and the last one."""
+    if with_gyro and recording.gyro_radps is None:
+        return None
     try:
-        place, heading = wheels_path(recording, *recorded_rates(calibration, recording))
+        heading, place = calibrated_path(calibration, recording, with_gyro=with_gyro)(recording.t_s)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None
+    rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
     columns = {"forward": place.real, "right": place.imag, "turn": heading}
-    return {name: packed_sums(column[steps.rows]) for name, column in columns.items()}
+    return {"every": every, "first_turn": float(heading[0])} | {
+        name: packed_sums(column[rows]) for name, column in columns.items()
+    }
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

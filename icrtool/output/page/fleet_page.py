@@ -7,12 +7,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render, write_html
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.tables.dropout import metres_text
 from icrtool.output.text_format import distance_text, duration_text
 
 FLEET_FILE = "fleet.json"
+PLOTS = "plots"
 
 FLEET_FAMILY = "icrtool/fleet/"
 
@@ -63,6 +65,7 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
         counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
         statuses=sorted({one.status for one in lines}), groups=sorted({one.group for one in lines} - {""}),
         robots=sorted({one.robot for one in lines} - {""}), horizon_m=HORIZON_M,
+        pictures=list(pictures_in(folder / PLOTS).values()),
     )  # fmt: skip
 
 
@@ -88,7 +91,7 @@ def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _columns(budgets: Sequence[str]) -> list[str]:
     within = [f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for" for name in budgets]
-    errors = [f"95 % after {HORIZON_M:g} m, {label}" for label in MODELS.values()]
+    errors = [f"error, {label}" for label in MODELS.values()]
     found = ["multiplier", "ICR y right", "ICR y left", "ICR x", "distance", "duration", "start"]
     return [*within, *errors, *found, "events", "warnings", "gates failed"]
 
@@ -123,7 +126,8 @@ def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
     if value is None:
         return Cell("", None)
-    return Cell(f"{value:{sign}.3f}" + (f" ± {std:.3f}" if std is not None else ""), value)
+    text = f"{value:{sign}.3f}".replace("-", "−")
+    return Cell(text + (f" ± {std:.3f}" if std is not None else ""), value)
 
 
 def _link(run: str, folder: Path) -> str:

@@ -20,6 +20,7 @@ from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a page raises for a JSON document that was edited."""
@@ -79,6 +80,9 @@ def _environment() -> Environment:
         "distance": text_format.distance_text,
         "duration": text_format.duration_text,
         "signed": text_format.signed,
+        "breakable": _breakable,
+        "minus": _minus,
+        "turn": _turn,
     }
     return environment
 
@@ -102,6 +106,24 @@ def write_html(page: str, path: Path) -> None:
 
 def _metres(value: float | None) -> str:
     return "–" if value is None else metres_text(value)
+
+
+def _breakable(name: str) -> Markup:
+    """Return a name that may be broken behind its underscores, on a narrow screen."""
+    from markupsafe import Markup, escape
+
+    return Markup("_<wbr>").join(escape(part) for part in escaped(name).split("_"))
+
+
+def _minus(value: float, digits: int, sign: str = "") -> str:
+    """Return a number as print has it: a minus, not a hyphen, and no sign before zero."""
+    return f"{round(value, digits) + 0.0:{sign}.{digits}f}".replace("-", "−")
+
+
+def _turn(trial: Mapping[str, Any]) -> str:
+    """Return the turn of a trial, as ``96° left``."""
+    degrees = trial["heading_change_deg"]
+    return f"{abs(degrees):.0f}° {'right' if degrees > 0 else 'left'}"
 
 
 def _static(name: str) -> str:

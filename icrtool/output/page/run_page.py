@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,16 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
-from icrtool.output.figures.drawing_process import matplotlib_unsaid
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
-from icrtool.output.page.pictures import WITH_PLACE, Picture, pictures_in, pictures_of
+from icrtool.output.page.pictures import WITH_PLACE, Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render, write_html
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
 from icrtool.output.text_format import duration_text, length_text, position_word
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.samples import ROLE_WORDS
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -82,6 +83,7 @@ def run_page(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
         title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
         pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
+        warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]], streams=_streams(summary),
         begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
         coordinates=coordinates, samples=len(run.table),
@@ -118,19 +120,9 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
 
 def draw_pictures(run: Run) -> dict[str, Picture]:
     """Draw the pictures of a run anew, into memory."""
-    from io import BytesIO
-
     from icrtool.output.figures.run_figures import FIGURES
-    from icrtool.output.figures.style import style
 
-    found = []
-    with matplotlib_unsaid():
-        for name, draw in FIGURES.items():
-            with style():
-                image = BytesIO()
-                draw(run).savefig(image, format="png")
-                found.append((name, image.getvalue()))
-    return pictures_of(found)
+    return drawn_pictures({name: partial(draw, run) for name, draw in FIGURES.items()})
 
 
 def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Picture]:
@@ -143,6 +135,12 @@ def _utc(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
+def _streams(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the streams, with the role of the positions as they are called."""
+    metric = summary["gnss"]["datum"] is None
+    return [{**one, "role": ROLE_WORDS[one["role"]] if metric else one["role"]} for one in summary["streams"]]
+
+
 def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
     horizons = [row["horizon_m"] for row in report["trials"]]
@@ -150,7 +148,7 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     shown = sorted({int(np.argmin(np.abs(distances - metres))) for metres in SHOWN_HORIZONS_M}) if horizons else []
     models = sorted(report["models"], key=lambda one: one["name"] != "recommended")
     return {
-        "horizons_m": [horizons[h] for h in shown],
+        "heads": _heads([horizons[h] for h in shown]),
         "trials": [report["trials"][h]["trials"] for h in shown],
         "why_none": [report["trials"][h]["why_none"] for h in shown],
         "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in models],
@@ -159,7 +157,7 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the worst trials, each with what the position reference did meanwhile."""
+    """Return the worst trials, each with what happened meanwhile: jumps of the position, outages, slip."""
     found = []
     for one in report["worst"]:
         speed = one["speed_mean_mps"]
@@ -169,8 +167,10 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
             jump["size_m"] for jump in summary["gnss"]["jump_list"] if one["stamp_ns"] <= jump["stamp_ns"] <= end_ns
         ]
         lost = [out for out in report["outages"] if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
-        notes = [f"jumps by {length_text(max(sizes))}"] if sizes else []
+        slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
+        notes = [f"the position jumps by {length_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
+        notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
         found.append({**one, "note": ", ".join(notes)})
     return found
 
@@ -184,7 +184,11 @@ def _ladder_rows(ladder: Mapping[str, Any]) -> dict[str, Any]:
         min((one["p95_m"][h] for one in held_out if one["p95_m"][h] is not None), default=None)
         for h in range(len(ladder["horizons_m"]))
     ]
-    return {**ladder, "best": best, "left_out": ""}
+    return {**ladder, "heads": _heads(ladder["horizons_m"]), "best": best, "left_out": ""}
+
+
+def _heads(horizons_m: Sequence[float]) -> list[str]:
+    return [f"after {metres:g} m" for metres in horizons_m]
 
 
 def _config_lines(config: Mapping[str, Any]) -> Sequence[str]:

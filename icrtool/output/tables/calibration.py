@@ -5,28 +5,29 @@ from __future__ import annotations
 import math
 
 from icrtool.calibration.one_log import LogCalibration, Parameter
+from icrtool.output.text_blocks import Block, Line, Table, Text, labelled
 
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
 
-def format_calibration(calibration: LogCalibration) -> str:
+def format_calibration(calibration: LogCalibration) -> Text:
     """Return the table of a calibration, no line end."""
     facts = calibration.facts
     right, left = math.degrees(facts.turned_right_rad), math.degrees(facts.turned_left_rad)
     speed = f"{facts.speed_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
-    lines = [
-        calibration.name,
-        "",
-        f"drive       {facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left",
-        f"compared    {calibration.windows} windows of driven distance, {calibration.stretches} independent stretches",
-        "",
-        f"{'parameter':<36}{'value ± std':<24}verdict",
+    head = [
+        ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
+        (
+            "compared",
+            f"{calibration.windows} windows of driven distance, {calibration.stretches} independent stretches",
+        ),
     ]
-    for one in calibration.parameters:
-        note = f": {one.note}" if one.note else ""
-        lines.append(f"{one.label:<36}{value_text(one):<24}{one.verdict}{note}")
-    lines += ["", *_setting_lines(calibration)]
-    return "\n".join(lines)
+    rows = [
+        (one.label, value_text(one), one.verdict + (f": {one.note}" if one.note else ""))
+        for one in calibration.parameters
+    ]
+    blocks: list[Block] = [Line(calibration.name, "title"), "", *labelled(head), ""]
+    return Text([*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), "", *_settings(calibration)])
 
 
 def value_text(one: Parameter) -> str:
@@ -39,20 +40,18 @@ def value_text(one: Parameter) -> str:
     return f"{number}{spread} {unit}".rstrip()
 
 
-def _setting_lines(calibration: LogCalibration) -> list[str]:
+def _settings(calibration: LogCalibration) -> list[Block]:
     if not calibration.settings:
-        if any(one.verdict == "shown" for one in calibration.parameters):
-            return ["nothing to configure: the drive confirms the configuration"]
-        return ["nothing to configure: the drive showed nothing well enough"]
-    lines = ["to configure, as options:"]
-    lines.append("  " + " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings))
-    lines.append("or in a file for --config:")
+        shown = any(one.verdict == "shown" for one in calibration.parameters)
+        why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
+        return [f"nothing to configure: {why}"]
+    options = " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings)
     sections: dict[str, list[str]] = {}
     for setting in calibration.settings:
         section, _, key = setting.key.partition(".")
         why = f"  # {setting.why}" if setting.why else ""
         # a TOML float keeps its point
         sections.setdefault(section, []).append(f"  {key} = {float(f'{setting.value:g}')!r}{why}")
-    for section, keys in sections.items():
-        lines += [f"  [{section}]", *keys]
-    return lines
+    lines = [line for section, keys in sections.items() for line in (f"  [{section}]", *keys)]
+    head = ("to configure, as options:", f"  {options}", "or in a file for --config:")
+    return [Line("\n".join([*head, *lines]), "as is")]

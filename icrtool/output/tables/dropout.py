@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from textwrap import wrap
 
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.tables.model_comparison import format_comparison
+from icrtool.output.tables.model_comparison import comparison_blocks
+from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
-    TABLE_WIDTH,
     controller_text,
     distance_text,
     duration_text,
@@ -21,10 +20,8 @@ from icrtool.output.text_format import (
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
 
-LABEL = 26
-MODEL = 15
-"""Columns of the left margin; of them, for a model's name."""
-CELL = 18
+MODEL = 21
+"""Characters of a model's name that are printed."""
 
 LISTED_HORIZONS = 4
 """More horizons than this without a trial are printed as a range."""
@@ -39,37 +36,37 @@ NEAR_HORIZONS_M = 1.5
 """Between horizons that are further apart an interpolated distance is marked as one."""
 
 
-def format_dropout(report: DropoutReport) -> str:
+Rows = list[list[str]]
+
+
+def format_dropout(report: DropoutReport) -> Text:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
     drive = report.run_summary["drive"]
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
-    lines = [
+    rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
+    head = ("distance without GNSS", "", *_horizon_texts(report))
+    blocks: list[Block] = [
         *unusable_lines(report.run_summary),
-        run_title(report.run_summary),
+        Line(run_title(report.run_summary), "title"),
         f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}",
         "",
     ]
     if sentences := headline(report):
-        lines += [*wrap(" ".join(sentences), TABLE_WIDTH), ""]
-    lines += _error_lines(report)
-    lines += [*_calibration_lines(report), *_reference_lines(report), *_learned_lines(report)]
-    lines += ["", *_count_lines(report)]
-    lines += [_turning_line(one) for one in report.by_turning]
-    lines += [
-        "",
-        *(part for line in budget_lines(report.budgets) for part in wrap(line, TABLE_WIDTH, subsequent_indent="  ")),
-    ]
+        blocks += [" ".join(sentences), ""]
+    blocks += [Table("llr", rows, head), "", *_calibration_lines(report), *_reference_lines(report)]
+    blocks += [*_learned_blocks(report), *_count_lines(report), *map(_turning_line, report.by_turning)]
+    blocks += ["", *budget_lines(report.budgets)]
     if report.comparison is not None:
-        lines += ["", *format_comparison(report.comparison).splitlines()]
+        blocks += ["", *comparison_blocks(report.comparison)]
     elif report.no_comparison:
-        lines += ["", f"models on distance they were not fitted to: left out: {report.no_comparison}"]
+        blocks += ["", f"models on distance they were not fitted to: left out: {report.no_comparison}"]
     if report.outages:
-        lines += ["", *_outage_lines(report.outages, report)]
+        blocks += ["", _outage_table(report.outages, report)]
     if report.verdicts:
-        lines += ["", *(verdict.line() for verdict in report.verdicts)]
-    return "\n".join(line.rstrip() for line in lines)
+        blocks += ["", *(Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts)]
+    return Text(blocks)
 
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
@@ -154,37 +151,34 @@ def reach_text(one: BudgetDistance) -> str:
     return f"{one.distance_m:.1f} m{far}"
 
 
-def _error_lines(report: DropoutReport) -> list[str]:
-    shown = shown_horizons(report)
-    lines = [_row("distance without GNSS", [f"{report.horizons_m[h]:g} m" for h in shown])]
-    # what is recommended first; the paper's models follow
+def _horizon_texts(report: DropoutReport) -> list[str]:
+    return [f"{report.horizons_m[h]:g} m" for h in shown_horizons(report)]
+
+
+def _error_rows(report: DropoutReport) -> Rows:
+    """Return 95 %, its interval and the expected error of each model, what is recommended first."""
+    shown, rows = shown_horizons(report), []
     for result in sorted(report.results, key=lambda one: one.name != "recommended"):
         summary, intervals = result.summary, result.intervals
-        lines.append(
-            _row(
-                f"{_short(result.label):<{MODEL}} 95 %", [_error_text(float(summary.p95[h]), report, h) for h in shown]
-            )
-        )
-        spans = [_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown]
-        lines.append(_row(f"{'':<{MODEL}}  interval", spans))
-        lines.append(
-            _row(f"{'':<{MODEL}} expected", [_error_text(float(summary.expected[h]), report, h) for h in shown])
-        )
+        label = result.label if len(result.label) <= MODEL else f"{result.label[: MODEL - 1]}…"
+        spans = (_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown)
+        rows += [
+            [label, "95 %", *(_error_text(float(summary.p95[h]), report, h) for h in shown)],
+            ["", "interval", *spans],
+            ["", "expected", *(_error_text(float(summary.expected[h]), report, h) for h in shown)],
+        ]
+    return rows
+
+
+def _ratio_rows(report: DropoutReport) -> Rows:
     icr, no_slip = report.result("icr"), report.result("no_slip")
-    if icr is not None and no_slip is not None:
-        lines += _ratio_lines(icr, no_slip, shown)
-    else:
-        lines.append("no slip is left out: robot.track_width_m is not known")
-    return lines
-
-
-def _ratio_lines(icr: ModelResult, no_slip: ModelResult, shown: Sequence[int]) -> list[str]:
-    lines = []
-    for label, column in (("95 %", "p95"), ("expected", "expected")):
-        pairs = [(float(getattr(no_slip.summary, column)[h]), float(getattr(icr.summary, column)[h])) for h in shown]
-        lead = "no slip : ICR" if label == "95 %" else ""
-        lines.append(_row(f"{lead:<{MODEL}} {label}", [ratio_text(*pair) for pair in pairs]))
-    return lines
+    if icr is None or no_slip is None:
+        return []
+    rows = []
+    for lead, label, column in (("no slip : ICR", "95 %", "p95"), ("", "expected", "expected")):
+        ours, theirs = getattr(icr.summary, column), getattr(no_slip.summary, column)
+        rows.append([lead, label, *(ratio_text(float(theirs[h]), float(ours[h])) for h in shown_horizons(report))])
+    return rows
 
 
 def _turning_line(split: TurningSplit) -> str:
@@ -194,19 +188,24 @@ def _turning_line(split: TurningSplit) -> str:
     return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
 
 
-def _count_lines(report: DropoutReport) -> list[str]:
-    shown, counts = shown_horizons(report), report.counts
-    lines = [_row("trials", [f"{int(counts.trials[h]):,}" for h in shown])]
-    cost = report.event_cost
-    for label, column in (
+def _count_rows(report: DropoutReport) -> Rows:
+    """Return the number of trials, and why other starts are none."""
+    shown, counts, cost = shown_horizons(report), report.counts, report.event_cost
+    reasons = (
         ("not counted: log ends", counts.short),
         ("  across a slip event", cost.trials if cost is not None else np.zeros_like(counts.short)),
         ("  across a wheel gap", counts.gap),
         ("  ends in GNSS outage", counts.outage),
         ("  from standstill", counts.standing),
-    ):
-        if column[shown].any():
-            lines.append(_row(label, [f"{int(column[h]):,}" for h in shown]))
+    )
+    named = [("trials", counts.trials), *((label, column) for label, column in reasons if column[shown].any())]
+    return [[label, "", *(f"{int(column[h]):,}" for h in shown)] for label, column in named]
+
+
+def _count_lines(report: DropoutReport) -> list[str]:
+    lines = []
+    if report.result("no_slip") is None:
+        lines.append("no slip is left out: robot.track_width_m is not known")
     if report.standing > NOTED_STANDING * report.states:
         share = 100 * report.standing / report.states
         counted = "each standstill is one start" if report.starts == "moving" else "each is a start (--starts all)"
@@ -234,7 +233,7 @@ def _event_lines(report: DropoutReport) -> list[str]:
         )
     ]  # fmt: skip
     text = f"{number} left out: ICR after {report.horizons_m[h]:g} m {', '.join(errors)}"
-    return wrap(f"{text} ({int(cost.trials[h]):,} trials cross one)", TABLE_WIDTH, subsequent_indent="  ")
+    return [f"{text} ({int(cost.trials[h]):,} trials cross one)"]
 
 
 def why_no_trial(report: DropoutReport, h: int) -> str | None:
@@ -264,30 +263,32 @@ def _empty_lines(report: DropoutReport) -> list[str]:
     lines = []
     for why, lengths in horizons.items():
         span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
-        lines += wrap(f"no trial of {span} m: {why}", TABLE_WIDTH, subsequent_indent="  ")
+        lines.append(f"no trial of {span} m: {why}")
     return lines
+
+
+def _reference_rows(report: DropoutReport) -> Rows:
+    own, shown = report.reference_error, shown_horizons(report)
+    if own is None or not np.isfinite(own.p95).any():
+        return []
+    return [
+        [lead, label, *(_error_text(float(values[h]), report, h) for h in shown)]
+        for lead, label, values in (("reference alone", "95 %", own.p95), ("", "expected", own.expected))
+    ]
 
 
 def _reference_lines(report: DropoutReport) -> list[str]:
-    """Return the rows of the reference's own error, and how much of the momentary ICRs' error it can be."""
+    """Return how much of the momentary ICRs' error can be the reference's own."""
     own, icr = report.reference_error, report.result("icr")
-    if own is None or not np.isfinite(own.p95).any():
+    if own is None or icr is None or not np.isfinite(own.p95).any():
         return []
-    shown = shown_horizons(report)
-    lines = [
-        _row(f"{'reference alone':<{MODEL}} {label}", [_error_text(float(values[h]), report, h) for h in shown])
-        for label, values in (("95 %", own.p95), ("expected", own.expected))
-    ]
     h = int(np.argmin(np.where(np.isfinite(own.p95), np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
-    if icr is not None:
-        lines.append(
-            f"of the {metres_text(float(icr.summary.p95[h]))} of the momentary ICRs (95 %, "
-            f"{report.horizons_m[h]:g} m) up to {metres_text(float(own.p95[h]))} can be the reference's own error"
-        )
-    return lines
+    whole, part = metres_text(float(icr.summary.p95[h])), metres_text(float(own.p95[h]))
+    what = f"the {whole} of the momentary ICRs (95 %, {report.horizons_m[h]:g} m)"
+    return [f"of {what} up to {part} can be the reference's own error"]
 
 
-def _learned_lines(report: DropoutReport) -> list[str]:
+def _learned_blocks(report: DropoutReport) -> list[Block]:
     """Return the errors of the momentary ICRs before and after the ICRs were first learned."""
     split, shown = report.by_learning, shown_horizons(report)
     if split is None:
@@ -297,38 +298,27 @@ def _learned_lines(report: DropoutReport) -> list[str]:
     if not split.before.trials[shown].any():
         return []
     when = f"{duration_text(split.learned_s)}, {distance_text(split.distance_m)}"
-    return [
-        f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]",
-        *(
-            _row(
-                f"  {name}",
-                [f"{_bare(part.p95[h])} / {_bare(part.expected[h])}" if part.trials[h] else "-" for h in shown],
-            )
-            for name, part in (("before", split.before), ("after", split.after))
-        ),
+    rows = [
+        [name, *(f"{_bare(part.p95[h])} / {_bare(part.expected[h])}" if part.trials[h] else "-" for h in shown)]
+        for name, part in (("  before", split.before), ("  after", split.after))
     ]
+    head = f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]"
+    return [head, Table("lr", rows, ("", *_horizon_texts(report)))]
 
 
-def _outage_lines(outages: Sequence[Outage], report: DropoutReport) -> list[str]:
-    """Return a line an outage, beside it p95 of the momentary ICRs over as much distance."""
-    icr = report.result("icr")
-    heads = ("from", "length", "distance", "end error", "max error", "95 % of trials")
-    widths = (10, 10, 10, 12, 12, 18)
-    lines = [f"{'outage':<10}" + "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))]
+def _outage_table(outages: Sequence[Outage], report: DropoutReport) -> Table:
+    """Return a row an outage, in it p95 of the momentary ICRs over as much distance."""
+    icr, rows = report.result("icr"), []
     for number, one in enumerate(outages, start=1):
         usual = p95_at(icr, report, one.distance_m) if icr is not None else None
-        label = f"{number} {one.kind}"
-        lines.append(
-            f"{label:<10}{one.begin_s:>8.1f} s{one.end_s - one.begin_s:>8.1f} s{one.distance_m:>8.1f} m"
-            f"{metres_text(one.end_error_m):>12}{metres_text(one.max_error_m):>12}"
-            f"{metres_text(usual) if usual is not None else '-':>18}"
-        )
-    return lines
-
-
-def _short(label: str) -> str:
-    """Return a label that fits into its column."""
-    return label if len(label) <= MODEL else f"{label[: MODEL - 1]}…"
+        rows.append(
+            (
+                f"{number} {one.kind}", f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s",
+                f"{one.distance_m:.1f} m", metres_text(one.end_error_m), metres_text(one.max_error_m),
+                metres_text(usual) if usual is not None else "-",
+            )
+        )  # fmt: skip
+    return Table("lr", rows, ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials"))
 
 
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
@@ -343,7 +333,3 @@ def _span_text(low_m: float, high_m: float) -> str:
 
 def _bare(metres: float) -> str:
     return metres_text(float(metres)).removesuffix(" m")
-
-
-def _row(label: str, cells: Sequence[str]) -> str:
-    return f"{label:<{LABEL}}" + "".join(f"{cell:>{CELL}}" for cell in cells)

@@ -11,6 +11,7 @@ import numpy as np
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.errors import RunError
+from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text
 from icrtool.records.tables import Floats
 
@@ -90,27 +91,27 @@ def reach(forecast: Forecast, budget_m: float) -> float:
     return float(distance[k - 1] + share * (distance[k] - distance[k - 1]))
 
 
-def format_forecast(forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...]) -> str:
+def format_forecast(forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...]) -> Text:
     """Return the table of a forecast, no line end."""
     total = float(forecast.distance_m[-1])
     logs = "1 log" if len(calibration.logs) == 1 else f"{len(calibration.logs)} logs"
     model = f"{calibration.fitted.model.label} (model {calibration.recommended}) from {logs}"
-    lines = [
-        f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
-        "",
-        f"{'distance [m]':<14}{'expected [m]':>14}{'95 % [m]':>12}{'heading ± [deg]':>18}",
-    ]
-    shown = sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)})
-    for metres in shown:
+    rows = []
+    for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
         k = int(metres) - 1
         row = (forecast.expected_m[k], forecast.p95_m[k], forecast.heading_std_deg[k])
-        lines.append(f"{metres:<14g}{row[0]:>14.2f}{row[1]:>12.2f}{row[2]:>18.1f}")
-    lines.append("")
+        rows.append((f"{metres:g}", f"{row[0]:.2f}", f"{row[1]:.2f}", f"{row[2]:.1f}"))
+    blocks: list[Block] = [
+        f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
+        "",
+        Table("r", rows, ("distance [m]", "expected [m]", "95 % [m]", "heading ± [deg]")),
+        "",
+    ]
     for budget in budgets_m:
         distance = reach(forecast, budget)
         far = "all of it" if distance >= total else f"{distance:.1f} m"
-        lines.append(f"within {budget:g} m (95 %): {far}")
+        blocks.append(f"within {budget:g} m (95 %): {far}")
     if total > MEASURED_TO_M:
-        lines.append(f"errors were measured up to {MEASURED_TO_M:g} m; what is beyond is extrapolated")
-    lines += [f"not shown by the calibration's driving: {name}" for name in calibration.fitted.not_shown]
-    return "\n".join([*lines, *calibration.warnings])
+        blocks.append(f"errors were measured up to {MEASURED_TO_M:g} m; what is beyond is extrapolated")
+    blocks += [f"not shown by the calibration's driving: {name}" for name in calibration.fitted.not_shown]
+    return Text([*blocks, *calibration.warnings])

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE
 from icrtool.calibration.model_comparison import ModelComparison
-from icrtool.calibration.record import FittedModel
-from icrtool.motion.models import TypicalDrive
-from icrtool.output.text_format import FITTED, TABLE_WIDTH
+from icrtool.motion.models import FittedModel, TypicalDrive
+from icrtool.output.text_blocks import Block, Table
+from icrtool.output.text_format import FITTED
 from icrtool.records.dropout import ModelScore
 
 COMPARISON_COLUMNS = (
@@ -22,23 +21,19 @@ COMPARISON_COLUMNS = (
 )  # fmt: skip
 
 
-def format_comparison(comparison: ModelComparison) -> str:
-    """Return the table, no line end: p95 / expected error [m] by horizon, all models in the same trials."""
-    horizons = "".join(f"{f'{horizon:g} m':>16}" for horizon in comparison.horizons_m)
-    folds = f"{comparison.blocks} blocks held out in turn"
-    lines = [
-        f"models on distance they were not fitted to, {folds}: 95 % / expected error [m]",
-        f"{'model':<26}{'fitted':<16}{horizons}",
+def comparison_blocks(comparison: ModelComparison) -> list[Block]:
+    """Return the table as text: p95 / expected error [m] by horizon, all models in the same trials."""
+    rows = [
+        (score.label, FITTED[score.fitted], *map(_pair, score.summary.p95.tolist(), score.summary.expected.tolist()))
+        for score in comparison.scores
     ]
-    for score in comparison.scores:
-        cells = "".join(
-            f"{_pair(float(p95), float(expected)):>16}"
-            for p95, expected in zip(score.summary.p95, score.summary.expected, strict=True)
-        )
-        lines.append(f"{score.label:<26}{FITTED[score.fitted]:<16}{cells}")
-    lines += wrap(extended_line(comparison), TABLE_WIDTH, subsequent_indent="  ")
-    lines += comparison.notes
-    return "\n".join(line.rstrip() for line in lines)
+    folds = f"{comparison.blocks} blocks held out in turn"
+    return [
+        f"models on distance they were not fitted to, {folds}: 95 % / expected error [m]",
+        Table("llr", rows, ("model", "fitted", *(f"{horizon:g} m" for horizon in comparison.horizons_m))),
+        extended_line(comparison),
+        *comparison.notes,
+    ]
 
 
 def extended_line(comparison: ModelComparison) -> str:

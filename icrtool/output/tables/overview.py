@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import textwrap
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
@@ -11,8 +10,8 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.output.tables.run import LABEL, excitation_lines
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text
+from icrtool.output.tables.run import Row, excitation_rows
+from icrtool.output.text_format import distance_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.tables import RobotLog
 
@@ -20,7 +19,7 @@ OLDEST_DATE_NS = 946_684_800_000_000_000
 """1 January 2000: stamps before it count from the start of a computer or a simulation."""
 
 
-def overview_lines(log: RobotLog, run: Run | None) -> list[str]:
+def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     """Return date, duration, distance and extent of a log; the distance where it could be fitted."""
     stamps = [table.stamp_ns for table in (log.wheels, log.gnss, log.heading) if len(table.stamp_ns)]
     if not stamps:
@@ -30,46 +29,47 @@ def overview_lines(log: RobotLog, run: Run | None) -> list[str]:
         date = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     else:
         date = "at an unknown date (its stamps do not count from 1970)"
-    lines = _line("recorded", f"{date}, {duration_text((end - begin) / 1e9)}")
+    rows = [("recorded", f"{date}, {duration_text((end - begin) / 1e9)}")]
     if run is not None:
         drive = run.summary["drive"]
-        speed = f"{drive['speed_mean_mps']:.2f} m/s on average"
-        lines += _line(
-            "driven", f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed}"
-        )
-    return lines + _extent_lines(log)
+        driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+        rows.append(("driven", f"{driven}, {drive['speed_mean_mps']:.2f} m/s on average"))
+    return rows + _extent_rows(log)
 
 
-def verdict_lines(run: Run | None, problem: IcrToolError | None, config: Config) -> list[str]:
+def verdict_rows(run: Run | None, problem: IcrToolError | None, config: Config) -> list[Row]:
     """Return whether a log can be fitted, what it shows, and what is missing."""
-    if run is None:
-        return _line("verdict", f"cannot be fitted: {problem}" if problem is not None else "cannot be fitted")
-    lines = excitation_lines(run)
-    if not run.usable:
-        lines += _line("verdict", f"can be fitted, but its ICRs are not usable: {run.summary['unusable_because']}")
-    else:
-        verdicts = run.summary["excitation"]["verdict"].values()
-        shown = "all ICRs are shown" if set(verdicts) == {"shown"} else "not all ICRs are shown"
-        lines += _line("verdict", f"can be fitted, {shown}")
-    if config.robot.track_width_m is None:
-        lines += _line(
-            "missing",
+    rows = excitation_rows(run) if run is not None else []
+    rows.append(("verdict", verdict(run, problem)))
+    if run is not None and config.robot.track_width_m is None:
+        missing = (
             "robot.track_width_m: without it, no-slip odometry and the multiplier are left out; --robot NAME "
-            "(icrtool robots lists them) or --set robot.track_width_m=… gives it",
+            "(icrtool robots lists them) or --set robot.track_width_m=… gives it"
         )
-    return lines
+        rows.append(("missing", missing))
+    return rows
 
 
-def next_line(log: str, options: Sequence[str], run: Run | None) -> str | None:
+def verdict(run: Run | None, problem: IcrToolError | None) -> str:
+    """Return in a sentence whether a log can be fitted, and whether it shows the ICRs."""
+    if run is None:
+        return f"cannot be fitted: {problem}" if problem is not None else "cannot be fitted"
+    if not run.usable:
+        return f"can be fitted, but its ICRs are not usable: {run.summary['unusable_because']}"
+    verdicts = run.summary["excitation"]["verdict"].values()
+    return f"can be fitted, {'all ICRs are shown' if set(verdicts) == {'shown'} else 'not all ICRs are shown'}"
+
+
+def next_command(log: str, options: Sequence[str], run: Run | None) -> str | None:
     """Return the command to run next with a log, by the options of this one; None where it cannot be fitted."""
     if run is None:
         return None
     cut = "--from" in options or "--to" in options
     command = "dropout-report" if run.usable and not cut else "fit"
-    return f"{'next':<{LABEL}}{shlex.join(['icrtool', command, log, *options])}"
+    return shlex.join(["icrtool", command, log, *options])
 
 
-def _extent_lines(log: RobotLog) -> list[str]:
+def _extent_rows(log: RobotLog) -> list[Row]:
     """Return the size of the area of the positions, outliers left out, and where it is."""
     fixes, datum = log.gnss, log.datum
     sound = np.isfinite(fixes.north_m) & np.isfinite(fixes.east_m)
@@ -79,12 +79,4 @@ def _extent_lines(log: RobotLog) -> list[str]:
     where = (
         f" about {datum.latitude_deg:.5f}°, {datum.longitude_deg:.5f}°" if datum is not None else " (metric positions)"
     )
-    return _line("area", f"{sizes[0]:.1f} m east-west x {sizes[1]:.1f} m north-south{where}")
-
-
-def _line(label: str, text: str) -> list[str]:
-    first = f"{label:<{LABEL}}"
-    return textwrap.wrap(
-        text, TABLE_WIDTH, initial_indent=first, subsequent_indent=" " * LABEL, break_long_words=False,
-        break_on_hyphens=False,
-    )  # fmt: skip
+    return [("area", f"{sizes[0]:.1f} m east-west x {sizes[1]:.1f} m north-south{where}")]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from textwrap import wrap
 from typing import Any
 
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
+from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
 from icrtool.output.text_format import (
-    TABLE_WIDTH,
     controller_text,
     distance_text,
     duration_text,
@@ -19,134 +17,110 @@ from icrtool.output.text_format import (
     run_title,
     unusable_lines,
 )
-from icrtool.records.run import ICR_COLUMNS, Run, icr_text
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.samples import ROLE_WORDS
 
-LABEL = 12
-"""Columns of the left margin: what a line is about."""
-
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
-"""A delay that receivers have, to say what it does; at lower speeds than this it does little."""
+"""A delay that receivers have, to show what it does; at lower speeds than this it does little."""
 
-WORTH_TELLING_S = 0.05
+SMALLEST_DELAY_S = 0.05
 """A delay below this is not worth a line."""
 
-ICR_LABELS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
 
 SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
-"""What is said of an ICR by the verdict of `find_excitation`."""
+"""What is printed beside an ICR, by the verdict of `find_excitation`."""
 
-Row = tuple[str, ...]
+Row = tuple[str, str]
+"""What a line is about, and its sentence."""
 
 
-def format_run(run: Run) -> str:
+def format_run(run: Run) -> Text:
     """Return the table of a run: streams, drive, ICRs, position, heading; at most 100 columns wide, no line end.
 
     Warnings are not in it: they belong to stderr.
     """
-    lines = [
-        *unusable_lines(run.summary),
-        run_title(run.summary),
-        "",
-        *_stream_lines(run),
-        "",
-        *_drive_lines(run),
-        "",
-        *_icr_lines(run),
-        *_multiplier_lines(run),
-        *_recommended_lines(run),
-        *excitation_lines(run),
-        *_terrain_lines(run),
-        "",
-        *_position_lines(run),
-        *_heading_lines(run),
-        *_delay_lines(run),
-        *event_lines(run),
-    ]
-    return "\n".join(line.rstrip() for line in lines)
+    drive = run.summary["drive"]
+    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s (mean ± std)"
+    learned = [*_multiplier_rows(run), *_recommended_rows(run), *excitation_rows(run)]
+    measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
+    return Text(
+        [
+            *unusable_lines(run.summary),
+            Line(run_title(run.summary), "title"),
+            "",
+            _stream_table(run),
+            "",
+            *labelled([("drive", f"{driven}, {speed}")]),
+            "",
+            _icr_table(run),
+            *labelled(learned),
+            *_terrain_table(run),
+            "",
+            *labelled(measured),
+        ]
+    )
 
 
-def excitation_lines(run: Run) -> list[str]:
+def excitation_rows(run: Run) -> list[Row]:
     """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
     found = run.summary["excitation"]
     verdicts = found["verdict"]
     if set(verdicts.values()) == {"shown"}:
-        said = "enough to show all three ICRs"
+        shown = "enough to show all three ICRs"
     else:
-        said = ", ".join(f"{ICR_LABELS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
+        shown = ", ".join(f"{ICR_WORDS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
     right, left = found["turned_right_deg"], found["turned_left_deg"]
     spun = found["spun_right_deg"] + found["spun_left_deg"]
-    turned = f"turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot"
-    return [_line("excitation", f"{said}; {turned}")]
+    return [("excitation", f"{shown}; turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot")]
 
 
-def _stream_lines(run: Run) -> list[str]:
-    rows: list[Row] = [("stream", "topic", "type", "rate", "samples", "clock")]
+def _stream_table(run: Run) -> Table:
+    head = ("stream".ljust(LABEL), "topic", "type", "rate", "samples", "clock")
+    rows = []
     for stream in run.summary["streams"]:
         kind = stream["message_type"].replace("/msg/", "/")
         hz = stream["rate_hz"]
         rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
         role = ROLE_WORDS[stream["role"]] if run.summary["gnss"]["datum"] is None else stream["role"]
         rows.append((role, stream["topic"], kind, rate, count, stream["clock"]))
-    widths = [max(len(row[column]) for row in rows) for column in range(6)]
-    widths[0] = LABEL - 2
-    # Long names give way: the topic keeps its end, the type its begin.
-    room = TABLE_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
-    widths[1] = min(widths[1], max(room - widths[2], room // 2))
-    widths[2] = min(widths[2], room - widths[1])
-    return [
-        f"{row[0]:<{widths[0]}}  {_tail(row[1], widths[1]):<{widths[1]}}  {_head(row[2], widths[2]):<{widths[2]}}  "
-        f"{row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}  {row[5]}"
-        for row in rows
-    ]
+    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
+    # Long names are cut: the topic keeps its end, the type its begin.
+    space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
+    topic = min(widths[1], max(space - widths[2], space // 2))
+    kind = min(widths[2], space - topic)
+    return Table("lllrrl", [(row[0], _tail(row[1], topic), _head(row[2], kind), *row[3:]) for row in rows], head)
 
 
-def _drive_lines(run: Run) -> list[str]:
-    drive = run.summary["drive"]
-    speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s"
-    return [
-        _line(
-            "drive",
-            f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}, {speed} (mean ± std)",
-        )
-    ]
-
-
-def _icr_lines(run: Run) -> list[str]:
+def _icr_table(run: Run) -> Table:
     icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
-    rows: list[Row] = [("ICR [m]", "final ± std", "mean ± std after that", "10-90 % rise", "")]
+    rows = []
     for column in ICR_COLUMNS:
-        mean, std, rise = (icr[key][column] for key in ("mean", "std", "convergence_s"))
+        mean, std, time_s = (icr[key][column] for key in ("mean", "std", "convergence_s"))
         if icr["final"][column] is None:
-            rows.append((ICR_LABELS[column], icr_text(icr, column), "", "", ""))
+            rows.append((ICR_WORDS[column], icr_text(icr, column), "", "", ""))
             continue
-        rows.append(
-            (
-                ICR_LABELS[column],
-                icr_text(icr, column),
-                f"{mean:+.3f} ± {std:.3f}",
-                f"{rise:.1f} s" if rise is not None else "hardly moved",
-                SHOWN_WORDS.get(verdicts[column], ""),
-            )
-        )
-    return [f"{row[0]:<{LABEL}}{row[1]:<20}{row[3]:<16}{row[2]:<24}{row[4]}" for row in rows]
+        convergence = f"{time_s:.1f} s" if time_s is not None else "hardly moved"
+        verdict = SHOWN_WORDS.get(verdicts[column], "")
+        rows.append((ICR_WORDS[column], icr_text(icr, column), convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
+    return Table("l", rows, ("ICR [m]".ljust(LABEL), "final ± std", "convergence time", "mean ± std after that", ""))
 
 
-def _multiplier_lines(run: Run) -> list[str]:
+def _multiplier_rows(run: Run) -> list[Row]:
     width, icr = run.track_width_m, run.summary["icr"]
     if width is None:
-        return [_line("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
+        return [("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
     multiplier, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
     if multiplier is None:
-        return [_line("multiplier", "not shown: it is made of y right and y left")]
+        return [("multiplier", "not shown: it is made of y right and y left")]
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     note = "" if shown else ": not shown well enough to be used"
     value = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
-    return [_line("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
+    return [("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
 
 
-def _recommended_lines(run: Run) -> list[str]:
+def _recommended_rows(run: Run) -> list[Row]:
     """Return the motion model to use, as `icrtool calibrate` recommends it, and what a controller is given."""
     found = run.summary.get("recommended")
     if found is None or not run.usable:
@@ -154,30 +128,24 @@ def _recommended_lines(run: Run) -> list[str]:
     rows = found["parameters"].items()
     values = ", ".join(f"{name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
     model = model_text(found["label"], found["model"], len(rows))
-    sentences = (
+    return [
         ("recommended", f"{model}: {values}; what error it makes: icrtool dropout-report"),
         ("controller", controller_text(found["controller"])),
-    )
-    return [
-        _line(label if number == 0 else "", part)
-        for label, sentence in sentences
-        for number, part in enumerate(wrap(sentence, TABLE_WIDTH - LABEL))
     ]
 
 
-def _terrain_lines(run: Run) -> list[str]:
+def _terrain_table(run: Run) -> list[Block]:
     """Return the ICRs between the terrain changes."""
-    if not run.summary["segments"]:
-        return []
-    rows: list[Row] = [("segment", "begins", *(f"{ICR_LABELS[column]} ± std [m]" for column in ICR_COLUMNS))]
+    rows = []
     for number, segment in enumerate(run.summary["segments"], start=1):
         mean, std = segment["mean"], segment["std"]
         icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
         rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", *icrs))
-    return ["", *(f"{row[0]:<{LABEL}}{row[1]:<9}{row[2]:<20}{row[3]:<20}{row[4]}" for row in rows)]
+    head = ("segment".ljust(LABEL), "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
+    return ["", Table("lrl", rows, head)] if rows else []
 
 
-def _position_lines(run: Run) -> list[str]:
+def _position_rows(run: Run) -> list[Row]:
     gnss = run.summary["gnss"]
     word = position_word(run.summary)
     lines = []
@@ -185,81 +153,77 @@ def _position_lines(run: Run) -> list[str]:
         mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
         raised = run.process_position_mps != configured_noise(run.config).position_mps
         why = "; follows them closely, for its position noise was raised" if raised else ""
-        lines.append(_line("position", f"filter to {word}: mean {mean}, max {most}{why}"))
+        lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
     reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
     why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
     lines.append(
-        _line(
+        (
             "fixes" if lines else "position",
             f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
         )
     )
-    lines += _class_lines(gnss["classes"], gnss["jumps"])
+    lines += _class_rows(gnss["classes"], gnss["jumps"])
     if gnss["recoveries"]:
         times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
-        lines.append(_line("", f"re-acquired after rejection: {times}"))
+        lines.append(("", f"re-acquired after rejection: {times}"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
         lost = len(run.summary["rtk_losses_ns"])
         cause = f" ({lost} of RTK, fixes went on)" if lost else ""
-        lines.append(_line("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
+        lines.append(("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
     return lines
 
 
-def _class_lines(classes: dict[str, dict[str, Any]], jumps: int) -> list[str]:
+def _class_rows(classes: dict[str, dict[str, Any]], jumps: int) -> list[Row]:
     """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
     lines = []
     for name, one in classes.items() if len(classes) > 1 else ():
         done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
         done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
         done += [f"{one['sold_as_fixed']:,} wrongly reported as fixed"] if one["sold_as_fixed"] else []
-        lines.append(_line("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
+        lines.append(("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
     if jumps:
-        lines.append(_line("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
+        lines.append(("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
     return lines
 
 
-def _heading_lines(run: Run) -> list[str]:
+def _heading_rows(run: Run) -> list[Row]:
     heading = run.summary["heading"]
     source = heading.get("source")
     lines = [f"{source.replace('_', ' ')}: {heading['parts']}"] if heading.get("parts") else []
     if heading["offset_deg"] is not None:
         # Adding zero takes the sign off a rounded -0.0.
-        offset = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg off the course"
+        value = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg"
+        offset = f"{value} from the course over ground"
         if heading["offset_name"]:
             offset += f" ({heading['offset_name']})"
         applied = heading["applied_offset_deg"]
         lines.append(f"{offset}; corrected by {0.0 - applied:+.1f} deg" if applied else f"{offset}; not corrected")
     elif not lines:
-        lines = ["could not be compared with the course: too little straight driving"]
-    lines = [part for line in lines for part in wrap(line, TABLE_WIDTH - LABEL)]
-    named = [_line("" if number else "heading", line) for number, line in enumerate(lines)]
-    return [*named, *_heading_counts(heading)]
-
-
-def _heading_counts(heading: Mapping[str, Any]) -> list[str]:
+        lines = ["could not be compared with the course over ground: too little straight driving"]
     used, rejected = heading["used"], heading["rejected"]
-    return [_line("headings", f"{used:,} used, {rejected:,} rejected{f' (gate {rejected:,})' if rejected else ''}")]
+    counts = f"{used:,} used, {rejected:,} rejected{f' (gate {rejected:,})' if rejected else ''}"
+    return [*(("" if number else "heading", line) for number, line in enumerate(lines)), ("headings", counts)]
 
 
-def _delay_lines(run: Run) -> list[str]:
+def _delay_rows(run: Run) -> list[Row]:
     """Return which streams seem to lag or lead the wheels."""
     if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
         return []
     found = []
     for word, facts in (("headings", run.summary["heading"]), ("fixes", run.summary["gnss"])):
         delay, std = facts["delay_s"], facts["delay_std_s"]
-        if delay is not None and abs(delay) > max(WORTH_TELLING_S, SIGNIFICANT_SIGMAS * std):
+        if delay is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
             found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
     lines = [*found, "not corrected: slip of the wheels has the same effect"] if found else []
     speed = run.summary["drive"]["speed_mean_mps"]
     if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = length_text(TYPICAL_DELAY_S * speed)
-        lines.append(f"of the fixes: not shown by this drive; {TYPICAL_DELAY_S:g} s late would move x by {shift}")
-    return [_line("" if number else "delays", line) for number, line in enumerate(lines)]
+        lines.append(f"of the fixes: not shown by this drive; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}")
+    return [("" if number else "delays", line) for number, line in enumerate(lines)]
 
 
-def event_lines(run: Run) -> list[str]:
+def event_rows(run: Run) -> list[Row]:
     """Return how many slip events of each kind there were, and the worst: the one that missed most distance."""
     events = run.summary["events"]
     if not events:
@@ -270,11 +234,7 @@ def event_lines(run: Run) -> list[str]:
     lasted = duration_text(worst["end_s"] - worst["begin_s"])
     missed = f"{100 * worst['severity']:.0f} % of the wheels' motion missed"
     worst_text = f"worst: {worst['kind']} from {worst['begin_s']:.1f} s for {lasted}, {missed}"
-    return [_line("slip", f"{counts}; the ICRs are not learned there"), _line("", worst_text)]
-
-
-def _line(label: str, text: str) -> str:
-    return f"{label:<{LABEL}}{text}"
+    return [("slip", f"{counts}; the ICRs are not learned there"), ("", worst_text)]
 
 
 def _tail(text: str, width: int) -> str:

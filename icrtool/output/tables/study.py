@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.simulation.studies import KINDS, StudyNumber, StudyRequest, StudyResult
 
 ERRORS = tuple(
@@ -26,41 +27,35 @@ SHOWN: dict[str, tuple[tuple[str, str], ...]] = {
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
 
 
-def format_study(result: StudyResult) -> str:
+def format_study(result: StudyResult) -> Text:
     """Return the tables of a study; no line end."""
     request, kind = result.request, KINDS[result.request.name]
     figures = f" (Fig{'s' if len(kind.figures) > 2 else ''}. {kind.figures})" if kind.figures else ""
     path = request.plan.path
     icrs = ", ".join(f"{icr:+.3f}" for icr in request.plan.icrs_m)
     driven = f"{getattr(path, 'kind', 'path')} at {getattr(path, 'speed_mps', 0):g} m/s, ICRs {icrs} m"
-    lines = [
+    blocks: list[Block] = [
         f"{request.name}{figures}: {kind.about}",
         f"{runs_text(request)} each, seed {request.seed}; {driven}",
         "",
     ]
-    lines += [*_level_lines(result), ""] if request.name in SHOWN else []
-    lines += _finding_lines(result.findings, "expected" if request.name == "consistency" else "paper")
-    return "\n".join(line.rstrip() for line in lines)
+    if request.name in SHOWN:
+        blocks += [*_level_blocks(result), ""]
+    findings = [(one.what, finding_text(one), one.paper) for one in result.findings]
+    return Text([*blocks, Table("l", findings, ("", "ours", "expected" if request.name == "consistency" else "paper"))])
 
 
-def _level_lines(result: StudyResult) -> list[str]:
-    """Return one line a setting: median and, in brackets, the 5th and 95th percentile over its runs."""
+def _level_blocks(result: StudyResult) -> list[Block]:
+    """Return one row a setting: median and, in brackets, the 5th and 95th percentile over its runs."""
     shown = [metric for metric in SHOWN[result.request.name] if metric[0] in result.levels[0]["metrics"]]
-    varies = KINDS[result.request.name].varies or "setting"
-    rows = [["preset", varies, *(heading for _, heading in shown)]]
+    rows = []
     for level in result.levels:
         value = level["value"]
-        rows.append(
-            [
-                level["series"],
-                value if isinstance(value, str) else f"{value:g}",
-                *(_cell(name, level["metrics"][name], result.request.runs) for name, _ in shown),
-            ]
-        )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+        cells = (_cell(name, level["metrics"][name], result.request.runs) for name, _ in shown)
+        rows.append((level["series"], value if isinstance(value, str) else f"{value:g}", *cells))
+    head = ("preset", KINDS[result.request.name].varies or "setting", *(heading for _, heading in shown))
     errors = any(name.startswith("error") for name, _ in shown)
-    return [*lines, f"{'errors [m]: ' if errors else ''}median [5 %, 95 %] over the runs"]
+    return [Table("l", rows, head), f"{'errors [m]: ' if errors else ''}median [5 %, 95 %] over the runs"]
 
 
 def _cell(name: str, found: dict[str, Any], runs: int) -> str:
@@ -71,12 +66,6 @@ def _cell(name: str, found: dict[str, Any], runs: int) -> str:
     form = "+.3f" if name.startswith("error") else ".3g"
     never = f", never in {runs - found['count']}" if found["count"] < runs else ""
     return f"{found['p50']:{form}} [{found['p5']:{form}}, {found['p95']:{form}}]{never}"
-
-
-def _finding_lines(findings: tuple[StudyNumber, ...], beside: str) -> list[str]:
-    rows = [("", "ours", beside), *((one.what, finding_text(one), one.paper) for one in findings)]
-    first, second = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
-    return [f"{what:<{first}}  {ours:<{second}}  {paper}" for what, ours, paper in rows]
 
 
 def finding_text(finding: StudyNumber) -> str:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import math
-from textwrap import wrap
 from typing import Any
 
 from icrtool.calibration.transfer import Cell, Pair, Transfer
-from icrtool.output.text_format import TABLE_WIDTH
+from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.text import table_cell
 
@@ -33,51 +32,68 @@ def transfer_document(transfer: Transfer) -> dict[str, Any]:
                 "first": pair.first,
                 "second": pair.second,
                 "parameters": [one._asdict() | {"significant": one.significant} for one in pair.parameters],
-                "errors": [one._asdict() for one in pair.errors],
+                "errors": [
+                    {"horizon_m": horizon, **one._asdict(), "paired": pair.paired}
+                    for horizon, one in pair.errors.items()
+                ],
                 "verdict": verdict(transfer, pair),
             }
             for pair in transfer.pairs
         ],
-        "transfer": [cell._asdict() for cell in transfer.cells],
-        "costs": [cost._asdict() for cost in transfer.costs],
+        "transfer": [_row(cell) for cell in transfer.cells],
+        "costs": [{**_place(cell), **cell.cost._asdict()} for cell in transfer.cells if cell.cost is not None],
     }
+
+
+def _place(cell: Cell) -> dict[str, Any]:
+    return dict(zip(Cell._fields[:3], cell[:3], strict=True))
+
+
+def _row(cell: Cell) -> dict[str, Any]:
+    return {**_place(cell), "trials": cell.trials, **cell.errors._asdict()}
 
 
 def transfer_csv(transfer: Transfer) -> bytes:
     """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Cell._fields)
+    writer.writerow(_row(transfer.cells[0]))
     writer.writerows(
-        [table_cell(value) if isinstance(value, str) else value if math.isfinite(value) else "" for value in cell]
+        [table_cell(value) if isinstance(value, str) else value if math.isfinite(value) else ""
+         for value in _row(cell).values()]
         for cell in transfer.cells
-    )
+    )  # fmt: skip
     return text.getvalue().encode()
 
 
-def format_transfer(transfer: Transfer) -> str:
+def format_transfer(transfer: Transfer) -> Text:
     """Return verdicts, differences and the transfer matrix, no line end."""
-    lines: list[str] = []
+    blocks: list[Block] = []
     for pair in transfer.pairs:
-        lines += [*wrap(verdict(transfer, pair), TABLE_WIDTH), ""]
-        lines.append(f"{'':<24}{pair.first:>16.16}{pair.second:>16.16}{'difference ± std':>24}")
-        for one in pair.parameters:
-            difference = f"{one.difference:+.3f} ± {one.std:.3f}"
-            lines.append(f"{one.quantity:<24}{one.first:>+16.3f}{one.second:>+16.3f}{difference:>24}")
-        for change in pair.errors:
+        rows = [
+            (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", f"{one.difference:+.3f} ± {one.std:.3f}")
+            for one in pair.parameters
+        ]
+        table = Table("lr", rows, ("", pair.first, pair.second, "difference ± std"))
+        blocks += [verdict(transfer, pair), "", table]
+        for horizon, change in pair.errors.items():
             if math.isfinite(change.p95_m):
-                route = ", the same route" if change.paired else ""
-                lines.append(f"held-out error after {change.horizon_m:g} m{route}: 95 % {_change(change[1:4])}; "
-                             f"expected {_change(change[4:7])}")  # fmt: skip
-        lines.append("")
-    lines.append(f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column")
+                route = ", the same route" if pair.paired else ""
+                blocks.append(f"held-out error after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
+                              f"expected {_change(change[3:])}")  # fmt: skip
+        blocks.append("")
     names = list(transfer.calibrations)
-    lines.append(f"{'':<24}" + "".join(f"{name:>20.18}" for name in names))
-    for row in names:
-        cells = (transfer.cell(row, column, CHOICE_HORIZON_M) for column in names)
-        lines.append(f"{row:<24.22}" + "".join(f"{f'{one.p95_m:.2f} / {one.expected_m:.2f}':>20}" for one in cells))
-    lines.append("on the diagonal each trial is predicted by what was not fitted to it")
-    return "\n".join(line.rstrip() for line in lines)
+    cells = [[transfer.cell(row, column, CHOICE_HORIZON_M) for column in names] for row in names]
+    matrix = [
+        (row[0].calibrated_on, *(f"{one.errors.p95_m:.2f} / {one.errors.expected_m:.2f}" for one in row))
+        for row in cells
+    ]
+    blocks += [
+        f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
+        Table("lr", matrix, ("", *names)),
+        "on the diagonal each trial is predicted by what was not fitted to it",
+    ]
+    return Text(blocks)
 
 
 def verdict(transfer: Transfer, pair: Pair) -> str:
@@ -86,10 +102,10 @@ def verdict(transfer: Transfer, pair: Pair) -> str:
     change = f"by {one.difference:+.2f} ± {one.std:.2f}"
     if not one.significant:
         change += ", which may be chance"
-    cost = transfer.cost(pair.first, pair.second, CHOICE_HORIZON_M)
-    if not math.isfinite(cost.p95_m):
+    cost = transfer.cell(pair.first, pair.second, CHOICE_HORIZON_M).cost
+    if cost is None or not math.isfinite(cost.p95_m):
         return f"The multiplier of {pair.second} differs from that of {pair.first} {change}."
-    sentence = f"costs {_change(cost[3:6])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
+    sentence = f"costs {_change(cost[:3])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
     if cost.p95_low_m <= 0.0 <= cost.p95_high_m:
         sentence += ", which may be chance"
     return (

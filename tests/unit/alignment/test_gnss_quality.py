@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.gnss_quality import judge_fixes
+from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.config import load_config
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
-from icrtool.kernels.filter_records import GATED
+from icrtool.kernels.measurement_codes import GATED
 from icrtool.logs.read_log import read_log
 from icrtool.logs.writing.log import WriteOptions, write_log
 from icrtool.records.run import Run
@@ -220,15 +220,15 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
     t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
     noise = np.where((t > 60) & (t < 80), 0.04, 0.0) * rng.normal(size=(2, len(t)))
     noisy = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + noise[0], east_m=log.gnss.east_m + noise[1]))
-    sold = {
-        told: judge_fixes(
-            confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).heading
-        ).sold
+    misreported = {
+        told: grade_fixes(
+            confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).fix_steps
+        ).misreported
         for told in ("flags", "not")
     }
-    assert not sold["flags"].any()
-    assert sold["not"].any()
-    assert not (sold["not"] & ((t < 58) | (t > 82))).any()
+    assert not misreported["flags"].any()
+    assert misreported["not"].any()
+    assert not (misreported["not"] & ((t < 58) | (t > 82))).any()
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     count = len(log.gnss.stamp_ns)
     said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
-    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
     assert quality.warnings == (f"made: {words}",)
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
 
@@ -253,7 +253,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
 def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     lossy, float_ = lose_rtk(clean())
     log = confess(lossy, float_, "flags")
-    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
     count = int(np.count_nonzero(float_))
     # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
     (warning,) = quality.warnings
@@ -268,8 +268,8 @@ def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_numbe
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
-    quality = judge_fixes(log, CONFIG, align_streams(log, CONFIG).heading)
-    assert quality.sold.any()
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
+    assert quality.misreported.any()
     assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)
 

@@ -10,12 +10,11 @@ import pytest
 
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
-from icrtool.calibration.measured_errors import ErrorSources
 from icrtool.calibration.pooled import calibrate, predictor
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, RunError
-from icrtool.motion.models import MODELS, twist, wheel_motion
+from icrtool.motion.models import MODELS, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
 from icrtool.output.tables.forecast import forecast_csv, reach, read_plan
 from support.recordings import WIDTH_M, draw_parameters, make_recording
@@ -105,9 +104,8 @@ def test_wheel_speeds_make_the_motion_asked_for(name: str) -> None:
     model = MODELS[name]
     parameters = draw_parameters(model, np.random.default_rng(4))
     speed, turn = np.array([0.5, 1.0, 0.8]), np.array([0.3, -0.4, 0.0])
-    v_x, _, omega = twist(
-        model, parameters, wheel_motion(*wheel_speeds(model, parameters, WIDTH_M, speed, turn), WIDTH_M)
-    )
+    fitted = FittedModel(model, parameters, np.eye(len(parameters)))
+    v_x, _, omega = fitted.twist(wheel_motion(*wheel_speeds(fitted, WIDTH_M, speed, turn), WIDTH_M))
     np.testing.assert_allclose([v_x, omega], [speed, turn], atol=ROUNDING)
 
 

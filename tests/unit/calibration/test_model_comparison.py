@@ -83,7 +83,7 @@ def test_a_gyro_of_the_other_sign_is_turned_and_said(run: Run) -> None:
     told = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
     usual, turned = (comparison_table(run, [MeasuredHeading("gyro", sign * told)]) for sign in (1, -1))
     assert usual.notes == ()
-    assert turned.notes == ("the gyro counts turns the other way: its sign was turned",)
+    assert turned.notes == ("the gyro counts turns in the other direction: its sign was changed",)
     for one, other in zip(usual.scores, turned.scores, strict=True):
         assert one.name == other.name
         assert np.allclose(one.summary.p95, other.summary.p95, atol=ROUNDING_M, equal_nan=True)

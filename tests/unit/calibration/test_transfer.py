@@ -43,10 +43,12 @@ def test_a_known_difference_is_found_within_its_standard_deviation(transfer: Tra
 
 
 def test_the_wrong_calibration_costs_and_an_equal_one_does_not(transfer: Transfer) -> None:
-    own, foreign = transfer.cell("new", "new", 10.0), transfer.cell("old", "new", 10.0)
+    own, foreign = transfer.cell("new", "new", 10.0).errors, transfer.cell("old", "new", 10.0).errors
     assert foreign.p95_low_m > own.p95_high_m
-    assert transfer.cell("old", "again", 10.0).expected_m < 1.5 * transfer.cell("again", "again", 10.0).expected_m
-    assert all(one.p95_low_m <= one.p95_m <= one.p95_high_m for one in transfer.cells if one.p95_low_m > 0.0)
+    on_again = [transfer.cell(name, "again", 10.0).errors.expected_m for name in ("old", "again")]
+    assert on_again[0] < 1.5 * on_again[1]
+    errors = [cell.errors for cell in transfer.cells]
+    assert all(one.p95_low_m <= one.p95_m <= one.p95_high_m for one in errors if one.p95_low_m > 0.0)
 
 
 def test_the_diagonal_is_the_held_out_score(transfer: Transfer) -> None:
@@ -54,7 +56,7 @@ def test_the_diagonal_is_the_held_out_score(transfer: Transfer) -> None:
     table = calibrate(groups).wheels
     together = table.score("recommended").together
     for h, horizon in enumerate(table.horizons_m):
-        assert transfer.cell("old", "old", horizon).p95_m == pytest.approx(together.p95[h], rel=1e-6)
+        assert transfer.cell("old", "old", horizon).errors.p95_m == pytest.approx(together.p95[h], rel=1e-6)
 
 
 def test_text_csv_and_json_hold_the_same(transfer: Transfer) -> None:
@@ -62,7 +64,7 @@ def test_text_csv_and_json_hold_the_same(transfer: Transfer) -> None:
     assert document["pairs"][0]["verdict"].split(";")[0] in " ".join(text.split())
     rows = list(csv.DictReader(io.StringIO(transfer_csv(transfer).decode())))
     assert len(rows) == len(document["transfer"]) == 9 * 4
-    assert float(rows[0]["p95_m"]) == transfer.cells[0].p95_m
+    assert float(rows[0]["p95_m"]) == transfer.cells[0].errors.p95_m
 
 
 def test_one_group_is_refused() -> None:
@@ -71,11 +73,13 @@ def test_one_group_is_refused() -> None:
 
 
 def test_costs_are_differences_in_the_same_trials(transfer: Transfer) -> None:
-    cost = transfer.cost("old", "new", 10.0)
-    own, foreign = transfer.cell("new", "new", 10.0), transfer.cell("old", "new", 10.0)
-    assert cost.p95_m == pytest.approx(foreign.p95_m - own.p95_m, rel=1e-9)
+    cell, own = transfer.cell("old", "new", 10.0), transfer.cell("new", "new", 10.0)
+    assert own.cost is None
+    assert (cost := cell.cost) is not None
+    assert cost.p95_m == pytest.approx(cell.errors.p95_m - own.errors.p95_m, rel=1e-9)
     assert 0.0 < cost.p95_low_m < cost.p95_m < cost.p95_high_m
-    same = transfer.cost("old", "again", 10.0)
+    same = transfer.cell("old", "again", 10.0).cost
+    assert same is not None
     assert same.expected_low_m < 0.1
 
 
@@ -99,5 +103,5 @@ def test_the_same_route_driven_twice_is_paired() -> None:
     second = replace(second, drive=second.drive._replace(north=second.drive.north + 0.2))
     groups = {"one": [first], "two": [second]}
     found = compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
-    assert all(change.paired for change in found.pairs[0].errors)
+    assert found.pairs[0].paired
     assert "the same route" in format_transfer(found)

@@ -14,7 +14,7 @@ from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import find_noise, innovation_cost
 from icrtool.estimation.run_filter import noise_of, set_up_again
 from icrtool.kernels.ekf import run_filter
-from icrtool.kernels.filter_records import GATED
+from icrtool.kernels.measurement_codes import GATED
 from icrtool.records.run import Run
 from icrtool.records.tables import RobotLog
 from support.drives import make_log
@@ -54,7 +54,7 @@ def test_what_is_configured_is_not_searched_for() -> None:
 
 def cost_of(run: Run, noise: ProcessNoise) -> float:
     summary = {**run.summary, "filter": {**run.summary["filter"], "process_position_mps": noise.position_mps}}
-    setup = set_up_again(replace(run, summary=summary), run.config)
+    setup = set_up_again(replace(run, summary=summary))
     return innovation_cost(run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters))
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import pytest
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.observability import Excitation, find_excitation
+from icrtool.estimation.icr_uncertainty import cut_drive
+from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs
 from icrtool.records.run import Run, drive_of
 from support.exact_drives import CONFIG, simulate
 
 
 def excitation_of(run: Run) -> Excitation:
-    return find_excitation(run.table, drive_of(run), run.track_width_m)
+    drive = drive_of(run)
+    windows = cut_drive(run.table, drive, nominal_icrs(run.table, run.track_width_m))
+    return find_excitation(run.table, drive, run.track_width_m, windows)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +23,7 @@ def varied():
 
 
 def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
-    assert varied.sufficient
+    assert set(varied.verdicts.values()) == {"shown"}
     assert varied.sentences == ()
     assert varied.turned_right_rad > 3.0
     assert varied.turned_left_rad > 3.0
@@ -30,12 +33,12 @@ def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
 def test_a_straight_drive_shows_none_and_asks_for_spins() -> None:
     found = excitation_of(fit(simulate(0, path="straight", seconds=60.0, offset_deg=0.0), CONFIG))
     assert set(found.verdicts.values()) == {"not shown"}
-    assert "add two spins each way" in found.sentences[-1]
+    assert "two full turns on the spot" in found.sentences[-1]
 
 
 def test_a_circle_asks_for_the_other_way() -> None:
     found = excitation_of(fit(simulate(0, path="circle", seconds=60.0, offset_deg=0.0), CONFIG))
-    assert not found.sufficient
+    assert set(found.verdicts.values()) != {"shown"}
     assert "to the left" in found.sentences[-1]
 
 

@@ -11,7 +11,8 @@ from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.kernels.ekf import run_filter
-from icrtool.kernels.filter_records import GATED, Measurements
+from icrtool.kernels.filter_records import Measurements
+from icrtool.kernels.measurement_codes import GATED
 from icrtool.kernels.smoother import run_smoother
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData

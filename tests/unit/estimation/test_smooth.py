@@ -18,7 +18,7 @@ CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 @pytest.fixture(scope="module")
 def pair() -> tuple[Run, States]:
     run = fit(make_log(0, 60.0), CONFIG)
-    return run, smooth(run, CONFIG)
+    return run, smooth(run)
 
 
 def test_the_table_is_the_runs_row_by_row(pair: tuple[Run, States]) -> None:

@@ -11,7 +11,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.estimation.fit import fit
 from icrtool.estimation.run_warnings import rejected_share
-from icrtool.kernels.filter_records import GATED, UNSEEN, USED
+from icrtool.kernels.measurement_codes import GATED, UNSEEN, USED
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run

@@ -9,7 +9,8 @@ import pytest
 
 from icrtool.kernels.ekf import run_filter
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN, USED, FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterParameters, Measurements
+from icrtool.kernels.measurement_codes import GATED, RECOVERED, UNSEEN, USED
 from support.matrix_filter import run_filter_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)

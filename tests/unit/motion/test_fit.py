@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from icrtool.calibration.held_out import hold_out
 from icrtool.errors import DataError
-from icrtool.motion.fit import CONSTANTS, Pool, WindowResiduals
-from icrtool.motion.models import MODELS, MotionModel, find_model, twist, wheel_motion
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import cut_trials, trial_errors, twist_rates
+from icrtool.motion.fit import Pool, WindowResiduals
+from icrtool.motion.models import MODELS, FittedModel, MotionModel, find_model, twist, wheel_motion
+from icrtool.motion.recording import LogConstants, Recording, cut_windows
+from icrtool.motion.trials import cut_trials, predicted_path, trial_errors
+from icrtool.records.tables import Floats
 from support.recordings import WIDTH_M, draw_parameters, make_recording
 
 EIGHT = MODELS["eight"]
@@ -17,6 +21,10 @@ SEEDS = range(8)
 STEP = 1e-6
 ROUNDING_M = 1e-9
 FREE = [model for model in MODELS.values() if model.terms]
+
+
+def fitted(model: MotionModel, parameters: Floats) -> FittedModel:
+    return FittedModel(model, parameters, np.eye(len(parameters)))
 
 
 def pool_of(model: MotionModel, *recordings: Recording) -> Pool:
@@ -27,9 +35,11 @@ def pool_of(model: MotionModel, *recordings: Recording) -> Pool:
 def test_derivatives_are_those_of_differences(name: str) -> None:
     model = find_model(name)
     recording = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0, gyro=True)
-    wheels = (EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
+    wheels = fitted(EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
     residuals = WindowResiduals(cut_windows(recording), model, WIDTH_M, wheels)
-    x = np.concatenate([draw_parameters(model, np.random.default_rng(1)), [0.02, 0.033, 0.01]])
+    x = np.concatenate(
+        [draw_parameters(model, np.random.default_rng(1)), [0.02, 0.033, *([0.01, 0.027] if model.uses_gyro else [])]]
+    )
     k = len(model.terms)
     _, slopes = residuals(x[:k], x[k:])
     for column in range(len(x)):
@@ -37,18 +47,18 @@ def test_derivatives_are_those_of_differences(name: str) -> None:
         low[column] -= STEP
         high[column] += STEP
         by = (residuals(high[:k], high[k:])[0] - residuals(low[:k], low[k:])[0]) / (2 * STEP)
-        if column == len(x) - 1 and not model.uses_gyro:
-            by = 0 * by
-        np.testing.assert_allclose(slopes[:, column], by, atol=1e-5, err_msg=str((*model.terms, *CONSTANTS)[column]))
+        np.testing.assert_allclose(
+            slopes[:, column], by, atol=1e-5, err_msg=str((*model.terms, *LogConstants._fields)[column])
+        )
 
 
 def test_window_ends_equal_the_direct_integration() -> None:
     parameters = draw_parameters(EIGHT, np.random.default_rng(2))
     recording = make_recording(EIGHT, parameters, seconds=60.0)
     trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
-    rates = twist_rates(recording, EIGHT, parameters)
-    errors, drive = trial_errors(recording, trials, rates), recording.drive
-    np.testing.assert_array_equal(rates, twist(EIGHT, parameters, wheel_motion(drive.v_left, drive.v_right, WIDTH_M)))
+    path, drive = predicted_path(recording, fitted(EIGHT, parameters)), recording.drive
+    errors = trial_errors(recording, trials, path)
+    rates = twist(EIGHT, parameters, wheel_motion(drive.v_left, drive.v_right, WIDTH_M))
     for start in range(0, 300, 50):
         end, north, east, psi = trials.ends[start, 1], 0.0, 0.0, drive.heading[start]
         for i in range(start, end):
@@ -77,9 +87,9 @@ def test_pooled_recordings_have_constants_of_their_own() -> None:
     turned = two.drive._replace(heading=two.drive.heading + 0.03)
     late = Recording("late", two.t_s, turned, None, WIDTH_M)
     found = pool_of(MODELS["five"], one, late).fit()
-    assert found.constants[0, 0] == pytest.approx(0.0, abs=0.01)
+    assert found.constants[0].heading_offset_rad == pytest.approx(0.0, abs=0.01)
     # the reference's heading is too large: what is added to it is negative
-    assert found.constants[1, 0] == pytest.approx(-0.03, abs=0.01)
+    assert found.constants[1].heading_offset_rad == pytest.approx(-0.03, abs=0.01)
     alone = pool_of(MODELS["five"], one).fit()
     assert np.all(np.diag(found.covariance) < np.diag(alone.covariance) * 1.5)
     assert np.all(np.abs(found.parameters - parameters) < 3.0 * np.sqrt(np.diag(found.covariance)))
@@ -117,8 +127,49 @@ def test_a_delay_of_the_wheels_is_found_and_used() -> None:
     # the poses are those of 0.2 s later: the wheels are to be read later
     moved = Recording("late", made.t_s[:-shift], type(d)(**others, **pose), None, WIDTH_M)
     found = pool_of(model, moved).fit()
-    assert found.constants[0, 1] == pytest.approx(0.2, abs=0.02)
+    assert found.constants[0].wheels_later_s == pytest.approx(0.2, abs=0.02)
     trials = cut_trials(moved, (10.0,))
-    rates = twist_rates(moved, model, found.parameters)
-    with_delay, without = trial_errors(moved, trials, rates, 0.2), trial_errors(moved, trials, rates)
+    with_delay, without = (
+        trial_errors(moved, trials, predicted_path(moved, found, LogConstants(wheels_later_s=later)))
+        for later in (0.2, 0.0)
+    )
     assert np.nanmean(with_delay) < 0.5 * np.nanmean(without)
+
+
+def test_a_gyro_read_at_another_time_than_the_wheels_is_found() -> None:
+    """Without its own time, the heading of a gyro 0.15 s apart is off by that time's turn at every start and end."""
+    model = MODELS["five"]
+    made = make_recording(model, model.prior_mean, 6, gyro=True, rate=20.0)
+    assert made.gyro_radps is not None
+    shift = 3
+    late = replace(made, gyro_radps=np.roll(made.gyro_radps, shift))
+    wheels = pool_of(model, late).fit()
+    pool = Pool([cut_windows(late)], [WIDTH_M], model.with_gyro(), wheels.fitted)
+    found = pool.fit()
+    assert found.constants[0].gyro_later_s == pytest.approx(shift / 20.0, abs=0.03)
+    trials, own = cut_trials(late, (10.0,)), found.constants[0]
+    at_its_time, at_the_wheels = (
+        trial_errors(late, trials, predicted_path(late, found, one)) for one in (own, own._replace(gyro_later_s=0.0))
+    )
+    assert np.nanmean(at_its_time) < 0.8 * np.nanmean(at_the_wheels)
+
+
+def test_a_poor_gyro_gives_way_to_the_wheels() -> None:
+    """Held out over distance, both together are not worse than the better of the two by more than 5 %."""
+    model = MODELS["five"]
+    rng = np.random.default_rng(5)
+    logs = [make_recording(model, model.prior_mean, seed, gyro=True, slip=0.02, name=f"{seed}") for seed in range(3)]
+    keep = np.exp(-0.1 / 5.0)
+    poor = []
+    for one in logs:
+        assert one.gyro_radps is not None
+        drift = np.zeros(len(one.t_s))
+        for k in range(1, len(drift)):
+            drift[k] = keep * drift[k - 1] + rng.normal(0.0, 0.05 * np.sqrt(1.0 - keep**2))
+        poor.append(replace(one, gyro_radps=one.gyro_radps + drift))
+    wheels, both = hold_out(poor, [model])
+    assert both is not None
+    weight = both.fits["five_gyro"].parameters[-1]
+    assert 0.5 < weight < 1.2
+    ratio = both.score("recommended").together.expected / wheels.score("recommended").together.expected
+    assert np.all(ratio < 1.05)

@@ -12,6 +12,7 @@ from icrtool.motion.models import (
     TERMS,
     TypicalDrive,
     find_model,
+    parameters_of_icrs,
     track_geometry,
     twist,
     typical_drive,
@@ -97,3 +98,18 @@ def test_every_term_has_a_prior_and_is_used() -> None:
     used = {term for model in MODELS.values() for term in model.terms} | set(GYRO_TERMS)
     assert used == set(TERMS)
     assert all(term.std > 0.0 for term in TERMS.values())
+
+
+def test_parameters_of_icrs_give_the_papers_twist_and_derivatives_equal_differences() -> None:
+    def expected(y_right: float, y_left: float, x: float, scale: float, difference: float) -> np.ndarray:
+        left, right = (scale + difference / 2) * V_LEFT, (scale - difference / 2) * V_RIGHT
+        return np.array([body_velocity(v_l, v_r, y_right, y_left, x) for v_l, v_r in zip(left, right, strict=True)]).T
+
+    at, step = np.array([*ICRS, 1.0, 0.0]), 1e-6
+    parameters, by = parameters_of_icrs(np.array(ICRS), WIDTH_M)
+    model = MODELS["full_linear"]
+    np.testing.assert_allclose(twist(model, parameters, MOTION), expected(*at), atol=EXACT)
+    without = twist(model, np.zeros(len(model.terms)), MOTION)
+    for column, change in enumerate(np.eye(5) * step):
+        slope = (expected(*(at + change)) - expected(*(at - change))) / (2 * step)
+        np.testing.assert_allclose(twist(model, by[:, column], MOTION) - without, slope, atol=1e-8)

@@ -11,9 +11,9 @@ from ruamel.yaml import YAML
 
 from icrtool.calibration.controller_numbers import export_numbers, unfit_reasons
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.record import Calibration, FittedModel
+from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError, DataError
-from icrtool.motion.models import CONTROLLER, MODELS, controller_parameters, twist, wheel_motion
+from icrtool.motion.models import MODELS, FittedModel, controller_model, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
 
 CONTROLLER_KEYS = {
@@ -133,7 +133,7 @@ def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -
     left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
-    assert twist(CONTROLLER, controller_parameters(geometry), motion)[:, 0] == pytest.approx(expected)
+    assert controller_model(geometry).twist(motion)[:, 0] == pytest.approx(expected)
 
 
 def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:

@@ -27,8 +27,7 @@ from icrtool.output.dropout_directory import (
     report_writer,
     write_tables,
 )
-from icrtool.output.figures.drawing_process import DrawingHere
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
 from icrtool.output.trials_file import trials_file
 from icrtool.records.run import Run
 
@@ -178,7 +177,7 @@ def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Ru
 
 
 def test_a_report_replaces_an_older_one_and_keeps_files_of_others(content: DropoutReport, tmp_path: Path) -> None:
-    with report_writer(tmp_path / "dropout", DrawingHere(()), np.arange(3)) as writer:
+    with report_writer(tmp_path / "dropout", (), np.arange(3)) as writer:
         writer.finish(content)
     assert (tmp_path / "dropout" / TRIALS_FILE).exists()
     (tmp_path / "dropout" / "notes.txt").touch()
@@ -193,7 +192,7 @@ def test_a_report_that_fails_leaves_the_older_one(written: Path, content: Dropou
     before = (written / "report.json").read_bytes()
 
     def fail() -> None:
-        with report_writer(written, DrawingHere(())) as writer:
+        with report_writer(written, ()) as writer:
             writer.finish(content)
             raise ZeroDivisionError
 

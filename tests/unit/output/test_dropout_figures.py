@@ -1,9 +1,7 @@
-"""The pictures: what they show, and the process that draws them."""
+"""The pictures of a dropout report: what they show."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
@@ -14,15 +12,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from icrtool.dropout_analysis import trials as dropout_analysis
-from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.output.figures import dropout_figures as pictures
-from icrtool.output.figures.drawing_process import DrawingProcess
 from icrtool.output.figures.dropout_errors import draw_histogram, draw_summary
 from icrtool.output.figures.dropout_paths import draw_examples, draw_outages, draw_worst
 from icrtool.output.figures.style import style
@@ -124,7 +119,7 @@ def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(repo
 
 
 def test_a_histogram_needs_no_other_models_than_it_says(run: Run) -> None:
-    models = [model for model in models_of(run) if model.name in pictures.HISTOGRAM_MODELS]
+    models = [model for model in models_of(run) if model.name in ("icr", "no_slip")]
     assert len(drawn(lambda: draw_histogram("barn", dropout(run, [5.0], models=models), 5.0)).axes) == 2
 
 
@@ -140,74 +135,17 @@ def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Run]) 
         assert "no slip" not in " ".join(texts_of(drawn(draw)))
 
 
-@pytest.mark.parametrize("table_bytes", [1, 1 << 30])
-def test_figures_are_drawn_once_and_as_soon_as_their_numbers_are_there(
-    run: Run, monkeypatch: pytest.MonkeyPatch, table_bytes: int
-) -> None:
-    monkeypatch.setattr(dropout_analysis, "LARGEST_TABLE_BYTES", table_bytes)
-    drawn: list[tuple[str, int]] = []
-    models: list[int] = []
-
-    def draw(_: object, name: str, *content: object) -> None:
-        drawn.append((name, models[-1]))
-
-    figures = pictures.ReportFigures(draw)
-
-    def watch(report: DropoutReport) -> None:
-        models.append(len(report.results))
-        figures.draw_ready(report)
-
-    figures.draw_rest(dropout_report(run, horizons_m=[5.0, 10.0], comparison=False, watch=watch))
-    assert models == [0, 1, 2, 3]
-    single = [("examples_15m", 0), ("worst", 0), ("outages", 0)]
-    assert drawn == [*single, ("histogram_05m", 2), ("histogram_10m", 2), ("summary", 3)]
-
-
-def test_drawing_needs_no_compiled_code() -> None:
-    # What dropout-report loads before it starts the process that draws, and what that process loads.
-    before = [
-        "cli.dropout_report",
-        "dropout_analysis.acceptance_limits",
-        "output.stored_run",
-        "output.atomic_file",
-        "output.figures.drawing_process",
-    ]
-    loads = "; ".join(f"import icrtool.{module}" for module in before)
-    code = (
-        f"import sys, icrtool.output.figures.dropout_figures as d; {loads}; "
-        "d.load_figures(); sys.exit('numba' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="forks from a process with threads, as pytest's is, only there")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_the_second_process_draws_what_there_is(
+def test_a_report_draws_what_it_holds(
     run: Run, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
-    with DrawingProcess(("png", "svg")) as process, process.into(tmp_path / "plots") as draw:
-        whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
-        figures = pictures.ReportFigures(draw)
-        figures.draw_ready(whole)
-        figures.draw_rest(whole)
-    names = {path.stem for path in (tmp_path / "plots").iterdir()}
+    whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
+    pictures.draw_figures(whole, tmp_path, ("png", "svg"))
+    names = {path.stem for path in tmp_path.iterdir()}
     assert names == {"summary", "histogram_05m", "histogram_10m", "examples_15m", "worst", "outages"}
-    assert len(list((tmp_path / "plots").iterdir())) == 2 * len(names)
+    assert len(list(tmp_path.iterdir())) == 2 * len(names)
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_what_goes_wrong_in_the_second_process_is_raised_here(report: DropoutReport, tmp_path: Path) -> None:
-    (tmp_path / "plots" / "histogram_05m.png").mkdir(parents=True)
-
-    def draw_all() -> None:
-        with DrawingProcess(("png",)) as process, process.into(tmp_path / "plots") as draw:
-            pictures.ReportFigures(draw).draw_ready(report)
-
+def test_a_picture_that_cannot_be_written_is_named(report: DropoutReport, tmp_path: Path) -> None:
+    (tmp_path / "histogram_05m.png").mkdir()
     with pytest.raises(OSError, match="histogram_05m"):
-        draw_all()
-
-
-def test_without_formats_nothing_is_started_or_drawn(report: DropoutReport, tmp_path: Path) -> None:
-    with DrawingProcess(()) as process, process.into(tmp_path / "plots") as draw:
-        pictures.ReportFigures(draw).draw_ready(report)
-    assert list(tmp_path.iterdir()) == []
+        pictures.draw_figures(report, tmp_path, ("png",))

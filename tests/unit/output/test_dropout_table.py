@@ -49,7 +49,8 @@ def content(run: Run) -> DropoutReport:
 
 
 def row_of(text: str, begin: str) -> list[str]:
-    return next(line for line in text.splitlines() if line.startswith(begin)).removeprefix(begin).split()
+    words = begin.split()
+    return next(line.split()[len(words) :] for line in text.splitlines() if line.split()[: len(words)] == words)
 
 
 def test_the_table_shows_the_horizons_nearest_to_1_5_10_and_20_m(content: DropoutReport) -> None:

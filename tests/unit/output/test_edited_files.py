@@ -15,7 +15,8 @@ import pytest
 import icrtool
 from icrtool.errors import IcrToolError
 from icrtool.output.calibration_file import open_calibration
-from icrtool.output.run_directory import events_csv, json_bytes
+from icrtool.output.json_file import json_bytes
+from icrtool.output.run_directory import events_csv
 from icrtool.output.stored_run import log_of
 from icrtool.output.tables.run import format_run
 

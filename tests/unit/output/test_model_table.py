@@ -9,14 +9,15 @@ import pytest
 
 from icrtool.calibration.model_comparison import ModelComparison, comparison_table
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.output.run_directory import json_bytes
+from icrtool.output.json_file import json_bytes
 from icrtool.output.tables.model_comparison import (
     COMPARISON_COLUMNS,
+    comparison_blocks,
     comparison_document,
     comparison_rows,
     extended_line,
-    format_comparison,
 )
+from icrtool.output.text_blocks import Text
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def comparison(make_run) -> ModelComparison:
 
 
 def test_every_model_has_its_line(comparison: ModelComparison) -> None:
-    text = format_comparison(comparison)
+    text = Text(comparison_blocks(comparison))
     for score in comparison.scores:
         assert any(line.startswith(score.label) for line in text.splitlines())
     assert "held out" in text

@@ -13,7 +13,8 @@ import pytest
 from icrtool.errors import OutputError
 from icrtool.output import run_directory
 from icrtool.output.figures import run_figures as figures
-from icrtool.output.run_directory import check_target, json_bytes, write_run
+from icrtool.output.json_file import json_bytes
+from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
 from icrtool.records.run import Run
 

@@ -7,7 +7,8 @@ import pytest
 
 from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
-from icrtool.output.text_format import TABLE_WIDTH, distance_text, duration_text, length_text, signed
+from icrtool.output.text_blocks import TEXT_WIDTH
+from icrtool.output.text_format import distance_text, duration_text, length_text, signed
 from icrtool.records.run import Run
 
 
@@ -45,7 +46,7 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
     assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
     assert "1 outage, " in text
     assert "filter to GNSS fixes: mean " in line_of(text, "position")
-    assert any(line.startswith("heading ") and "off the course" in line for line in text.splitlines())
+    assert any(line.startswith("heading ") and "course over ground" in line for line in text.splitlines())
     heading = run.summary["heading"]
     assert heading["used"] > 1000
     assert line_of(text, "headings").split()[1:5] == [
@@ -63,7 +64,7 @@ def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: Run) -> None:
     ]
     wide = replace(run, summary={**run.summary, "streams": long_names})
     for text in (format_run(run), format_run(wide)):
-        assert max(map(len, text.splitlines())) <= TABLE_WIDTH
+        assert max(map(len, text.splitlines())) <= TEXT_WIDTH
         assert "\x1b" not in text
         assert not any(line != line.rstrip() for line in text.splitlines())
         assert not text.endswith("\n")
@@ -122,7 +123,7 @@ def test_lengths_read_well() -> None:
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
     steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
     speed = run.summary["drive"]["speed_mean_mps"]
-    said = f"not shown by this drive; 0.1 s late would move x by {length_text(0.1 * speed)}"
+    said = f"not shown by this drive; a lag of 0.1 s would move x by {length_text(0.1 * speed)}"
     assert said in format_run(steady)
     known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02, "delay_std_s": 0.01}})
     assert said not in format_run(known)

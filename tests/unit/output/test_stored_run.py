@@ -21,7 +21,8 @@ from icrtool.output import run_directory
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.figures.run_figures import FIGURES
 from icrtool.output.figures.style import SAVE, style
-from icrtool.output.run_directory import json_bytes, write_run
+from icrtool.output.json_file import json_bytes
+from icrtool.output.run_directory import write_run
 from icrtool.output.stored_run import log_of, newest_run, open_run
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run

@@ -264,10 +264,17 @@ const icrtoolCharts = (() => {
   const LOOKS = {
     recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
     no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
+    recommended_gyro: { color: "recommended", dash: "dashed", width: 2 },
   };
+  const OTHERS = [["other", "solid"], ["icr", "dotted"], ["no-slip", "solid"], ["final", "dashdot"], ["other", "dashed"],
+    ["icr", "dashdot"], ["no-slip", "dotted"], ["recommended", "dotted"]].map(([color, dash]) => ({ color, dash, width: 2 }));
+  const met = new Map();
 
+  /** Return how a model is drawn: the same in every chart; models without a look of their own take turns. */
   function lookOf(name) {
-    return LOOKS[name] || { color: "other", width: 2 };
+    if (LOOKS[name]) return LOOKS[name];
+    if (!met.has(name)) met.set(name, met.size);
+    return OTHERS[met.get(name) % OTHERS.length];
   }
 
   /** Make the chart of errors over distance; gives a function that destroys it. */

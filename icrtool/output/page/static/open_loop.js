@@ -23,11 +23,17 @@ const icrtoolOpenLoop = (() => {
   }
 
   /** Return the path of a model with constant parameters: its path through the whole drive, turned into place. */
-  function alongPath(path, start, end, heading) {
-    const c = Math.cos(heading - path.turn[start]), s = Math.sin(heading - path.turn[start]);
+  function alongPath(path, start, end, last, heading) {
+    // The path has one of `every` steps, and the last one.
+    const at = (values, i) => {
+      const k = Math.min(Math.floor(i / path.every), values.length - 2), from = k * path.every;
+      return values[k] + ((i - from) / (Math.min(from + path.every, last) - from)) * (values[k + 1] - values[k]);
+    };
+    const turned = heading - at(path.turn, start) - path.first_turn, c = Math.cos(turned), s = Math.sin(turned);
+    const forward0 = at(path.forward, start), right0 = at(path.right, start);
     const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
     for (let i = start; i <= end; i++) {
-      const forward = path.forward[i] - path.forward[start], right = path.right[i] - path.right[start];
+      const forward = at(path.forward, i) - forward0, right = at(path.right, i) - right0;
       north[i - start] = forward * c - right * s;
       east[i - start] = forward * s + right * c;
     }
@@ -43,7 +49,7 @@ const icrtoolOpenLoop = (() => {
   function drive(data, row, lengths) {
     const { steps, series } = data, start = series.step[row], heading = series.heading[row];
     const gap = steps.gaps.find((step) => step >= start);
-    const last = gap === undefined ? steps.distance.length - 1 : gap;
+    const final = steps.distance.length - 1, last = gap === undefined ? final : gap;
     const ends = lengths.map((metres) => endOf(steps, start, metres));
     const longest = ends[ends.length - 1], end = Math.min(longest === null ? last : longest, last);
     let why = "";
@@ -51,7 +57,7 @@ const icrtoolOpenLoop = (() => {
     const hasReference = (step) => !steps.without_reference.some(([from, to]) => from <= step && step <= to);
     const models = data.models.map((model) => {
       const icrs = model.icrs || [series.y_right[row], series.y_left[row], series.x[row]];
-      const path = model.path ? alongPath(model.path, start, end, heading) : byIcrs(steps, icrs, start, end, heading);
+      const path = model.path ? alongPath(model.path, start, end, final, heading) : byIcrs(steps, icrs, start, end, heading);
       const errors = ends.map((step) => {
         if (step === null || step > end || !hasReference(step)) return null;
         const k = step - start;

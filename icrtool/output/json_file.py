@@ -1,0 +1,36 @@
+"""JSON files of ours: how they are written, and how an unknown one is recognised."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from icrtool.records.plain_data import plain
+from icrtool.records.text import LogText
+
+
+def schema_of(file: Path) -> str:
+    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none."""
+    try:
+        schema = json.loads(file.read_bytes())["schema"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return ""
+    return schema if isinstance(schema, str) else ""
+
+
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
+    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
+    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
+    return (text + "\n").encode("utf-8", errors="backslashreplace")
+
+
+def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
+    if isinstance(value, dict):
+        return {key: _as_in_the_log(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_as_in_the_log(item) for item in value]
+    return value.raw if isinstance(value, LogText) else value

@@ -1,0 +1,97 @@
+"""Every command that a page shows runs, in one folder, with a short log in place of the reader's."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from icrtool.cli.commands import icrtool as command_line
+
+ROOT = Path(__file__).resolve().parents[1]
+
+ELSEWHERE = {
+    "docs/ci.md": "tests/e2e/test_ci.py runs its jobs",
+    "docs/tutorial.md": "tests/test_docs_site.py runs it in order",
+    "docs/how-to/another-robot.md": "tests/test_docs_site.py runs it in order",
+    "docs/how-to/controllers.md": "tests/test_docs_site.py runs it in order",
+    "docs/how-to/notebook.md": "tests/test_docs_site.py runs it in order",
+}
+NOT_RUN = {
+    "icrtool batch /shared/season -o /shared/results --scheduler tcp://host:8786": "needs a cluster; "
+    "tests/unit/fleet/test_cluster.py runs one of Dask on this machine",
+}
+FEWER = {
+    "study": ["--runs", "2", "--duration", "20"], "simulate": ["--duration", "60"],
+    "fit": ["--plots", "none"], "dropout-report": ["--plots", "none"], "batch": ["--plots", "none", "--no-ladder"],
+}  # fmt: skip
+"""Options added so that a command takes a second, not minutes; pictures are drawn by the tests of each command."""
+
+MEANT = {"icrtool-runs/*": ["icrtool-runs/field"], "RUN": ["icrtool-runs/field"]}
+"""What a word of a page stands for here: the folder also has runs of other robots."""
+
+
+def shown_commands() -> Iterator[tuple[str, str]]:
+    """Yield page and command of every line of code that begins with ``icrtool``, without comment and pipe."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        name = page.relative_to(ROOT).as_posix()
+        text = page.read_text(encoding="utf-8")
+        blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL) + re.findall(r"(?:^    .*\n)+", text, re.MULTILINE)
+        for line in "\n".join(blocks).splitlines():
+            if line.strip().startswith("icrtool ") and name not in ELSEWHERE:
+                yield name, shlex.join(shlex.split(line, comments=True)).partition(" '|' ")[0]
+
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+COMMANDS: dict[str, str] = {}
+for found_on, line in shown_commands():
+    if line not in NOT_RUN and f"{line}\n" not in TUTORIAL:
+        COMMANDS.setdefault(line, found_on)
+"""Each command once, and a page that shows it."""
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(command_line, list(words))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with what the pages name: logs, runs, calibrations, a comparison, a plan."""
+    folder = tmp_path_factory.mktemp("pages")
+    with contextlib.chdir(folder):
+        Path("sample_logs").symlink_to(ROOT / "sample_logs")
+        robot = ["--robot", "husky-a200"]
+        options = [*robot, "--path", "lawnmower", "--speed", "0.8", "--duration", "45", "--wheel-rate", "20",
+                   "--heading-rate", "20", "--gnss-rate", "5"]  # fmt: skip
+        for log, seed in {"field.mcap": "1", "other.bag": "2", "season/a.mcap": "3"}.items():
+            Path(log).parent.mkdir(exist_ok=True)
+            assert run("simulate", "-o", log, "--seed", seed, *options).exit_code == 0
+        fits = {"field.mcap": "icrtool-runs/field", "season/a.mcap": "season1/a"}
+        for log, directory in fits.items():
+            assert run("fit", log, *robot, "--plots", "none", "-o", directory, "-q").exit_code == 0
+        shutil.copytree("icrtool-runs/field", "season2/field")
+        assert run("calibrate", "icrtool-runs/field", "-o", "season.json", "-q").exit_code == 0
+        assert run("compare", "season1/", "season2/", "-o", "comparison.json", "-q").exit_code == 0
+        Path("plan.csv").write_text("east_m,north_m\n0,0\n5,0\n5,8\n", encoding="utf-8")
+        yield folder
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_that_a_page_shows_runs(folder: Path, command: str) -> None:
+    name, *words = shlex.split(command)[1:]
+    words = [part for word in words for part in MEANT.get(word, [word])]
+    result = run(name, *words, *FEWER.get(name, []))
+    assert result.exit_code == 0, (COMMANDS[command], result.output, result.exception)
+
+
+def test_what_is_run_elsewhere_or_not_at_all_is_still_shown() -> None:
+    shown = {command for _, command in shown_commands()}
+    assert set(NOT_RUN) <= shown
+    assert all((ROOT / page).is_file() for page in ELSEWHERE)
+    assert len(COMMANDS) > 20

@@ -1,0 +1,108 @@
+"""The schemas of the documents: they are those of the code, documents keep to them, and no key is undocumented."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import pytest
+
+from icrtool.calibration.forecast import forecast_drive
+from icrtool.calibration.from_runs import calibrate
+from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.transfer import compare_groups
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.estimation.fit import fit
+from icrtool.fleet.fleet_files import fleet_document
+from icrtool.fleet.roll_up import PooledCalibration
+from icrtool.fleet.row import File, GateVerdict, Row
+from icrtool.output.dropout_directory import report_document
+from icrtool.output.json_file import json_bytes
+from icrtool.output.tables.forecast import forecast_document
+from icrtool.output.tables.transfer import transfer_document
+from icrtool.records.text import LogText
+from support.barn import configured, simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def load_script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("schemas", ROOT / "scripts" / "schemas.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+SCRIPT = load_script()
+
+
+@pytest.fixture(scope="module")
+def documents() -> dict[str, Any]:
+    """A document of every kind, read back from JSON."""
+    run, twin = (fit(simulate(turn_mps=turn), configured()) for turn in (0.25, 0.3))
+    other = replace(twin, summary={**twin.summary, "inputs": [{"path": "b", "bytes": 1, "sha256": "b"}]})
+    calibration = calibrate(run)
+    report = dropout_report(
+        run, horizons_m=(1.0, 5.0), outage_s=(4.0,), gates=("icr.p95@5m <= 0.001",), calibrations=[calibration],
+        without_events=True,
+    )  # fmt: skip
+    verdicts = (GateVerdict("icr.p95@5m <= 1", 0.5, 0.5, passed=True),)
+    row = Row("a.bag", "runs/a", "done", verdicts=verdicts, inputs=(File("a.bag", 1, 2, "ab"),), icr={"x_icr_m": None})
+    pooled = PooledCalibration("jackal", "grass", ("a.bag",), ())
+    found = {
+        "run": run.summary,
+        "dropout": report_document(report),
+        "calibration": calibration.summary(),
+        "compare": transfer_document(compare_groups({LogText("one"): [run], LogText("two"): [other]})),
+        "forecast": forecast_document(forecast_drive(calibration, recording_of(run)), calibration, (0.5,)),
+        "fleet": fleet_document([row], [pooled]),
+    }
+    return {name: json.loads(json_bytes(document)) for name, document in found.items()}
+
+
+def test_the_schemas_in_the_documentation_are_those_of_the_code() -> None:
+    stored = {file.name: file.read_text(encoding="utf-8") for file in SCRIPT.FOLDER.glob("*.json")}
+    assert stored == SCRIPT.schemas(), "run scripts/schemas.py"
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPT.DOCUMENTS))
+def test_a_document_keeps_to_its_schema(documents: dict[str, Any], name: str) -> None:
+    msgspec.convert(documents[name], SCRIPT.DOCUMENTS[name])
+    damaged = {**documents[name], "schema": f"icrtool/{name}/2"}
+    with pytest.raises(msgspec.ValidationError, match="schema"):
+        msgspec.convert(damaged, SCRIPT.DOCUMENTS[name])
+
+
+def undocumented(value: Any, schema: dict[str, Any], whole: dict[str, Any], place: str = "") -> Iterator[str]:
+    """Yield the keys of a document that its schema does not have."""
+    if "$ref" in schema:
+        schema = whole["$defs"][schema["$ref"].rpartition("/")[2]]
+    for choice in schema.get("anyOf", ()):
+        if value is not None and choice.get("type") != "null":
+            yield from undocumented(value, choice, whole, place)
+    if isinstance(value, list):
+        for one in value[:3]:
+            yield from undocumented(one, schema.get("items", {}) or {}, whole, place)
+    known, others = schema.get("properties"), schema.get("additionalProperties")
+    for key, one in value.items() if isinstance(value, dict) else ():
+        if known is not None and key in known:
+            yield from undocumented(one, known[key], whole, f"{place}.{key}")
+        elif isinstance(others, dict):
+            yield from undocumented(one, others, whole, f"{place}.{key}")
+        elif known is not None:
+            yield f"{place}.{key}"
+
+
+# The schema of run.json is what a run must hold to be read; it has further keys that only inform.
+@pytest.mark.parametrize("name", sorted(set(SCRIPT.DOCUMENTS) - {"run"}))
+def test_no_key_is_undocumented(documents: dict[str, Any], name: str) -> None:
+    schema = json.loads(SCRIPT.schemas()[f"{name}-1.json"])
+    assert not list(undocumented(documents[name], schema, schema))

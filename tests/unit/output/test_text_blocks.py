@@ -1,0 +1,56 @@
+"""Text with tables: plain where it is piped, by rich on a terminal."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from icrtool.cli.terminal import show
+from icrtool.output.text_blocks import TEXT_WIDTH, Line, Table, Text, labelled
+
+TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
+
+
+def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
+    assert Text([TABLE]).splitlines() == ["stream        rate", "wheels     50.0 Hz", "a [bold]b  1.25 Hz"]
+
+
+def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
+    words = " ".join(["word"] * 60)
+    (first, *later) = Text([words]).splitlines()
+    assert len(first) <= TEXT_WIDTH
+    assert all(line.startswith("  word") for line in later)
+    assert Text([Line(words, "as is")]) == words
+    (first, *later) = Text(labelled([("drive", words), ("", "next")])).splitlines()
+    assert first.startswith("drive       word")
+    assert [line[:13] for line in later] == [f"{'':12}w"] * (len(later) - 1) + [f"{'':12}n"]
+
+
+PAGE = Text([Line("NOT USABLE: x", "bad"), TABLE, *labelled([("drive", " ".join(["word"] * 30))])])
+
+
+def test_a_terminal_gets_its_width_and_colours_and_no_markup_of_a_log(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, value in (("TERM", "xterm-256color"), ("COLUMNS", "60")):
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    show(PAGE)
+    shown = capsys.readouterr().out
+    assert "\x1b[1;31mNOT USABLE: x" in shown
+    assert "a [bold]b" in shown
+    monkeypatch.setenv("NO_COLOR", "1")
+    show(PAGE)
+    plain = capsys.readouterr().out
+    assert "\x1b[1;31m" not in plain
+    assert max(map(len, plain.splitlines())) <= 60 + 8
+    monkeypatch.setenv("TERM", "dumb")
+    show(PAGE)
+    assert capsys.readouterr().out == f"{PAGE}\n"
+
+
+def test_a_pipe_gets_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    show(PAGE)
+    assert capsys.readouterr().out == f"{PAGE}\n"
