@@ -132,7 +132,7 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
-    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t))), (), stands=stands)
+    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
     if problem.courses < FEWEST_COURSES:
         return None
     noises = problem.usual()
@@ -278,9 +278,11 @@ class _Problem:
         from icrtool.kernels.heading_kalman import filter_headings, smooth_headings
 
         events, model = self.events(noises), self.model(noises)
-        states, _ = smooth_headings(events, model, filter_headings(events, model))
+        states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
-        return Guess(bias, float(states[-1, X]), float(states[-1, DELAY]), self.middle)
+        bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
+        x, late = float(states[-1, X]), float(states[-1, DELAY])
+        return Guess(bias, float(bias_std), float(scale_std), x, late, self.middle)
 
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate with some noises."""

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.gnss_steps import unbroken
-from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, WHEELS_CORRELATION_S, DerivedHeading
+from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.heading_offset_cause import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -226,12 +226,11 @@ def align_estimated_heading(
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
     std = derived.estimate.median_std
-    correlation_s = WHEELS_CORRELATION_S if derived.source == "wheels_course" else 0.0
     own = HeadingAlignment(
         source=derived.source, parts=derived.why, windows=0, offset_rad=math.nan, offset_std_rad=math.nan,
         scatter_rad=math.nan,
         agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
-        applied_std_rad=0.0, applied_correlation_s=correlation_s, std_rad=std, name=NO_NAME,
+        applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std, name=NO_NAME,
         warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
     )  # fmt: skip
     if stated is None or derived.attitude_offset is None:
@@ -243,7 +242,7 @@ def align_estimated_heading(
         notes = [f"{log.name}: {_offset_note(text, offset)}"]
     return replace(
         stated, source=own.source, parts=own.parts, offset_rad=offset, offset_std_rad=offset_std,
-        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=own.applied_correlation_s, std_rad=std,
+        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std,
         name=name, warnings=tuple(notes),
     )  # fmt: skip
 

@@ -120,7 +120,7 @@ def take_heading(
 
 @njit
 def advance(
-    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, x: Floats, P: Floats,
+    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, turn_variance: float, x: Floats, P: Floats,
     parameters: FilterParameters,
 ) -> float:  # fmt: skip
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
@@ -141,6 +141,7 @@ def advance(
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]
+    P[11] += turn_variance * dt
     return travelled
 
 
@@ -181,7 +182,10 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 t_next = min(t_next, data.change_t[c])
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
-                travelled += advance(dt, in_gap, slips, data.v_left[held], data.v_right[held], x, P, parameters)
+                travelled += advance(
+                    dt, in_gap, slips, data.v_left[held], data.v_right[held],
+                    data.turn_variance[held] if held < len(data.turn_variance) else 0.0, x, P, parameters,
+                )  # fmt: skip
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):

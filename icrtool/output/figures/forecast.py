@@ -24,7 +24,7 @@ def draw_forecast(forecast: Forecast, title: str, budgets_m: tuple[float, ...]) 
     subtitle = "Forecast error without GNSS from the start: wheels alone, by the calibration"
     figure = new_figure(title, subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
     grown, path = figure.subplots(1, 2)
-    figure.subplots_adjust(wspace=0.28, **inches(figure, left=0.7, right=0.25, top=0.75, bottom=0.6))
+    figure.subplots_adjust(wspace=0.28, **inches(figure, left=0.7, right=0.25, top=0.75, bottom=0.95))
     grown.plot(forecast.distance_m, forecast.p95_m, label="95 %", **ICR.keywords())
     grown.plot(forecast.distance_m, forecast.expected_m, label="expected", **FILTER.keywords())
     for budget in budgets_m:
@@ -35,20 +35,20 @@ def draw_forecast(forecast: Forecast, title: str, budgets_m: tuple[float, ...]) 
         )  # fmt: skip
     if forecast.distance_m[-1] > MEASURED_TO_M:
         grown.axvline(MEASURED_TO_M, label="measured up to here", **MEAN.keywords())
-    grown.set_xlabel("distance without GNSS [m]")
-    grown.set_ylabel("position error [m]")
+    grown.set_xlabel("Distance without GNSS [m]")
+    grown.set_ylabel("Error [m]")
     grown.set_xlim(0.0, None)
     grown.set_ylim(0.0, None)
-    grown.legend(loc="upper left")
-    path.plot(forecast.east_m, forecast.north_m, label="path", **FILTER.keywords())
-    every = max(len(forecast.distance_m) // CIRCLES, 1)
-    rows = np.arange(every - 1, len(forecast.distance_m), every)
+    path.plot(forecast.east_m, forecast.north_m, label="path", **HALF_WIDTH.keywords() | {"linestyle": "-"})
+    # Where the forecast is extrapolated its circles would bury the path.
+    measured = np.flatnonzero(forecast.distance_m <= MEASURED_TO_M)
+    rows = measured[:: max(len(measured) // CIRCLES, 1)]
     size = 2.0 * forecast.p95_m[rows]
     circles = EllipseCollection(
         size, size, np.zeros(len(rows)), units="xy", offset_transform=path.transData, edgecolors=ICR.color,
         facecolors="none", linewidths=0.8, offsets=np.column_stack([forecast.east_m[rows], forecast.north_m[rows]]),
     )  # fmt: skip
-    path.plot([], [], label="95 % of the errors", color=ICR.color, linewidth=0.8)
+    path.plot([], [], label=f"95 % of the errors, up to {MEASURED_TO_M:g} m", color=ICR.color, linewidth=0.8)
     path.add_collection(circles)
     path.update_datalim(
         [(e + a * r, n + a * r) for e, n, r in zip(forecast.east_m[rows], forecast.north_m[rows], size / 2, strict=True)
@@ -56,7 +56,7 @@ def draw_forecast(forecast: Forecast, title: str, budgets_m: tuple[float, ...]) 
     )  # fmt: skip
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
-    path.set_xlabel("east [m]")
-    path.set_ylabel("north [m]")
-    path.legend(loc="best")
+    path.set_xlabel("East [m]")
+    path.set_ylabel("North [m]")
+    figure.legend(loc="lower center", ncols=5, columnspacing=1.8)
     return figure
