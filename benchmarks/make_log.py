@@ -70,7 +70,7 @@ def make_logs(folder: Path, seconds: float) -> dict[str, Path]:
 
 
 def add_images(log: Path, target: Path, gigabytes: float) -> Path:
-    """Copy an MCAP log in chunks of rosbag2's size and add images: 640 x 480 rgb8, compressible by half as real ones."""
+    """Copy an MCAP log in chunks of rosbag2's size and add images: 640 x 480 rgb8, half as large when compressed."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
