@@ -63,6 +63,8 @@ def forecast_plan(
     DataError
         A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
     """
+    if not (np.isfinite(north_m).all() and np.isfinite(east_m).all()):
+        raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
     path, line = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
     step = np.diff(path)
     direction = np.unwrap(np.angle(step))
@@ -129,8 +131,6 @@ def _ahead_and_turn(fitted: FittedModel, width_m: float, v: Floats, w: Floats) -
 
 def _resampled(points: Complexes) -> tuple[Complexes, Ints]:
     """Return points (n,) a step apart along straight lines between points (p,), and the line (n,) that each lies on."""
-    if not np.isfinite(points).all():
-        raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
     length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     if not 1.0 <= length[-1] <= LONGEST_PATH_M:
         raise DataError("plan", f"a path of {length[-1]:.3g} m", f"give 1 m to {LONGEST_PATH_M:g} m")

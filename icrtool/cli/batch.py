@@ -77,7 +77,7 @@ def command(
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
     from icrtool.fleet.fleet_files import PLOTS, calibrations_text, fleet_document, write_fleet
     from icrtool.fleet.roll_up import pooled_calibrations
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import check_place, write_file
 
     asked = BatchOptions(
         config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
@@ -110,8 +110,7 @@ def command(
 
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
-        with atomic_file(markdown) as file:
-            file.write_bytes(format_fleet_markdown(rows, missing).encode("utf-8", errors="backslashreplace"))
+        write_file(markdown, format_fleet_markdown(rows, missing))
     if compared is not None:
         options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
     if page:

@@ -42,7 +42,7 @@ def command(
       icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import check_place, write_file
     from icrtool.output.calibration_file import open_calibration
     from icrtool.output.figures.calibration_picture import check_picture, write_forecast_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast
@@ -54,8 +54,7 @@ def command(
     calibration = open_calibration(calibration_file)
     forecast = _forecast(calibration, path)
     if output is not None:
-        with atomic_file(output) as partial:
-            partial.write_text(forecast_csv(forecast), encoding="utf-8")
+        write_file(output, forecast_csv(forecast))
     if plot is not None:
         write_forecast_picture(forecast, path.name, budgets, plot)
     if as_json:

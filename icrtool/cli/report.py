@@ -55,10 +55,10 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     import json
 
     from icrtool.errors import RunError
+    from icrtool.output.atomic_file import write_file
     from icrtool.output.json_file import schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
     from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
-    from icrtool.output.page.render import write_html
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
@@ -72,7 +72,7 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     else:
         what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
         raise RunError(source, what, "icrtool fit, batch and compare make one")
-    write_html(page, place)
+    write_file(place, page)
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:

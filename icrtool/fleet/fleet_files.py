@@ -12,7 +12,7 @@ import msgspec
 from icrtool import __version__
 from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
 from icrtool.fleet.row import Row, columns_of
-from icrtool.output.atomic_file import atomic_file
+from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
 
@@ -55,17 +55,17 @@ def write_fleet(
     """
     columns = columns_of(rows)
     cells = [row.columns() for row in rows]
-    _write(directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]))
+    write_file(directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]))
     failures = [msgspec.to_builtins(row) for row in rows if row.status == "failed"]
-    _write(directory / "failures.csv", csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
+    write_file(directory / "failures.csv", csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
     with atomic_file(directory / "fleet.parquet") as file:
         _write_parquet(columns, cells, file)
     if calibrations:
-        _write(directory / "calibrations.txt", calibrations_text(calibrations).encode("utf-8", "backslashreplace"))
+        write_file(directory / "calibrations.txt", calibrations_text(calibrations))
     if plots:
         write_figures(rows, directory / PLOTS, tuple(plots))
     # Last: where it is, the others are of the same batch.
-    _write(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
+    write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
 
 
 def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
@@ -108,11 +108,6 @@ def reason_of(row: Row) -> str:
     """Return why a log failed without what is particular to it: the second part of ``what: why; advice``."""
     parts = row.reason.split(": ", 1)
     return parts[-1].split(";")[0].split(" (tried")[0]
-
-
-def _write(path: Path, content: bytes) -> None:
-    with atomic_file(path) as file:
-        file.write_bytes(content)
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:

@@ -78,7 +78,7 @@ def process(request: Request, stage: Stage) -> Row:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.atomic_file import atomic_file
+    from icrtool.output.atomic_file import write_file
 
     begun = time.monotonic()
     try:
@@ -89,8 +89,7 @@ def process(request: Request, stage: Stage) -> Row:
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     row_file = path_of(request.row_file)
     row_file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(row_file) as file:
-        file.write_bytes(msgspec.json.encode(row))
+    write_file(row_file, msgspec.json.encode(row))
     return row
 
 

@@ -153,6 +153,9 @@ def robust_least_squares(
                 break
             step = step / 2.0
             tried = evaluate(x + step)
+        else:
+            # no part of the step lowers the cost: the Jacobian of noisy data shows no further
+            break
         x, (residuals, jacobian) = x + step, tried
     scale = scale_by_kind(residuals, kinds)
     groups = np.arange(len(residuals)) if group is None else group
@@ -209,6 +212,9 @@ def sandwich_covariance(
     meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
     inverse = np.linalg.solve(information, np.eye(len(pull)))
     sandwich = inverse @ meat @ inverse
+    if not (np.diag(sandwich) > 0.0).all():
+        # rounding: weights that differ by hundreds of decades
+        sandwich = inverse
     # exact data that do not separate the parameters leave no finite covariance
     with np.errstate(over="ignore", invalid="ignore"):
         grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))

@@ -19,7 +19,7 @@ from icrtool.errors import DataError, DefinitionError
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import split_files
-from icrtool.logs.cut import Moment, cut_of, moment
+from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE, find_gyro, find_gyros
@@ -35,7 +35,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.stamps import StampedRows, usable_rows
+from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
@@ -209,9 +209,10 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
             f"{name}: one stream has no header stamps, and the header stamps of another are far from log time; "
             "log time is used for all streams"
         )
-    for role, one in (("wheels", motion), ("gnss", position), ("heading", source)):
-        if one is not None and one.stamps.note and one.stamps.note != "no header":
-            warnings.append(f"{name}: {role}: {one.stamps.note}; log time is used")
+    chosen: tuple[tuple[Role, WheelMotion | PositionSource | HeadingSource | None], ...]
+    chosen = (("wheels", motion), ("gnss", position), ("heading", source))
+    notes = [note for role, one in chosen if one is not None for note in clock_notes(one.stamps, name, role)]
+    warnings += list(dict.fromkeys(notes))
     gnss, datum, rejected = _fixes(position, config, clock, name)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
@@ -237,11 +238,12 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     ]
     stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
     gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, stamps)
-    return RobotLog(
+    log = RobotLog(
         name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro,
         find_gyros(survey.tables, clock, stamps),
         _other_receivers(survey.candidates, position, datum, config, clock, name),
     )  # fmt: skip
+    return longest_part(log)
 
 
 def _other_receivers(

@@ -20,6 +20,8 @@ from icrtool.records.text import LogText
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
+_MOST_FIELDS = 100
+"""Of a header; real ones have ten at most."""
 
 
 class _Record(NamedTuple):
@@ -221,8 +223,11 @@ class Ros1Bag(ChunkedFile):
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:
     """Return the fields of a record's or a connection's header by name."""
-    fields, place = {}, 0
-    while place + 4 <= len(header):
+    fields: dict[bytes, bytes] = {}
+    place = 0
+    for _ in range(_MOST_FIELDS):
+        if place + 4 > len(header):
+            break
         end = place + 4 + int.from_bytes(header[place : place + 4], "little")
         name, _, value = header[place + 4 : end].partition(b"=")
         fields[name] = value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,26 @@ _MOST_BYTES_AT_ONCE = 1 << 24
 """Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
 
 
+class SetBack(NamedTuple):
+    """How far log time goes back at most from one stored message to the next, and how mixed messages are once sorted.
+
+    Attributes
+    ----------
+    step_ns : the largest step back
+    pieces : into how many a stretch between such steps is cut by sorting, in the mean: 1 where the stretches only
+        change places, about 2 where single messages are out of place, many where times come again
+    """
+
+    step_ns: int
+    pieces: float
+
+
+NOT_SET_BACK = SetBack(0, 0.0)
+
+NEAR_NS = 2_000_000_000
+"""Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
+
+
 @dataclass(frozen=True, slots=True)
 class TopicTable:
     """All messages of one topic, in log-time order.
@@ -46,6 +66,7 @@ class TopicTable:
     texts : the distinct texts of each text field
     unreadable : messages that did not have the shape of their type
     definition_source : where the message definition came from
+    set_back : of the clock that the messages were logged with
     """
 
     topic: LogText
@@ -55,6 +76,7 @@ class TopicTable:
     texts: dict[str, list[LogText]]
     unreadable: int
     definition_source: str
+    set_back: SetBack = NOT_SET_BACK
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -325,7 +347,16 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
+            NOT_SET_BACK if order is None else _set_back(times, order),
         )
+
+
+def _set_back(times: Ints, order: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting by `order` (n,) does to the stretches between."""
+    steps = np.diff(times)
+    stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
+    pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
+    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
@@ -365,7 +396,10 @@ def _merged(group: list[TopicTable]) -> TopicTable:
             renumber = [np.array([*(places[text] for text in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
         columns[path] = _joined(parts, -1 if path in texts else 0)[order]
-    return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)
+    set_back = max(table.set_back for table in group)
+    return replace(
+        group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable, set_back=set_back
+    )
 
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:

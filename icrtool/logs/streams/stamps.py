@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import Bools, Ints
+from icrtool.errors import DataError
+from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
+from icrtool.records.tables import Bools, Ints, Role
 
-NEAR_NS = 2_000_000_000
-"""A header stamp this far from the log time (median) is another clock's: GPS time is 18 s off, a dead RTC years."""
+MOST_PIECES = 10.0
+"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
 
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
@@ -27,12 +29,16 @@ class StampedRows:
     log_ns : (n,) log times
     note : why the header's are not used, empty when they are
     delay_ns : median of log time minus header stamp, 0 without header stamps
+    replaced : header stamps of another clock that log times stand for
+    set_back : as `TopicTable.set_back`
     """
 
     header_ns: Ints | None
     log_ns: Ints
     note: str
     delay_ns: int
+    replaced: int = 0
+    set_back: SetBack = NOT_SET_BACK
 
     def on(self, clock: Literal["header", "log"]) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
@@ -41,6 +47,10 @@ class StampedRows:
 
 def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
+    return replace(_usable(table, path), set_back=table.set_back)
+
+
+def _usable(table: TopicTable, path: str) -> StampedRows:
     log_ns = table.log_time_ns
     if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
@@ -52,12 +62,35 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    far = np.abs(log_ns - header - delay) > NEAR_NS
-    header[far] = log_ns[far] - delay
+    other = np.abs(log_ns - header - delay) > NEAR_NS
+    header[other] = log_ns[other] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
-    return StampedRows(header, log_ns, "", delay)
+    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)))
+
+
+def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
+    """Yield sentences about clocks that cannot be used, or that were set.
+
+    Raises
+    ------
+    DataError
+        The clock was set back, and times came again: nothing shows which of two samples came first.
+    """
+    if rows.set_back.pieces > MOST_PIECES:
+        why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
+        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
+    if rows.set_back.step_ns > NEAR_NS:
+        yield (
+            f"{name}: log time goes back by {rows.set_back.step_ns / 1e9:.0f} s; messages are sorted; if the clock was "
+            "set while recording, fit each part alone (--from, --to)"
+        )
+    if rows.note and rows.note != "no header":
+        yield f"{name}: {role}: {rows.note}; log time is used"
+    if rows.replaced > 1:
+        counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+        yield f"{name}: {role}: {counted}; log time is used for them"
 
 
 def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:

@@ -140,7 +140,9 @@ def _unwound(positions: Floats) -> Floats:
     """
     unwound = positions
     for place, column in enumerate(positions.T):
-        if not float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf)) <= ONE_TURN_RAD:
+        with np.errstate(invalid="ignore"):  # infinite ones are left out later
+            spread = float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf))
+        if not spread <= ONE_TURN_RAD:
             continue
         finite = np.flatnonzero(np.isfinite(column))
         steps = np.abs(np.diff(column[finite]))

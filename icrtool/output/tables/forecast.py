@@ -11,6 +11,7 @@ import numpy as np
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.errors import RunError
+from icrtool.logs.table_file import csv_frame
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text
 from icrtool.records.tables import Floats
@@ -39,7 +40,7 @@ def read_plan(file: Path) -> tuple[Floats, Floats, Floats | None]:
     try:
         if file.stat().st_size > LARGEST_PLAN_BYTES:
             raise RunError(file, f"larger than {LARGEST_PLAN_BYTES / 1e6:g} MB", "thin out its points")
-        table = pd.read_csv(file, skipinitialspace=True)
+        table = csv_frame(file)
     except OSError as err:
         raise RunError(file, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:
