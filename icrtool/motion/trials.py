@@ -20,7 +20,6 @@ from icrtool.motion.recording import (
 )
 from icrtool.records.tables import Complexes, Floats, Ints
 
-
 STARTS_A_CALL = 1 << 16
 """States of which the trials are cut, or driven, at a time."""
 
