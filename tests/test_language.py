@@ -58,7 +58,12 @@ PAGES = (
     "README.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
-    *(f"docs/{page}.md" for page in ("architecture", "configuration", "equations", "paper")),
+    "sample_logs/README.md",
+    *(
+        page.relative_to(ROOT).as_posix()
+        for page in sorted((ROOT / "docs").rglob("*.md"))
+        if page.name != "glossary.md"
+    ),
 )
 
 

@@ -75,7 +75,7 @@ def command(
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
-    robot.wheel_radius_m=… give what the messages do not.
+    robot.wheel_radius_m=… give what the messages do not hold.
 
     \b
     Example:
