@@ -22,6 +22,7 @@ DONE: tuple[str, ...] = (
     "errors",
     "estimation",
     "figures",
+    "fleet",
     "kernels",
     "logs",
     "calibration",
