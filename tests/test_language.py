@@ -25,6 +25,7 @@ DONE: tuple[str, ...] = (
     "fleet",
     "kernels",
     "logs",
+    "calibration",
     "motion",
     "records",
     "simulation",
@@ -39,6 +40,7 @@ DONE: tuple[str, ...] = (
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PUBLISHED = (
+    "way_noise",
     "gyro_course",
     "wheels_course",
     "too_little_way_left",

@@ -110,7 +110,7 @@ def predicted_path(
     Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
     of = steps if steps is not None else joined_steps(recording, 1)
-    gyro = of.gyro_read(own.gyro_later_s)[0] if fitted.model.uses_gyro else of.gyro
+    gyro = of.gyro + own.gyro_later_s * of.gyro_change()
     v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left, of.v_right, recording.width_m, gyro))
     turned = of.held * (omega + own.gyro_bias_radps)
     heading = np.concatenate([[0.0], np.cumsum(turned)])
