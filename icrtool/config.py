@@ -22,6 +22,9 @@ LARGEST_FILE_BYTES = 1 << 20
 MOST_LISTED = 1000
 """Horizons, or outages."""
 
+_DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]+\s*\.\s*){64}")
+"""So many parts of a key, one after the other."""
+
 _BARE_POINT = re.compile(r"(?<![\w.])(?=\.\d)|(?<=\d\.)(?![\w.])|(?<=\d\.)(?=[eE])")
 """Places in numbers where TOML, but no person, asks for a zero."""
 
@@ -281,13 +284,28 @@ def _read_toml(path: Path) -> dict[str, Any]:
             raise ConfigError(path, "not a file", "a configuration is a TOML file")
         if status.st_size > LARGEST_FILE_BYTES:
             raise ConfigError(path, f"{status.st_size} bytes long", f"a configuration has at most {LARGEST_FILE_BYTES}")
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(path.read_text(encoding="utf-8-sig"))
     except RecursionError as err:
         raise ConfigError(path, "not a configuration", "its values are nested too deeply") from err
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:  # no UTF-8, no TOML, or an integer longer than Python reads
         raise ConfigError(path, "not a TOML file", str(err)) from err
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return what a TOML text holds.
+
+    Raises
+    ------
+    RecursionError
+        Its values, or the parts of its keys, are nested too deeply: tomllib takes gigabytes for a key of 20,000 parts.
+    ValueError
+        It is no TOML.
+    """
+    if _DEEP_KEY.search(text):
+        raise RecursionError
+    return tomllib.loads(text)
 
 
 def _parse_set(text: str) -> dict[str, Any]:
@@ -306,7 +324,7 @@ def _parse_value(value: str, key: str) -> Any:  # noqa: ANN401 - whatever TOML h
     """Return a value as TOML reads it, with numbers as people type them (``.08``, ``1.``); else it is a text."""
     for text in (value, _BARE_POINT.sub("0", value)):
         try:
-            return tomllib.loads(f"value = {text}")["value"]
+            return parse_toml(f"value = {text}")["value"]
         except RecursionError as err:
             raise ConfigError(key, "its value is nested too deeply") from err
         except ValueError:
@@ -337,6 +355,8 @@ def _flaw(value: object) -> str | None:
     # An argument that is not UTF-8 comes with lone surrogates, which no JSON file takes.
     if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
         return "not text in UTF-8"
+    if isinstance(value, str) and not value.isprintable():
+        return "has characters that do not print"
     return None
 
 

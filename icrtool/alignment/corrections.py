@@ -186,9 +186,9 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             raise
         raise DataError(
             log.name,
-            f"no heading in it, and positions of ±{drive.fix_std_m:.1f} m show none at this speed "
-            f"({drive.travel[-1]:.0f} m in {drive.wheel_t[-1]:.0f} s)",
-            "record an orientation (AHRS), use RTK, or drive faster",
+            f"no heading in it, and positions of ±{drive.fix_std_m:.1f} m show none over so short a drive "
+            f"({drive.travel[-1]:.0f} m)",
+            "record an orientation (AHRS), use RTK, or drive several times as far",
         ) from error
 
 

@@ -23,8 +23,13 @@ from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.kernels.robust import huber_weights, mad_std
 from icrtool.records.tables import Complexes, Floats
 
-COURSE_WINDOW_M, COURSE_IN_POSITION_STD = 1.0, 12.0
-LONGEST_COURSE_S = 10.0
+COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
+ENOUGH_COURSES = 24.0
+"""A course is as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
+
+LARGEST_TURN_ERROR_RAD = 2.0
+"""A course is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
+
 FEWEST_FIXES = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
 
@@ -32,8 +37,8 @@ SPIKE_SIGMAS = 8.0
 MIDDLE_NOISE = 0.01
 """Turns that change the sides' speeds by less than this show no middle."""
 
-LONGEST_STRETCH_S = 30.0
-"""Courses further apart are not compared."""
+LONGEST_STRETCH_S = 60.0
+"""Displacements that take longer, or are further apart, are not compared without a turn rate."""
 
 
 class TurnRate(NamedTuple):
@@ -83,9 +88,12 @@ class Guess(NamedTuple):
     bias : (n,) of the turn rate at its samples [rad/s]
     x : ICR ahead of the antenna [m]; late : delay of the positions [s]
     middle : how much the antenna's speed grows with half the speed difference of the sides (left - right)
+    bias_std, scale_std : what is not known of bias [rad/s] and scale
     """
 
     bias: Floats
+    bias_std: float
+    scale_std: float
     x: float = 0.0
     late: float = 0.0
     middle: float = 0.0
@@ -155,7 +163,8 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
     square = np.maximum(product(path).real, 1e-12)
     seen = product(centred(place)) / square
-    kept = (t[end] - t[begin] < LONGEST_COURSE_S) & (np.abs(seen) > 0.3)
+    unknown = guess.bias_std * (t[end] - t[begin]) + guess.scale_std * np.abs(turned[end] - turned[begin])
+    kept = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(seen) > 0.3)
     kept &= np.abs(whole[end] - whole[begin]) > 0.5 * length * (count - 1) / count
     gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
     kept &= np.searchsorted(gap, t[begin]) == np.searchsorted(gap, t[end])
@@ -199,14 +208,17 @@ def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
     begin, end = edge[:-1], edge[1:] - 1
     went = np.interp(t[end], drive.wheel_t, along) - np.interp(t[begin], drive.wheel_t, along)
     seen = (place[end] - place[begin]) * np.sign(went)
-    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went)) & (t[end] - t[begin] < LONGEST_COURSE_S)
+    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
+    kept &= t[end] - t[begin] < LONGEST_STRETCH_S
     middle, seen = ((t[begin] + t[end]) / 2)[kept], seen[kept]
     near = np.diff(middle) < LONGEST_STRETCH_S
     return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]
 
 
 def _course_length(drive: DriveArrays) -> float:
-    return max(COURSE_WINDOW_M, COURSE_IN_POSITION_STD * min(drive.fix_std_m, 10.0))
+    std = min(drive.fix_std_m, 10.0)
+    short = max(float(drive.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
+    return max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
 
 
 def _edges(gone: Floats, length: float) -> np.ndarray:

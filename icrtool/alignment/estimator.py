@@ -140,8 +140,10 @@ class AlignmentFit(NamedTuple):
 
     @property
     def heading_scatter(self) -> float:
-        """Robust scatter of the heading [rad], across windows or within a second, whichever is more."""
-        return max(self.across_std, float(self.fit.scale[-1]) / math.sqrt(2.0))
+        """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
+        noise = math.sqrt(2.0) * self.drive.fix_std_m / self.windows.length_m
+        across = math.sqrt(max(self.across_std**2 - noise**2, 0.0))
+        return max(across, float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
     def across_std(self) -> float:

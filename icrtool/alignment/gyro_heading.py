@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -131,7 +132,7 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
-    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t))), (), stands=stands)
+    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
     if problem.courses < FEWEST_COURSES:
         return None
     noises = problem.usual()
@@ -277,9 +278,11 @@ class _Problem:
         from icrtool.kernels.heading_kalman import filter_headings, smooth_headings
 
         events, model = self.events(noises), self.model(noises)
-        states, _ = smooth_headings(events, model, filter_headings(events, model))
+        states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
-        return Guess(bias, float(states[-1, X]), float(states[-1, DELAY]), self.middle)
+        bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
+        x, late = float(states[-1, X]), float(states[-1, DELAY])
+        return Guess(bias, float(bias_std), float(scale_std), x, late, self.middle)
 
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate with some noises."""
@@ -348,11 +351,12 @@ class _Problem:
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]
-        x, P = causal.x[last], causal.P[last]
-        carried = x[:, PSI] + (1 + x[:, SCALE]) * dG - x[:, BIAS] * dt
-        f = np.zeros((len(rows), x.shape[1]))
-        f[:, PSI], f[:, BIAS], f[:, SCALE] = 1.0, -dt, dG
-        variance = np.einsum("ni,nij,nj->n", f, P, f) + noises["angle"] ** 2 * dt
+        x, P = causal.x, causal.P
+        carried = x[last, PSI] + (1 + x[last, SCALE]) * dG - x[last, BIAS] * dt
+        variance = noises["angle"] ** 2 * dt
+        f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
+        for i, j in product(f, f):
+            variance += f[i] * P[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         scaled = (1 + constants[SCALE]) * G
         smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))

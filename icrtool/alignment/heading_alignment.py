@@ -11,11 +11,11 @@ import numpy as np
 from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.gnss_steps import unbroken
-from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, WHEELS_CORRELATION_S, DerivedHeading
+from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.heading_offset_cause import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.records.tables import Complexes, Floats, RobotLog
+from icrtool.records.tables import Floats, RobotLog
 
 FEWEST_WINDOWS = 8
 SIGNIFICANT_SIGMAS = 4.0
@@ -75,16 +75,10 @@ class CourseAngles(NamedTuple):
 def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
-    v = (drive.v_left + drive.v_right) / 2
-    psi = np.interp(drive.wheel_t + drive.wheel_dt / 2, drive.heading_t, drive.heading)
-
-    def between(rate: Complexes) -> Complexes:
-        total = np.concatenate([[0.0], np.cumsum((rate * drive.wheel_dt)[:-1])])
-        at = np.interp(drive.fix_t, drive.wheel_t, total)
-        return np.asarray(at[end] - at[begin], np.complex128)
-
+    v, nose = drive.mean_speed, drive.nose
     seen = drive.fix[end] - drive.fix[begin]
-    laid, other = between(v * np.exp(1j * psi)), between(v * np.exp(-1j * psi))
+    along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
+    laid, other = (at[end] - at[begin] for at in (along, mirrored))
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(
@@ -226,12 +220,11 @@ def align_estimated_heading(
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
     std = derived.estimate.median_std
-    correlation_s = WHEELS_CORRELATION_S if derived.source == "wheels_course" else 0.0
     own = HeadingAlignment(
         source=derived.source, parts=derived.why, windows=0, offset_rad=math.nan, offset_std_rad=math.nan,
         scatter_rad=math.nan,
         agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
-        applied_std_rad=0.0, applied_correlation_s=correlation_s, std_rad=std, name=NO_NAME,
+        applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std, name=NO_NAME,
         warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
     )  # fmt: skip
     if stated is None or derived.attitude_offset is None:
@@ -243,7 +236,7 @@ def align_estimated_heading(
         notes = [f"{log.name}: {_offset_note(text, offset)}"]
     return replace(
         stated, source=own.source, parts=own.parts, offset_rad=offset, offset_std_rad=offset_std,
-        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=own.applied_correlation_s, std_rad=std,
+        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std,
         name=name, warnings=tuple(notes),
     )  # fmt: skip
 

@@ -24,15 +24,11 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
-RESPONSE_S = 0.1
-"""A robot answers its wheels by up to this much later or earlier: in turns the filter's wheels do not predict a heading
-better than that, and the ICRs must not learn it (`icrtool.alignment.estimator.RESPONSE_STD_S`)."""
-
-WHEELS_CORRELATION_S = 5.0
-"""A heading estimated with the wheels errs alike for about this long: a few courses."""
-
 LARGEST_SPREAD = 2.0
 """Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
+
+LARGEST_DRIFT = math.radians(10.0)
+"""A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
 LONGEST_HOLE_S = 1.0
 """No heading is estimated within a longer hole of the turn rate."""
@@ -71,8 +67,6 @@ class DerivedHeading:
         rate = 1e9 / float(np.median(np.diff(heading.stamp_ns)))
         stream = StreamChoice("heading", self.topic, "estimated", len(heading.stamp_ns), rate, "header", 0.0, self.why)
         streams = (*(one for one in log.streams if one.role != "heading"), stream)
-        turned = np.gradient(np.unwrap(heading.heading_rad), (heading.stamp_ns - heading.stamp_ns[0]) / 1e9)
-        heading = replace(heading, var_rad2=heading.var_rad2 + (RESPONSE_S * turned) ** 2)
         return replace(log, heading=heading, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
 
 
@@ -96,15 +90,17 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         )
     drive = drive_arrays(log)
     found = _with_gyro(log, drive, None)
+    if found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT:
+        return found
+    turn = wheel_rate(drive, width_m)
+    pair, length = _pair(log, turn)
+    estimate = estimate_heading(drive, turn, [pair] if pair is not None else [], stands=False)
+    if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
+        return _derived(log, estimate, turn, None, length, None)
     if found is None:
-        turn = wheel_rate(drive, width_m)
-        pair, length = _pair(log, turn)
-        estimate = estimate_heading(drive, turn, [pair] if pair is not None else [], stands=False)
-        if estimate is None:
-            raise DataError(
-                log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
-            )
-        found = _derived(log, estimate, turn, None, length, None)
+        raise DataError(
+            log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
+        )
     return found
 
 

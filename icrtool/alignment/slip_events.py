@@ -100,6 +100,14 @@ def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ..
     does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
     """
+    try:
+        return _found_events(sensors, width_m)
+    except np.linalg.LinAlgError:
+        # Exact data, or intervals of very different lengths: nothing separates the parameters of the motion.
+        return ()
+
+
+def _found_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
     knots = lay_knots(sensors)
     if knots is None:
         return ()

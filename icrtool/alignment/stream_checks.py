@@ -10,6 +10,9 @@ from icrtool.records.tables import RobotLog
 IMPOSSIBLE_MPS = 1e6
 """A wheel speed from here on is a broken value: its distance is more than can be cut into windows."""
 
+IMPOSSIBLE_M = 1e9
+"""A position this far from the origin is a broken value: metric coordinates of any country are below 1e8 m."""
+
 
 def check_streams(log: RobotLog) -> None:
     """Refuse streams that cannot be used together.
@@ -54,6 +57,9 @@ def check_streams(log: RobotLog) -> None:
     fastest = float(np.abs(columns["wheel"]).max())
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
+    farthest = float(np.abs(columns["position"]).max())
+    if farthest >= IMPOSSIBLE_M:
+        raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "is it in its unit?")
     begin = max(int(stamps[0]) for stamps in needed.values())
     end = min(int(stamps[-1]) for stamps in needed.values())
     if begin >= end:

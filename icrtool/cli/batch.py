@@ -39,7 +39,11 @@ if TYPE_CHECKING:
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Distance over which 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option(
-    "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
+    "--gate",
+    "gates",
+    metavar="TEXT",
+    multiple=True,
+    help="Acceptance limit: exit status 3 if it is not met; repeatable.",
 )
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
@@ -63,8 +67,8 @@ def command(
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
 
     A FOLDER is searched recursively. A MANIFEST (CSV or TOML) lists logs or patterns with their robot, configuration,
-    group and tags. A log that fails, hangs or kills its process costs only itself. The same command continues an
-    interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
+    group and tags. A log that fails, hangs or ends its process does not affect the others. The same command continues
+    an interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
 
     Exit status: 3 if a gate failed, else 1 if a log could not be used.
 
@@ -77,7 +81,7 @@ def command(
     from icrtool.fleet.batch import BatchOptions, plan, run_batch
     from icrtool.fleet.fleet_files import PLOTS, calibrations_text, fleet_document, write_fleet
     from icrtool.fleet.roll_up import pooled_calibrations
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import check_place, write_file
 
     asked = BatchOptions(
         config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
@@ -110,8 +114,7 @@ def command(
 
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
-        with atomic_file(markdown) as file:
-            file.write_bytes(format_fleet_markdown(rows, missing).encode("utf-8", errors="backslashreplace"))
+        write_file(markdown, format_fleet_markdown(rows, missing))
     if compared is not None:
         options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
     if page:

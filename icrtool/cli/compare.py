@@ -40,7 +40,7 @@ def command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import check_place, write_file
     from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
     from icrtool.output.json_file import json_bytes
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
@@ -63,8 +63,7 @@ def command(
     document = transfer_document(transfer)
     for file, content in ((csv_file, transfer_csv(transfer)), (output, json_bytes(document))):
         if file is not None:
-            with atomic_file(file) as partial:
-                partial.write_bytes(content)
+            write_file(file, content)
     if plot is not None:
         write_transfer_picture(document, plot)
     if as_json:

@@ -29,8 +29,7 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import check_place, write_file
 
     check_place(output)
-    with atomic_file(output) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_file(output, text)

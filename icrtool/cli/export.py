@@ -92,10 +92,9 @@ def _leave(text: str, output: Path | None) -> None:
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.atomic_file import atomic_file
+    from icrtool.output.atomic_file import write_file
 
-    with atomic_file(output) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_file(output, text)
 
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
@@ -116,7 +115,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
-    from icrtool.output.atomic_file import atomic_file, check_place
+    from icrtool.output.atomic_file import atomic_file, check_place, write_file
     from icrtool.output.exports.foxglove import write_foxglove
     from icrtool.output.exports.foxglove_layout import foxglove_layout
     from icrtool.output.json_file import json_bytes
@@ -125,8 +124,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
     check_place(layout)
     with atomic_file(output) as partial:
         write_foxglove(run, partial)
-    with atomic_file(layout) as partial:
-        partial.write_bytes(json_bytes(foxglove_layout(run)))
+    write_file(layout, json_bytes(foxglove_layout(run)))
     click.echo(f"written to {output}; layout for Foxglove: {layout}")
 
 

@@ -38,7 +38,8 @@ AGAIN_S = 0.005
 def end_in_order(boundary: CodeType) -> Iterator[None]:
     """Have SIGINT raise KeyboardInterrupt and SIGTERM leave with `TERMINATED`, at the latest after `GRACE_S`.
 
-    The exceptions come once no module is being loaded, and are still raised after the block; the limit ends with it.
+    The exceptions come once no module is being loaded. The limit holds until the process ends: at its end the
+    interpreter waits for threads, which may be compiling. After the block, signals have their default effect.
 
     Parameters
     ----------
@@ -48,25 +49,27 @@ def end_in_order(boundary: CodeType) -> Iterator[None]:
         yield
         return
     ending = _Ending(boundary)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, ending.come)
+    # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
+    handled = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
+    for number in handled:
+        signal.signal(number, ending.come)
     if not hasattr(signal, "setitimer"):
         yield  # Windows
         return
     signal.signal(signal.SIGALRM, ending.come_again)
-    with _watched():
+    with _watched(ending):
         try:
             yield
         finally:
             # The interpreter forgets the handler of the alarm before it ends, and the alarm would kill it.
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+            for number in handled:
+                signal.signal(number, signal.SIG_DFL)
 
 
 @contextmanager
-def _watched() -> Iterator[None]:
-    """End the process `GRACE_S` after a signal that is handled, if it still is in the block."""
+def _watched(ending: _Ending) -> Iterator[None]:
+    """End the process `GRACE_S` after a signal that came in the block, if it still is there."""
     arrived, signalled = os.pipe()
     os.set_blocking(signalled, False)
     # The system's handler of a signal writes its number there at once, whatever the interpreter is doing.
@@ -80,11 +83,12 @@ def _watched() -> Iterator[None]:
     try:
         yield
     finally:
-        over.set()
         signal.set_wakeup_fd(before)
-        # The end of the pipe would not be enough: a forked process has a copy of this side.
-        os.write(signalled, bytes([OVER]))
-        os.close(signalled)
+        if not ending.ended:
+            over.set()
+            # The end of the pipe would not be enough: a forked process has a copy of this side.
+            os.write(signalled, bytes([OVER]))
+            os.close(signalled)
 
 
 def _watch(arrived: int, over: threading.Event) -> None:
@@ -110,16 +114,16 @@ def end_by_force(status: int) -> None:
 
 
 class _Ending:
-    """The end of a command, once a signal has asked for it."""
+    """The end of a command, once a signal has asked for it; `ended`: its exception was raised."""
 
     def __init__(self, boundary: CodeType) -> None:
         self._boundary = boundary
         self._waiting: int | None = None
-        self._ended = False
+        self.ended = False
 
     def come(self, number: int, frame: FrameType | None) -> None:
         """End the command, or wait; asked a second time, do not wait."""
-        if self._ended:
+        if self.ended:
             return  # what is half written is being removed, in limited time
         if self._waiting is None and self._loading(frame) and hasattr(signal, "setitimer"):
             self._waiting = number
@@ -145,7 +149,7 @@ class _Ending:
         if self._waiting is not None:
             self._waiting = None
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-        self._ended = hasattr(signal, "setitimer")
+        self.ended = hasattr(signal, "setitimer")
         if number == signal.SIGTERM:
             # Killed by a timeout or at a shutdown, a command still removes what is half written.
             sys.exit(TERMINATED)

@@ -15,7 +15,9 @@ from icrtool.cli.fit import RUNS
 @click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
               help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
-@click.option("--no-coordinates", is_flag=True, help="Leave out where on the globe a run was: to pass the page on.")
+@click.option(
+    "--no-coordinates", is_flag=True, help="Leave out where on the globe a run was, for a page that is passed on."
+)
 @click.option("-q", "--quiet", is_flag=True, help="Print no results.")
 def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.
@@ -55,10 +57,10 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     import json
 
     from icrtool.errors import RunError
+    from icrtool.output.atomic_file import write_file
     from icrtool.output.json_file import schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
     from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
-    from icrtool.output.page.render import write_html
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
@@ -72,7 +74,7 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     else:
         what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
         raise RunError(source, what, "icrtool fit, batch and compare make one")
-    write_html(page, place)
+    write_file(place, page)
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter_records import FilterParameters, Measurements
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart, SensorData
@@ -60,6 +61,13 @@ MIDDLE_OF_THE_TURN = 0.5
 """Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and
 1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
 
+TURN_WANDER_RAD = math.radians(1.2)
+"""How far a body turns more or less than its wheels show, a random walk [rad/sqrt(s)]: the errors of an attitude
+sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow it."""
+
+RESPONSE_S, CHANGE_S = 0.1, 0.5
+"""Rigid-body simulated robots answer their wheels by up to this much later; a change of the turn rate takes so long."""
+
 PAPER_TERRAIN_ICR_STD_M = 10.0
 """Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's
 width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
@@ -82,8 +90,8 @@ class FilterSetup:
     t0: float
     x0: Floats
     P0: Floats
-    gnss_index: Ints
-    heading_index: Ints
+    gnss_index: Ints | slice
+    heading_index: Ints | slice
 
 
 def check_start(config: Config) -> None:
@@ -147,13 +155,23 @@ def set_up_filter(
         change_t=np.empty(0),
         slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
     )
+    icrs, icr_std = _initial_icrs(config, sensors.icr_start)
+    if sensors.heading_is_estimated:
+        data = data._replace(turn_variance=_response_variance(data, float(icrs[0] - icrs[1])) + TURN_WANDER_RAD**2)
     t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
-    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), sensors.heading_correlation_s)
-    parameters = _parameters(config, data, sensors.antenna_m, noise or configured_noise(config), alike)
-    x0, P0 = _start_state(data, t0, _initial_icrs(config, sensors.icr_start), parameters, warm_start)
+    noise = noise or configured_noise(config)
+    correlation_s = sensors.heading_correlation_s
+    if sensors.heading_is_estimated:
+        # Headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
+        # with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more.
+        density = math.radians(noise.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
+        correlation_s = float(np.median(headings.var_rad2)) / (2.0 * density)
+    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
+    parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
+    x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
     return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
 
 
@@ -168,7 +186,10 @@ def _seconds(stamps_ns: Ints, epoch_ns: int) -> Floats:
     return (stamps_ns - epoch_ns) / 1e9
 
 
-def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
+def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | slice:
+    """Return the rows outside the outages; without one a slice, which copies nothing."""
+    if not outages_ns:
+        return slice(None)
     kept = np.ones(len(stamps_ns), np.bool_)
     for begin, end in outages_ns:
         kept &= (stamps_ns < begin) | (stamps_ns >= end)
@@ -289,6 +310,20 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     """
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
+
+
+def _response_variance(data: Measurements, width_m: float) -> Floats:
+    """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
+
+    A body answers its wheels later than they turn, or slips less before it does: each change of the turn rate moves the
+    heading by up to `RESPONSE_S` times that change. Within a change these errors have one sign, so that white noise as
+    large as a step's own error would leave most of it to the ICRs. `width_m` is the ICRs' separation.
+    """
+    t = data.wheel_t
+    turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
+    before, now, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, 0.0, CHANGE_S))
+    change = (after - 2.0 * now + before) / CHANGE_S
+    return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
 
 
 def _parameters(

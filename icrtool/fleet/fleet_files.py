@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +12,9 @@ import msgspec
 from icrtool import __version__
 from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
 from icrtool.fleet.row import Row, columns_of
-from icrtool.output.atomic_file import atomic_file
+from icrtool.output.atomic_file import atomic_file, write_file
+from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
-from icrtool.records.text import table_cell
 
 FLEET_SCHEMA = "icrtool/fleet/1"
 
@@ -57,17 +55,17 @@ def write_fleet(
     """
     columns = columns_of(rows)
     cells = [row.columns() for row in rows]
-    _write(directory / "fleet.csv", _csv(columns, [[row.get(name) for name in columns] for row in cells]))
+    write_file(directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]))
     failures = [msgspec.to_builtins(row) for row in rows if row.status == "failed"]
-    _write(directory / "failures.csv", _csv(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
+    write_file(directory / "failures.csv", csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
     with atomic_file(directory / "fleet.parquet") as file:
         _write_parquet(columns, cells, file)
     if calibrations:
-        _write(directory / "calibrations.txt", calibrations_text(calibrations).encode("utf-8", "backslashreplace"))
+        write_file(directory / "calibrations.txt", calibrations_text(calibrations))
     if plots:
         write_figures(rows, directory / PLOTS, tuple(plots))
     # Last: where it is, the others are of the same batch.
-    _write(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
+    write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
 
 
 def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
@@ -110,25 +108,6 @@ def reason_of(row: Row) -> str:
     """Return why a log failed without what is particular to it: the second part of ``what: why; advice``."""
     parts = row.reason.split(": ", 1)
     return parts[-1].split(";")[0].split(" (tried")[0]
-
-
-def _write(path: Path, content: bytes) -> None:
-    with atomic_file(path) as file:
-        file.write_bytes(content)
-
-
-def _csv(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([[_cell(cell) for cell in row] for row in rows])
-    return text.getvalue().encode("utf-8", errors="backslashreplace")
-
-
-def _cell(value: Any) -> Any:  # noqa: ANN401 - text or a number
-    if isinstance(value, str):
-        return table_cell(value)
-    return "" if value is None else value
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import csv
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from icrtool.config import parse_toml
 from icrtool.errors import ConfigError
 
 COLUMNS = ("log", "robot", "config", "group", "tags")
 
 SUFFIXES = {".csv", ".toml"}
+
+LARGEST_BYTES = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,8 @@ def read_manifest(path: Path) -> list[Entry]:
         It cannot be read, has an unknown column, a log that does not exist or a pattern that matches nothing.
     """
     try:
+        if (size := path.stat().st_size) > LARGEST_BYTES:
+            raise ConfigError(path, f"{size} bytes long", f"a manifest has at most {LARGEST_BYTES}")
         text = path.read_text(encoding="utf-8-sig")
         rows = _toml_rows(path, text) if path.suffix.lower() == ".toml" else _csv_rows(path, text)
     except OSError as err:
@@ -100,7 +104,7 @@ def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
 
 
 def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
-    document = tomllib.loads(text)
+    document = parse_toml(text)
     rows = document.get("logs")
     if set(document) - {"logs"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ConfigError(path, "not a manifest", "it holds tables [[logs]] and nothing else")
@@ -124,13 +128,13 @@ def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
     """Return what a pattern matches; a name with a bracket or a star of its own is taken as it is, if it is there."""
     named = path.parent / pattern
-    if named.exists():
-        return (named,)
     try:
+        if named.exists():
+            return (named,)
         base = Path(named.anchor) if Path(pattern).is_absolute() else path.parent
         relative = str(Path(pattern).relative_to(base)) if Path(pattern).is_absolute() else pattern
         found = tuple(sorted(base.glob(relative)))
-    except (ValueError, NotImplementedError) as err:
+    except (ValueError, NotImplementedError, OSError, RecursionError) as err:
         raise ConfigError(f"{path}: log", f"{pattern!r} is not a pattern", str(err)) from err
     if not found:
         raise ConfigError(f"{path}: log", f"{pattern!r} matches nothing", f"it is relative to {path.parent}")

@@ -72,13 +72,13 @@ def decode_request(line: bytes) -> Request:
 
 
 def process(request: Request, stage: Stage) -> Row:
-    """Fit a log, analyse the run, write both, and return its row; a log that cannot be used gives a row that says why.
+    """Fit a log, analyse the run, write both, and return its row; one that cannot be used gives a row with the reason.
 
     Parameters
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.atomic_file import atomic_file
+    from icrtool.output.atomic_file import write_file
 
     begun = time.monotonic()
     try:
@@ -89,8 +89,7 @@ def process(request: Request, stage: Stage) -> Row:
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     row_file = path_of(request.row_file)
     row_file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(row_file) as file:
-        file.write_bytes(msgspec.json.encode(row))
+    write_file(row_file, msgspec.json.encode(row))
     return row
 
 
@@ -129,9 +128,9 @@ def _results(request: Request, stage: Stage) -> Row:
     directory = path_of(request.directory)
     check_target(directory, path_of(request.path), overwrite=request.overwrite)
     stage("reading")
-    log = read_log(path_of(request.path), request.config)
+    logs = [read_log(path_of(request.path), request.config)]
     stage("filtering")
-    run = fit(log, request.config)
+    run = fit(logs.pop(), request.config)
     stage("writing the run")
     run.write(directory, plots=request.plots)
     stage("dropout analysis")

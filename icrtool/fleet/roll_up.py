@@ -14,7 +14,7 @@ import msgspec
 from icrtool import __version__
 from icrtool.errors import IcrToolError, LogError
 from icrtool.fleet.row import Row
-from icrtool.output.atomic_file import atomic_file
+from icrtool.output.atomic_file import write_file
 from icrtool.output.json_file import json_bytes
 from icrtool.records.run import Run
 
@@ -139,8 +139,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
         return _without(one, tuple(left_out), str(err))
     (directory / CALIBRATIONS).mkdir(exist_ok=True)
     file = f"{CALIBRATIONS}/{name}.json"
-    with atomic_file(directory / file) as partial:
-        partial.write_bytes(json_bytes(result.calibration.summary()))
+    write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.wheels)))
     used = tuple(log for log in one.logs if log not in left_out)

@@ -86,6 +86,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
         data = Measurements(
             batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
             batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t, np.zeros(0, np.bool_),
+            np.zeros(0),
         )  # fmt: skip
         place = np.empty(3, np.int64)
         place[0] = np.searchsorted(batch.gnss_t, batch.t0, side="right")

@@ -120,7 +120,7 @@ def take_heading(
 
 @njit
 def advance(
-    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, x: Floats, P: Floats,
+    dt: float, in_gap: bool, slips: bool, v_left: float, v_right: float, turn_variance: float, x: Floats, P: Floats,
     parameters: FilterParameters,
 ) -> float:  # fmt: skip
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
@@ -141,6 +141,7 @@ def advance(
     scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
     for i in range(6):
         P[DIAGONAL[i]] += scale * parameters.process_variance[i]
+    P[11] += turn_variance * dt
     return travelled
 
 
@@ -181,7 +182,10 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
                 t_next = min(t_next, data.change_t[c])
             dt = max(t_next - t, 0.0)
             if dt > 0.0:
-                travelled += advance(dt, in_gap, slips, data.v_left[held], data.v_right[held], x, P, parameters)
+                travelled += advance(
+                    dt, in_gap, slips, data.v_left[held], data.v_right[held],
+                    data.turn_variance[held] if held < len(data.turn_variance) else 0.0, x, P, parameters,
+                )  # fmt: skip
                 t = t_next
             while c < n_change and data.change_t[c] <= t:
                 for i in range(3, 6):
@@ -228,11 +232,17 @@ def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
-    state, out = start_state(data, t0, x0, P0), empty_output(data, last - first)
-    events = last + len(data.gnss_t) + len(data.heading_t)
-    for begin, end in pairwise((*range(first, last, max(last * BLOCK_EVENTS // max(events, 1), 1)), last)):
-        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), None)
-    return out._replace(P=state.P)
+    state, events = start_state(data, t0, x0, P0), last + len(data.gnss_t) + len(data.heading_t)
+    size = max(last * BLOCK_EVENTS // max(events, 1), 1)
+    block = empty_output(data, min(size, last - first))
+    # The kernel writes row by row; here each column is contiguous, so that the states need no copy of them.
+    x, variance, distance = np.empty((6, last - first)).T, np.empty((6, last - first)).T, np.empty(last - first)
+    for begin, end in pairwise((*range(first, last, size), last)):
+        count, rows = end - begin, slice(begin - first, end - first)
+        out = block._replace(x=block.x[:count], variance=block.variance[:count], distance=block.distance[:count])
+        filter_rows(data, begin, end, state, parameters, out, None)
+        x[rows], variance[rows], distance[rows] = out.x, out.variance, out.distance
+    return block._replace(x=x, variance=variance, distance=distance, P=state.P)
 
 
 def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> FilterState:
@@ -264,12 +274,6 @@ def empty_output(data: Measurements, rows: int) -> FilterOutput:
         heading_innovation=np.full(n_heading, np.nan),
         P=np.empty(21),
     )
-
-
-def output_rows(out: FilterOutput, begin: int, end: int) -> FilterOutput:
-    """Return a view of an output that holds its recorded states [begin, end) only."""
-    rows = slice(begin, end)
-    return out._replace(x=out.x[rows], variance=out.variance[rows], distance=out.distance[rows])
 
 
 def empty_nodes(events: int) -> Nodes:

@@ -62,6 +62,7 @@ class Measurements(NamedTuple):
     heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
     change_t : (c,) times of terrain changes
     slipping : (n,) intervals [k, k+1) in a slip event; empty for none
+    turn_variance : (n,) further growth of the heading's variance over [k, k+1) [rad^2/s]; empty for none
     """
 
     wheel_t: Floats
@@ -75,6 +76,7 @@ class Measurements(NamedTuple):
     heading_r: Floats
     change_t: Floats
     slipping: Flags = np.zeros(0, np.bool_)
+    turn_variance: Floats = np.zeros(0)
 
 
 class FilterOutput(NamedTuple):

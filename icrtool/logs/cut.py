@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from icrtool.errors import DataError, LogError
 from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Container, Cut
+from icrtool.records.tables import RobotLog
+
+PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
+"""A longer interval between samples is reported; a log whose samples are a day apart is of two recordings."""
 
 Moment = float | str | datetime
 """Seconds since the log's first message, or a time of day: a `datetime`, or a text in ISO 8601."""
@@ -69,6 +77,47 @@ def nanoseconds(given: float | datetime, first_ns: int) -> int:
         passed = given - datetime(1970, 1, 1, tzinfo=UTC)
         return (passed.days * 86_400 + passed.seconds) * 1_000_000_000 + passed.microseconds * 1000
     return first_ns + round(max(min(given, 1e9), -1e9) * 1e9)
+
+
+def longest_part(log: RobotLog) -> RobotLog:
+    """Return a log without what another clock stamped, and with warnings where its clock may have been set forward.
+
+    Of parts that are `LONGEST_PAUSE_S` and more apart, that with the most wheel samples, and positions, is kept.
+    """
+    stamps, fixes = log.wheels.stamp_ns, log.gnss.stamp_ns
+    ends = np.append(np.flatnonzero(np.diff(stamps) > LONGEST_PAUSE_S * 1e9), len(stamps) - 1)
+    begins = np.append(0, ends[:-1] + 1)
+    positions = np.searchsorted(fixes, stamps[ends], side="right") - np.searchsorted(fixes, stamps[begins])
+    longest = int(np.argmax((ends - begins) * (positions > 1)))
+    parts = {}
+    for role, margin_s in (("wheels", 0.0), ("gnss", LONGEST_PAUSE_S), ("heading", LONGEST_PAUSE_S)):
+        margin_ns = int(margin_s * 1e9)
+        first, last = stamps[begins[longest]] - margin_ns, stamps[ends[longest]] + margin_ns
+        parts[role] = _between(getattr(log, role), first, last)
+    counts = {role: (len(kept.stamp_ns), len(getattr(log, role).stamp_ns)) for role, kept in parts.items()}
+    warnings = list(log.warnings)
+    if lost := [f"{every - kept} of {every} ({role})" for role, (kept, every) in counts.items() if kept < every]:
+        warnings.append(
+            f"{log.name}: more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock "
+            "was set, --from and --to read that part"
+        )
+    for role, kept in parts.items():
+        longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
+        if longest_s > PAUSE_S:
+            why = "the recording was paused, or its clock was set forward"
+            warnings.append(f"{log.name}: {role}: no samples for {longest_s:.0f} s: {why}")
+            break
+    return replace(log, warnings=tuple(warnings), **parts)
+
+
+def _between(samples: Any, begin_ns: int, end_ns: int) -> Any:  # noqa: ANN401 - samples of any sensor
+    """Return the samples with stamps in [begin_ns, end_ns]."""
+    inside = (samples.stamp_ns >= begin_ns) & (samples.stamp_ns <= end_ns)
+    if inside.all():
+        return samples
+    columns = {field.name: getattr(samples, field.name) for field in fields(samples)}
+    rows = {name: column[inside] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    return replace(samples, **rows)
 
 
 def _first_ns(container: Container) -> int:

@@ -19,10 +19,10 @@ from icrtool.errors import DataError, DefinitionError
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import split_files
-from icrtool.logs.cut import Moment, cut_of, moment
+from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.gyro import find_gyro, find_gyros
+from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
@@ -35,7 +35,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.stamps import increasing
+from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
@@ -61,7 +61,12 @@ NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A log after one pass: its channels, all candidates, the messages that could not be read, its files."""
+    """A log after one pass: its channels, all candidates, the messages that could not be read, its files.
+
+    Attributes
+    ----------
+    tables : of their columns those that candidates do not hold: stamps, turn rates, static transforms
+    """
 
     name: LogText
     path: LogText
@@ -113,12 +118,17 @@ def survey_log(
         channels = tuple(container.channels)
     finally:
         container.close()
+    candidates = find_candidates(tables, config, unread)
+    for table in tables:
+        # What only the candidates were made of goes: half of what a log takes.
+        for name in table.columns.keys() - {*GYRO_FIELDS, *FIELDS}:
+            del table.columns[name]
     return Survey(
         name=LogText(log_name(path)),
         path=LogText(str(path)),
         channels=channels,
         tables=tuple(tables),
-        candidates=find_candidates(tables, config, unread),
+        candidates=candidates,
         problems=problems,
         inputs=inputs,
     )
@@ -199,9 +209,10 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
             f"{name}: one stream has no header stamps, and the header stamps of another are far from log time; "
             "log time is used for all streams"
         )
-    for role, one in (("wheels", motion), ("gnss", position), ("heading", source)):
-        if one is not None and one.stamps.note and one.stamps.note != "no header":
-            warnings.append(f"{name}: {role}: {one.stamps.note}; log time is used")
+    chosen: tuple[tuple[Role, WheelMotion | PositionSource | HeadingSource | None], ...]
+    chosen = (("wheels", motion), ("gnss", position), ("heading", source))
+    notes = [note for role, one in chosen if one is not None for note in clock_notes(one.stamps, name, role)]
+    warnings += list(dict.fromkeys(notes))
     gnss, datum, rejected = _fixes(position, config, clock, name)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
@@ -225,11 +236,14 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock)
-    return RobotLog(
+    stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, stamps)
+    log = RobotLog(
         name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro,
-        find_gyros(survey.tables, clock), _other_receivers(survey.candidates, position, datum, config, clock, name),
+        find_gyros(survey.tables, clock, stamps),
+        _other_receivers(survey.candidates, position, datum, config, clock, name),
     )  # fmt: skip
+    return longest_part(log)
 
 
 def _other_receivers(
@@ -385,8 +399,6 @@ def _headings(
     if config.frames.heading != "auto":
         convention, why = config.frames.heading, "configured"
     stamps = source.stamps.on(clock)
-    rows = np.flatnonzero(source.usable)
-    order, _, _ = increasing(stamps[rows])
-    rows = rows[order]
+    rows = usable_rows(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"

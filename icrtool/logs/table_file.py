@@ -5,17 +5,47 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.cut import Moment, moment, nanoseconds
+from icrtool.logs.cut import Moment, longest_part, moment, nanoseconds
 from icrtool.records.tables import InputFile, RobotLog
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 SUFFIX = ".csv"
+
+LONGEST_HEAD_BYTES = 1 << 18
+"""Of the line that names the columns: pandas takes a minute for a million of them."""
 
 
 def is_table(path: Path) -> bool:
     """Return whether a path names a table."""
     return path.suffix.lower() == SUFFIX and path.is_file()
+
+
+def csv_frame(path: Path) -> pd.DataFrame:
+    """Return the columns of a CSV file whose first line names them.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    ValueError
+        It is not a table: text that is not UTF-8, a line that names too many columns, or rows with more values.
+    """
+    import pandas as pd
+
+    with path.open("rb") as stream:
+        if len(head := stream.readline(LONGEST_HEAD_BYTES)) == LONGEST_HEAD_BYTES:
+            raise ValueError(f"its first line has more than {head.count(b',')} columns")
+    table = pd.read_csv(path, skipinitialspace=True)
+    if not isinstance(table.index, pd.RangeIndex):
+        raise ValueError("its rows have more values than its first line has names")  # noqa: TRY004 - of the file
+    return table
 
 
 def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:
@@ -34,7 +64,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     try:
         with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        table = pd.read_csv(path, skipinitialspace=True)
+        table = csv_frame(path)
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:
@@ -44,10 +74,10 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
         clock, unit = ("stamp_ns", 1) if "stamp_ns" in table else ("t_s", 1e9)
         if clock in table and len(table):
             stamps = pd.to_numeric(table[clock], errors="coerce") * unit
-            first = int(stamps.min()) if stamps.notna().any() else 0
-            inside = stamps.notna()
+            inside = np.isfinite(stamps)
+            first = int(stamps[inside].min()) if inside.any() else 0
             inside &= stamps >= nanoseconds(begin, first) if begin is not None else True
             inside &= stamps < nanoseconds(stop, first) if stop is not None else True
             table = table[inside]
     log = RobotLog.from_frames(table, table, table, table, path.stem)
-    return replace(log, inputs=(InputFile(str(path), path.stat().st_size, digest),))
+    return longest_part(replace(log, inputs=(InputFile(str(path), path.stat().st_size, digest),)))

@@ -98,31 +98,49 @@ def atomic_directory(
     """
     check_place(directory, ours, kind=kind)
     made: list[Path] = []
-    partial: Path | None = None
     try:
         place = _resolved(directory)
         made = [parent for parent in place.parents if not parent.exists()][::-1]
         _make_parents(place, made)
-        for left in _hidden(place):
-            _clean(left, place, names)
-        partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
-        with unfinished(partial):
-            partial.mkdir()
-            with disk.locked(partial):
-                yield partial
-                check_place(place, ours, kind=kind)
-                done = _put(partial, place, kind, names, made_from)
+        with hidden_directory(place, names) as partial:
+            yield partial
+            check_place(place, ours, kind=kind)
+            done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:
             note(f"{directory}: {done}")
     except OSError as err:
         raise OutputError(directory, "cannot be written", err.strerror or str(err)) from err
     finally:
-        if partial is not None:
-            _discard(partial, _resolved(directory), names)
         for parent in reversed(made):
             with suppress(OSError):
                 parent.rmdir()
+
+
+@contextmanager
+def hidden_directory(place: Path, names: Collection[str] = ()) -> Iterator[Path]:
+    """Give a new directory beside a place, and remove it at the end; those of killed processes are removed first.
+
+    Parameters
+    ----------
+    place : without links
+    names : as in `atomic_directory`
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+    for left in _hidden(place):
+        _clean(left, place, names)
+    partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
+    try:
+        with unfinished(partial):
+            partial.mkdir()
+            with disk.locked(partial):
+                yield partial
+    finally:
+        _discard(partial, place, names)
 
 
 def restore(directory: Path, ours: IsOurs) -> None:
@@ -159,7 +177,7 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_fro
     disk.sync_tree(partial)
     # From here on its name may be that of the old directory, whose files are looked after below.
     end(partial)
-    old = exchange(partial, place) if replaces else None
+    old = exchange(partial, place, partial.with_suffix(".old")) if replaces else None
     if old is None:
         disk.rename(partial, place)
     disk.sync(place.parent)
@@ -173,11 +191,15 @@ def _put(partial: Path, place: Path, kind: str, names: Collection[str], made_fro
     return f"replaced: {'; '.join(parts)}" if parts else ""
 
 
-def exchange(partial: Path, place: Path) -> Path:
-    """Put `partial` into the place of a directory, in one step where that can be; return where the old one is now."""
+def exchange(partial: Path, place: Path, old: Path) -> Path:
+    """Put `partial` into the place of a directory; return where the old one is now.
+
+    Parameters
+    ----------
+    old : a hidden name beside the place, used where two directories cannot be exchanged in one step; `restore` finds it
+    """
     if disk.exchange(partial, place):
         return partial
-    old = partial.with_suffix(".old")
     try:
         disk.rename(place, old)
         disk.rename(partial, place)

@@ -48,6 +48,18 @@ def atomic_file(file: Path) -> Iterator[Path]:
             disk.remove(partial)
 
 
+def write_file(file: Path, content: str | bytes) -> None:
+    """Write a file, whole or not at all; of a text in UTF-8, what is no character becomes an escape.
+
+    Raises
+    ------
+    OutputError
+        As `atomic_file`.
+    """
+    with atomic_file(file) as partial:
+        partial.write_bytes(content.encode("utf-8", errors="backslashreplace") if isinstance(content, str) else content)
+
+
 def check_place(path: Path) -> None:
     """Refuse a file whose directory is not there, before any work is done for it.
 

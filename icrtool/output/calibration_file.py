@@ -11,7 +11,7 @@ from typing import Any
 from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import OutputError, RunError
-from icrtool.output.atomic_file import atomic_file
+from icrtool.output.atomic_file import write_file
 from icrtool.output.json_file import json_bytes, schema_of
 
 FILE_NAME = "calibration.json"
@@ -53,8 +53,7 @@ def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
         Something that is not a calibration is there, or it cannot be written.
     """
     file = calibration_file(place)
-    with atomic_file(file) as partial:
-        partial.write_bytes(json_bytes(document))
+    write_file(file, json_bytes(document))
     return file
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
@@ -19,6 +17,7 @@ from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
+from icrtool.output.csv_file import csv_bytes
 from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
@@ -114,11 +113,11 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
         A file cannot be written.
     """
     summary = report.summary_columns()
-    (directory / "summary.csv").write_bytes(_csv(summary, _rows(summary.values())))
-    (directory / "histogram.csv").write_bytes(_csv(HISTOGRAM_COLUMNS, _histogram_rows(report)))
-    (directory / "worst.csv").write_bytes(_csv(WORST_COLUMNS, _worst_rows(report.worst)))
+    (directory / "summary.csv").write_bytes(csv_bytes(summary, _rows(summary.values())))
+    (directory / "histogram.csv").write_bytes(csv_bytes(HISTOGRAM_COLUMNS, _histogram_rows(report)))
+    (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, _worst_rows(report.worst)))
     if report.comparison is not None:
-        (directory / "ladder.csv").write_bytes(_csv(COMPARISON_COLUMNS, comparison_rows(report.comparison)))
+        (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(report.comparison)))
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
@@ -332,12 +331,3 @@ def _cells(column: Sequence[str] | np.ndarray[Any, Any]) -> list[Any]:
     """Return a column as plain values, None for what is not a number."""
     values = column.tolist() if isinstance(column, np.ndarray) else list(column)
     return [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]
-
-
-def _csv(columns: Iterable[str] | Mapping[str, object], rows: Iterable[Sequence[Cell]]) -> bytes:
-    """Return a table as CSV: numbers in their shortest exact form, empty where there is none."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue().encode()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_place
+from icrtool.output.csv_file import csv_bytes
 from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
@@ -127,7 +128,7 @@ def write_run(
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
         write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        (partial / EVENTS_FILE).write_text(events_csv(run.summary["events"]), encoding="utf-8")
+        (partial / EVENTS_FILE).write_bytes(events_csv(run.summary["events"]))
         sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE)}
         sums[states_name] = states_sum.result()
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
@@ -160,10 +161,9 @@ def is_run_directory(directory: Path) -> bool:
     return schema_of(directory / RUN_FILE).startswith(SCHEMA_FAMILY)
 
 
-def events_csv(events: list[dict[str, Any]]) -> str:
-    """Return the text of events.csv: a row an event, numbers in full precision."""
-    rows = [EVENT_COLUMNS, *(tuple(str(event[column]) for column in EVENT_COLUMNS) for event in events)]
-    return "".join(f"{','.join(row)}\n" for row in rows)
+def events_csv(events: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return events.csv: a row an event."""
+    return csv_bytes(EVENT_COLUMNS, ([event[column] for column in EVENT_COLUMNS] for event in events))
 
 
 def _write_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.output.atomic_directory import atomic_directory, check_place
+from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.simulation.studies import KINDS, Column, StudyResult
 
@@ -46,7 +46,8 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
     name = result.request.name
     with atomic_directory(directory, is_study_directory, kind=KIND) as partial:
         (partial / STUDY_FILE).write_bytes(json_bytes(study_document(result)))
-        _write_csv(result.columns, partial / f"{name}.csv")
+        rows = zip(*map(_cells, result.columns.values()), strict=True)
+        (partial / f"{name}.csv").write_bytes(csv_bytes(result.columns, rows))
         if plots:
             from icrtool.output.figures.study import draw_study
 
@@ -75,18 +76,8 @@ def study_document(result: StudyResult) -> dict[str, Any]:
     }
 
 
-def _write_csv(columns: dict[str, Column], path: Path) -> None:
-    """Write one row a run; numbers in the shortest form that reads back the same, nothing where there is none."""
-    texts = [_texts(values) for values in columns.values()]
-    with path.open("x", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*texts, strict=True))
-
-
-def _texts(values: Column) -> list[str]:
+def _cells(values: Column) -> list[Any]:
     if isinstance(values, list):
         return values
-    if values.dtype == np.bool_:
-        return [str(int(value)) for value in values]
-    return ["" if value != value else repr(value) for value in values.tolist()]  # noqa: PLR0124 - NaN
+    found: list[Any] = (values.astype(int) if values.dtype == np.bool_ else values).tolist()
+    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from icrtool.errors import DataError, OutputError
-from icrtool.output.atomic_directory import exchange
-from icrtool.records.unfinished import unfinished
+from icrtool.output import disk
+from icrtool.output.atomic_directory import exchange, hidden_directory, restore
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
 
@@ -38,25 +37,31 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
     OutputError
         Something is there, or the place cannot be written. It then stays as it was.
     """
-    places = (log, truth_path(log))
-    for place in places:
-        if place.exists() and not force:
-            raise OutputError(place, "exists already", "--force replaces it")
-        if place.is_dir() and not (place / "metadata.yaml").is_file():
-            raise OutputError(place, "is a directory and no bag", "it is left alone; choose another name")
+    truth = truth_path(log)
     try:
-        with (
-            tempfile.TemporaryDirectory(prefix=f".{log.name}.", dir=log.absolute().parent) as scratch,
-            unfinished(fresh := Path(scratch)),
-        ):
-            yield fresh / places[0].name, fresh / places[1].name
-            for place in places:
-                if place.is_dir():
-                    exchange(fresh / place.name, place)
-                else:
-                    (fresh / place.name).replace(place)
+        restore(log, _is_bag)
+        for place in (log, truth):
+            if place.exists() and not force:
+                raise OutputError(place, "exists already", "--force replaces it")
+            if place.is_dir() and (place == truth or not _is_bag(place)):
+                raise OutputError(place, "is a directory and no bag", "it is left alone; choose another name")
+        with hidden_directory(log.absolute()) as fresh:
+            yield fresh / log.name, fresh / truth.name
+            disk.sync_tree(fresh)
+            # Killed from here on, it leaves a log without its truth, never with that of another log.
+            disk.remove(truth)
+            if log.is_dir():
+                disk.remove(exchange(fresh / log.name, log, fresh.with_suffix(".old")))
+            else:
+                disk.replace(fresh / log.name, log)
+            disk.replace(fresh / truth.name, truth)
+            disk.sync(log.absolute().parent)
     except OSError as err:
         raise OutputError(log, "cannot be written", err.strerror or str(err)) from err
+
+
+def _is_bag(place: Path) -> bool:
+    return (place / "metadata.yaml").is_file()
 
 
 def write_truth(table: TruthTable, path: Path) -> None:

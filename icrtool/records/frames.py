@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.errors import DataError
 from icrtool.records.samples import (
@@ -56,6 +57,9 @@ GYRO = (("turn_rate_radps",), ("yaw_rate_radps",))
 LATEST_S = 4e9
 """Limit of stamps, the year 2096: differences of larger stamps may overflow 64 bits of nanoseconds."""
 
+LARGEST_STD = 1e9
+"""A stated standard deviation from here on [m, rad] is taken as not known."""
+
 
 class Parts(NamedTuple):
     """The parts of a log that data frames give."""
@@ -66,6 +70,7 @@ class Parts(NamedTuple):
     heading: HeadingSamples
     gyro: GyroSamples | None
     streams: tuple[StreamChoice, ...]
+    warnings: tuple[str, ...]
 
 
 def parts_from_frames(
@@ -89,7 +94,14 @@ def parts_from_frames(
         _stream("heading", heading_columns, headings.stamp_ns, "clockwise from north"),
     )
     rates = _gyro(gyro, name) if gyro is not None and any(column in gyro for (column,) in GYRO) else None
-    return Parts(samples, fixes, datum, headings, rates, streams)
+    chosen = (("wheels", wheels, wheel_columns), ("position", position, position_columns),
+              ("heading", heading, heading_columns))  # fmt: skip
+    warnings = []
+    for group, frame, columns in chosen:
+        clock, seconds, sound = _stamped(frame, columns, group, name)
+        if back := np.count_nonzero(np.diff(seconds[sound]) < 0):
+            warnings.append(f"{name}: {group}: {clock} goes back at {back} rows; rows are sorted by it")
+    return Parts(samples, fixes, datum, headings, rates, streams, tuple(warnings))
 
 
 def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str, name: str) -> tuple[str, ...]:
@@ -113,16 +125,13 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
     """Return a column (n,), NaN where it is empty."""
     try:
         return np.asarray(frame[column], np.float64)
-    except (TypeError, ValueError) as err:
+    except (TypeError, ValueError, OverflowError) as err:
         raise DataError(name, f"column {column}: holds a value that is not a number", str(err)) from err
 
 
 def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[Ints, list[Floats]]:
     """Return stamps (n,), strictly increasing, and columns of the rows that have numbers in all of them."""
-    values = [_numbers(frame, column, name) for column in columns]
-    (clock,) = _chosen(frame, (("stamp_ns",), ("t_s",)), group, name)
-    seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
-    sound = np.logical_and.reduce([np.isfinite(column) for column in (seconds, *values)])
+    clock, seconds, sound = _stamped(frame, columns, group, name)
     if np.any(np.abs(seconds[sound]) > LATEST_S):
         raise DataError(name, f"column {clock}: a stamp of {np.abs(seconds[sound]).max():.3g} s", "is it in its unit?")
     if clock == "t_s":
@@ -134,7 +143,22 @@ def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) ->
     if len(stamps) < 2:
         raise DataError(name, f"{group}: {len(stamps)} rows have numbers in {' and '.join(columns)}", "two are needed")
     rows = len(np.flatnonzero(sound)) - 1 - last
-    return stamps, [np.ascontiguousarray(column[sound][rows]) for column in values]
+    return stamps, [np.ascontiguousarray(_numbers(frame, column, name)[sound][rows]) for column in columns]
+
+
+def _stamped(
+    frame: pd.DataFrame, columns: Sequence[str], group: str, name: str
+) -> tuple[str, Floats, NDArray[np.bool_]]:
+    """Return the column of stamps, its values [s] (rows,), and which rows have numbers in it and in `columns`."""
+    (clock,) = _chosen(frame, (("stamp_ns",), ("t_s",)), group, name)
+    seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
+    return (
+        clock,
+        seconds,
+        np.logical_and.reduce(
+            [np.isfinite(column) for column in (seconds, *(_numbers(frame, column, name) for column in columns))]
+        ),
+    )
 
 
 def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ...]]:
@@ -163,7 +187,9 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
         height = np.nan_to_num(extra.get("height_m", unknown))
         datum = Datum(float(first[0]), float(second[0]), float(height[0]))
         north, east, _ = geodetic2ned(first, second, height, datum.latitude_deg, datum.longitude_deg, datum.height_m)
-    var_north, var_east = (extra[stds[0]] ** 2, extra[stds[1]] ** 2) if stds else (unknown, unknown.copy())
+    # Of a standard deviation that is no real one, the square may overflow.
+    real = {std: np.where(np.abs(extra[std]) < LARGEST_STD, extra[std], np.nan) for std in stds}
+    var_north, var_east = (real[stds[0]] ** 2, real[stds[1]] ** 2) if stds else (unknown, unknown.copy())
     covariance = np.zeros(len(stamps)) if stds else unknown.copy()
     return PositionFixes(stamps, np.asarray(north), np.asarray(east), var_north, var_east, covariance), datum, columns
 
@@ -187,6 +213,7 @@ def _heading(frame: pd.DataFrame, name: str) -> tuple[HeadingSamples, tuple[str,
     for column, unit in (("heading_std_rad", 1.0), ("heading_std_deg", math.pi / 180)):
         if column in frame:
             std = unit * _at(frame, column, columns, stamps, name)
+            std[np.abs(std) >= LARGEST_STD] = np.nan
             break
     return HeadingSamples(stamps, np.pi - np.mod(np.pi - heading, 2 * np.pi), std**2), columns
 

@@ -108,8 +108,11 @@ class RobotLog:
         DataError
             A column is missing, holds a value that is not a number, or has fewer than two samples; the column is named.
         """
-        samples, fixes, datum, headings, rates, streams = parts_from_frames(wheels, position, heading, gyro, name)
-        return cls(LogText(name), samples, fixes, headings, datum, streams, (), {}, (), gyro=rates)
+        parts = parts_from_frames(wheels, position, heading, gyro, name)
+        return cls(
+            LogText(name), parts.wheels, parts.gnss, parts.heading, parts.datum, parts.streams, (), {}, parts.warnings,
+            gyro=parts.gyro,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         spans = [samples.stamp_ns[[0, -1]] for samples in self._by_role().values() if len(samples.stamp_ns)]

@@ -8,6 +8,9 @@ from typing import Self
 LONGEST_NAME = 80
 """Characters of a name that are printed; of a longer one the beginning and the end are."""
 
+LONGEST_TEXT = 1 << 16
+"""Characters of a text from a log that are used: names of 40 MB took minutes to look through."""
+
 LONGEST_MESSAGE = 4000
 """Characters of an error or a warning that are printed."""
 
@@ -25,7 +28,8 @@ class LogText(str):
 
     Attributes
     ----------
-    raw : the text as it is in the log; for JSON, which has its own escapes, and for file names
+    raw : the text as it is in the log, its first `LONGEST_TEXT` characters; for JSON, which has its own
+        escapes, and for file names
 
     Examples
     --------
@@ -39,6 +43,7 @@ class LogText(str):
         """Return `raw` as a LogText; a LogText is returned as it is."""
         if isinstance(raw, cls):
             return raw
+        raw = raw[:LONGEST_TEXT]
         self = super().__new__(cls, escaped(raw))
         self.raw = raw
         return self

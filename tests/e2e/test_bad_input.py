@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
 from icrtool.config import load_config
+from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
@@ -28,6 +29,7 @@ from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 START_NS = 1_760_000_000_000_000_000
 ROBOT = ("--set", "robot.track_width_m=0.55", "--set", "robot.wheel_radius_m=0.165")
 OPTIONS = WriteOptions(wheel_radius_m=0.165, track_width_m=0.55)
+CONFIG = load_config(sets=[*ROBOT[1::2]])
 NO_INTS, NO_FLOATS = np.zeros(0, np.int64), np.zeros(0)
 
 
@@ -500,3 +502,69 @@ def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, option
         assert after or process.returncode != 0
         stopped += not after
     assert stopped > 0
+
+
+HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
+
+
+def clock_set(folder: Path, jump_ns: int, *, topic: str = "", header: bool = True, log_time: bool = True) -> Path:
+    """The drive with clocks that are set by `jump_ns` after half of it: of all topics, or of one."""
+
+    def edit(name: str, stamp: int, data: bytes) -> tuple[int, bytes]:
+        later = stamp + (jump_ns if stamp >= START_NS + 10 * 10**9 and topic in name else 0)
+        return later if log_time else stamp, with_header(data, later if header else stamp)
+
+    return rewritten(log(folder), edit)
+
+
+SORTED, PAUSED, APART = "log time goes back", "no samples for", "more than a day apart"
+
+
+@pytest.mark.parametrize("topic", ["", "/joint_states", "/gps/fix", "/imu/data"])
+@pytest.mark.parametrize(
+    ("jump_ns", "words"),
+    [(HOUR_NS, {PAUSED}), (-HOUR_NS, {SORTED, PAUSED}), (YEAR_NS, {APART}), (-YEAR_NS, {SORTED, APART})],
+)
+def test_a_clock_that_is_set_is_reported(tmp_path: Path, topic: str, jump_ns: int, words: set[str]) -> None:
+    warnings = "\n".join(read_log(clock_set(tmp_path, jump_ns, topic=topic), CONFIG).warnings)
+    assert {word for word in (SORTED, PAUSED, APART) if word in warnings} == words
+
+
+def test_a_drive_in_parts_an_hour_apart_gives_the_same_icrs(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    usual = fit(read_log(log(tmp_path / "whole"), CONFIG), CONFIG).summary["icr"]["final"]
+    for jump_ns in (HOUR_NS, -HOUR_NS):
+        folder = tmp_path / str(jump_ns)
+        folder.mkdir()
+        found = fit(read_log(clock_set(folder, jump_ns), CONFIG), CONFIG).summary["icr"]["final"]
+        assert found == pytest.approx(usual, abs=0.002), "metres"
+
+
+@pytest.mark.parametrize("clocks", [{"header": True}, {"header": False}])
+def test_a_clock_that_is_set_back_so_that_times_come_again_is_refused(tmp_path: Path, clocks: dict[str, bool]) -> None:
+    with pytest.raises(DataError, match=r"log time goes back by 5\.0 s"):
+        read_log(clock_set(tmp_path, -5 * 10**9, **clocks), CONFIG)
+
+
+@pytest.mark.parametrize("shift_ns", [-15 * 10**9, -HOUR_NS, 8 * 10**9])
+def test_a_few_messages_out_of_place_are_sorted(tmp_path: Path, shift_ns: int) -> None:
+    numbers: dict[str, int] = {}
+
+    def edit(topic: str, stamp: int, data: bytes) -> tuple[int, bytes]:
+        numbers[topic] = numbers.get(topic, 0) + 1
+        stamp += shift_ns if numbers[topic] in (60, 61, 70) else 0
+        return stamp, with_header(data, stamp)
+
+    found = read_log(rewritten(log(tmp_path), edit), CONFIG)
+    assert any(SORTED in warning for warning in found.warnings)
+    assert len(found.wheels.stamp_ns) >= 397
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR_NS, -HOUR_NS, YEAR_NS, -YEAR_NS])
+def test_header_stamps_of_another_clock_are_reported(tmp_path: Path, jump_ns: int) -> None:
+    path = clock_set(tmp_path, jump_ns, log_time=False)
+    assert any("log time is used" in warning for warning in read_log(path, CONFIG).warnings)
+    late = rewritten(
+        path, lambda _, stamp, data: (stamp, with_header(data, stamp + jump_ns * (stamp > START_NS + 18 * 10**9)))
+    )
+    assert any("header stamps are of another clock" in warning for warning in read_log(late, CONFIG).warnings)

@@ -23,7 +23,9 @@ print("loaded")
 
 COMMAND = """
 import signal
+from icrtool.cli import interrupts
 from icrtool.cli.interrupts import end_in_order
+interrupts.GRACE_S = 30.0
 
 def command():
     import loading
@@ -97,4 +99,29 @@ def test_compiled_code_that_looks_for_no_signal_is_ended_and_leaves_nothing(tmp_
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (143, "", "")
     assert not (tmp_path / "half").exists()
+    assert time.monotonic() - begin < 10
+
+
+AT_THE_END = """
+import hashlib, os, signal, sys, threading
+from icrtool.cli.interrupts import end_in_order
+
+def compute():
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
+
+def command():
+    threading.Thread(target=compute).start()
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.pause()
+
+with end_in_order(command.__code__):
+    command()
+"""
+
+
+def test_a_thread_that_computes_does_not_hold_up_the_end() -> None:
+    """The interpreter waits for its threads when it ends."""
+    begin = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "")
     assert time.monotonic() - begin < 10

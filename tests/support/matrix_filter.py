@@ -77,6 +77,7 @@ def run_filter_plain(
         slips = held < len(data.slipping) and data.slipping[held]
         if dt > 0:
             Q = np.diag(parameters.process_variance) * (REFERENCE_STEP_S * dt if parameters.rate_invariant else dt**2)
+            Q[2, 2] += dt * data.turn_variance[held] if held < len(data.turn_variance) else 0.0
             if in_gap or slips:
                 if slips and not in_gap:
                     speeds = (data.v_left[held], data.v_right[held])

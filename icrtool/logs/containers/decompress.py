@@ -38,11 +38,25 @@ class Inflation:
         DecompressionError
             Damaged data; or the chunks before this one inflated more than `LARGEST_RATIO` times and one chunk.
         """
+        self.check()
+        out = decompress(data, compression, size, partial=partial)
+        self.add(len(data), len(out))
+        return out
+
+    def check(self) -> None:
+        """Refuse to decompress more, where what was decompressed is too much.
+
+        Raises
+        ------
+        DecompressionError
+            As `decompress`.
+        """
         if self._left < 0:
             raise DecompressionError(f"the log inflates more than {LARGEST_RATIO} times")
-        out = decompress(data, compression, size, partial=partial)
-        self._left += LARGEST_RATIO * len(data) - len(out)
-        return out
+
+    def add(self, packed: int, unpacked: int) -> None:
+        """Count what was decompressed [bytes]."""
+        self._left += LARGEST_RATIO * packed - unpacked
 
 
 class DecompressionError(Exception):
@@ -71,7 +85,7 @@ def decompress(data: bytes | memoryview, compression: str, size: int, *, partial
     if decoder is None:
         raise DecompressionError(f"compression {compression!r} is not known")
     try:
-        out = decoder(data, size)
+        out = decoder(data, size, partial)
     except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
         raise DecompressionError(str(err) or "not enough memory") from err
     if len(out) != size and not partial:
@@ -79,22 +93,25 @@ def decompress(data: bytes | memoryview, compression: str, size: int, *, partial
     return out
 
 
-def _lz4(data: bytes | memoryview, size: int) -> bytes:
+def _lz4(data: bytes | memoryview, size: int, _: bool) -> bytes:
     import lz4.frame
 
     decoder = lz4.frame.LZ4FrameDecompressor()
     return bytes(decoder.decompress(data, max_length=size + 1))
 
 
-def _bz2(data: bytes | memoryview, size: int) -> bytes:
+def _bz2(data: bytes | memoryview, size: int, _: bool) -> bytes:
     return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
 
 
-def _zstd(data: bytes | memoryview, size: int) -> bytes:
+def _zstd(data: bytes | memoryview, size: int, partial: bool) -> bytes:
     import zstandard
 
+    decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
     try:
-        with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
+        if not partial and zstandard.frame_content_size(data) == size:
+            return decompressor.decompress(data)
+        with decompressor.stream_reader(data) as reader:
             return bytes(reader.read(size + 1))
     except zstandard.ZstdError as err:
         raise DecompressionError(str(err)) from err
@@ -114,13 +131,14 @@ def unpack_messages(
     report : called once, after the last block, with how many messages could not be decompressed, and why
     """
     left_out, reason = 0, ""
+    inflation = Inflation()
     for block in blocks:
         rows: list[int] = []
         messages: list[bytes] = []
         held = 0
         for row in np.flatnonzero(np.isin(block.channel, list(wanted))).tolist():
             try:
-                message = _unpack(block.data[block.start[row] : block.end[row]].tobytes(), compression)
+                message = _unpack(block.data[block.start[row] : block.end[row]].tobytes(), compression, inflation)
             except DecompressionError as err:
                 left_out, reason = left_out + 1, reason or str(err.args[0])
                 continue
@@ -143,16 +161,19 @@ def _repacked(block: Block, rows: list[int], messages: list[bytes]) -> Block:
     return Block(data, block.channel[rows], block.log_time_ns[rows], start, end)
 
 
-def _unpack(data: bytes, compression: str) -> bytes:
+def _unpack(data: bytes, compression: str, inflation: Inflation) -> bytes:
     """Decompress one message."""
     import zstandard
 
     if compression != "zstd":
         raise DecompressionError(f"compression {compression!r} is not known")
+    inflation.check()
     try:
         size = zstandard.frame_content_size(data)
         if size > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"one claims {size} bytes")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_UNKNOWN_SIZE_BYTES if size < 0 else 0)
+        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=_UNKNOWN_SIZE_BYTES if size < 0 else 0)
     except (zstandard.ZstdError, MemoryError) as err:
         raise DecompressionError(str(err)) from err
+    inflation.add(len(data), len(out))
+    return out

@@ -10,15 +10,18 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, Problems, ros_type_name
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
-from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
+from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, ros_type_name
+from icrtool.logs.containers.chunked_file import ChunkedFile
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError
+from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE
 from icrtool.records.tables import Ints
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
+_MOST_FIELDS = 100
+"""Of a header; real ones have ten at most."""
 
 
 class _Record(NamedTuple):
@@ -53,7 +56,7 @@ class _Chunk(NamedTuple):
     end_ns: int
 
 
-class Ros1Bag:
+class Ros1Bag(ChunkedFile):
     """One ROS 1 bag.
 
     Raises
@@ -63,17 +66,11 @@ class Ros1Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.files = [path]
-        self.problems = Problems(path.name)
-        self._table = RecordTable()
-        self._inflation = Inflation()
+        super().__init__(path)
         self._connections: dict[int, Channel] = {}
-        self._stream = path.open("rb")
         try:
-            self._size = path.stat().st_size
             self._check_start()
-            self._chunks = self._read_index()
+            self._chunks: list[_Chunk] | None = self._read_index()
             if self._chunks is None:
                 self.problems.add("has no index (not closed, or cut off); read from start to end")
                 for _ in self._read_in_order(learn=True):
@@ -82,23 +79,6 @@ class Ros1Bag:
             self.close()
             raise
         self.channels = list(self._connections.values())
-
-    def share_read(self) -> float:
-        """Return the share of the file that has been read, 0 to 1."""
-        return self._stream.tell() / max(self._size, 1)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._stream.close()
-
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message by the index, None without one."""
-        begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
-        return min(begins, default=None)
-
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message by the index, None without one."""
-        return max((chunk.end_ns for chunk in self._chunks or () if chunk.end_ns), default=None)
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted connections, chunk by chunk."""
@@ -243,8 +223,11 @@ class Ros1Bag:
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:
     """Return the fields of a record's or a connection's header by name."""
-    fields, place = {}, 0
-    while place + 4 <= len(header):
+    fields: dict[bytes, bytes] = {}
+    place = 0
+    for _ in range(_MOST_FIELDS):
+        if place + 4 > len(header):
+            break
         end = place + 4 + int.from_bytes(header[place : place + 4], "little")
         name, _, value = header[place + 4 : end].partition(b"=")
         fields[name] = value

@@ -7,6 +7,7 @@ So the messages are grouped by their number of joints, and each group is decoded
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -134,9 +135,7 @@ def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
         column = columns[f"{quantity}[*]"] = np.full((len(table), joints), np.nan)
         for j in range(joints):
             column[:, j] = _interface(table, f"joint {j}.", quantity)
-    return TopicTable(
-        table.topic, table.message_type, table.log_time_ns, columns, texts, table.unreadable, table.definition_source
-    )
+    return replace(table, columns=columns, texts=texts)
 
 
 def _interface(table: TopicTable, joint: str, quantity: str) -> NDArray[np.float64]:

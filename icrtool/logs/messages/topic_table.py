@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,32 @@ _ROWS_AT_ONCE = 16_384 + 8
 _FIRST_ROWS = 64
 """Rows of a topic's first table; the next ones have twice as many: a log may hold thousands of topics."""
 
+_MOST_EXPECTED = 1 << 22
+"""Numbers of a column that memory is set aside for on the log's word alone."""
+
 _LARGEST_TABLE = 1 << 22
 _MOST_BYTES_AT_ONCE = 1 << 24
 """Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
+
+
+class SetBack(NamedTuple):
+    """How far log time goes back at most from one stored message to the next, and how mixed messages are once sorted.
+
+    Attributes
+    ----------
+    step_ns : the largest step back
+    pieces : into how many a stretch between such steps is cut by sorting, in the mean: 1 where the stretches only
+        change places, about 2 where single messages are out of place, many where times come again
+    """
+
+    step_ns: int
+    pieces: float
+
+
+NOT_SET_BACK = SetBack(0, 0.0)
+
+NEAR_NS = 2_000_000_000
+"""Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +66,7 @@ class TopicTable:
     texts : the distinct texts of each text field
     unreadable : messages that did not have the shape of their type
     definition_source : where the message definition came from
+    set_back : of the clock that the messages were logged with
     """
 
     topic: LogText
@@ -52,6 +76,7 @@ class TopicTable:
     texts: dict[str, list[LogText]]
     unreadable: int
     definition_source: str
+    set_back: SetBack = NOT_SET_BACK
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
@@ -86,9 +111,9 @@ class TopicTable:
         return self.columns[path], self.texts[path]
 
     def floats(self, *paths: str) -> NDArray[np.float64]:
-        """Return the first of these columns as float64, NaN everywhere when the type has none."""
+        """Return the first of these columns as float64, not to be written to; NaN everywhere when the type has none."""
         values = self.find(*paths)
-        return np.full(len(self), np.nan) if values is None else values.astype(np.float64)
+        return np.full(len(self), np.nan) if values is None else values.astype(np.float64, copy=False)
 
     def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
         """Return the table of the chosen messages."""
@@ -125,6 +150,55 @@ class _Rows:
         )
 
 
+class _Column:
+    """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
+
+    Parameters
+    ----------
+    lacking : what integers are where a row has fewer elements than others; floats are NaN there
+    """
+
+    def __init__(self, lacking: int) -> None:
+        self._lacking = lacking
+        self._rows = 0
+        self._values: NDArray[Any] = np.empty(0, np.int64)
+
+    def add(self, part: NDArray[Any], expected: int) -> None:
+        """Add rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
+        before, held = self._rows, self._values
+        self._rows += len(part)
+        one = _single_row(part)
+        if before == 0:
+            self._values = part if one is None else one
+        elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
+            width = max(part.shape[1:], held.shape[1:])
+            if len(held) < self._rows or width > held.shape[1:]:
+                likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
+                self._values = np.empty((*width, max(2 * before, self._rows, likely)), held.dtype).T
+                self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
+            self._put(before, part)
+
+    def _put(self, begin: int, part: NDArray[Any]) -> None:
+        rows = self._values[begin : begin + len(part)]
+        if part.ndim == 2 and part.shape[1] < rows.shape[1]:
+            rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
+            rows = rows[:, : part.shape[1]]
+        rows[...] = part
+
+    def taken(self) -> NDArray[Any]:
+        """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
+        values = self._values
+        return values[: self._rows] if len(values) > 1 else np.broadcast_to(values, (self._rows, *values.shape[1:]))
+
+
+def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
+    """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
+    bits = rows.view(np.int64)
+    if len(rows) == 0 or np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]):
+        return None
+    return rows[:1].copy()
+
+
 @dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
@@ -143,8 +217,8 @@ class TopicCollector:
     _layout: Layout | None = None
     _source: str = ""
     _rows: _Rows = field(default_factory=_Rows)
-    _times: list[Ints] = field(default_factory=list)
-    _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _times: _Column = field(default_factory=lambda: _Column(0))
+    _columns: dict[str, _Column] = field(default_factory=dict)
     _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
@@ -227,10 +301,12 @@ class TopicCollector:
         if not readable.all():
             table, times_ns = table[readable], times_ns[readable]
         self._unreadable += filled - len(table)
-        self._times.append(times_ns)
+        expected = self.channel.count or 0
+        self._times.add(times_ns, expected)
         for path, slot in self.layout.slots.items():
-            take = self._text_numbers if slot.kind == "string" else self.layout.numbers
-            self._parts.setdefault(path, []).append(take(table, path))
+            is_text = slot.kind == "string"
+            values = (self._text_numbers if is_text else self.layout.numbers)(table, path)
+            self._columns.setdefault(path, _Column(-1 if is_text else 0)).add(values, expected)
         rows.filled = 0
 
     def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
@@ -253,16 +329,13 @@ class TopicCollector:
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
         self._settle()
-        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
-        self._times.clear()
+        times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
+        self._times, self._columns, self._unreadable = _Column(0), {}, 0
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
-        unreadable, self._unreadable = self._unreadable, 0
-        gathered, self._parts = self._parts, {}
-        for path, parts in gathered.items():
-            values = _joined(parts, -1 if path in self._texts else 0)
-            parts.clear()
+        for path in [*gathered]:
+            values = gathered.pop(path).taken()
             if path in self._texts:
                 texts[path] = list(self._texts[path].values())
             columns[path] = values if order is None else values[order]
@@ -274,7 +347,16 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
+            NOT_SET_BACK if order is None else _set_back(times, order),
         )
+
+
+def _set_back(times: Ints, order: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting by `order` (n,) does to the stretches between."""
+    steps = np.diff(times)
+    stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
+    pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
+    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
@@ -314,7 +396,10 @@ def _merged(group: list[TopicTable]) -> TopicTable:
             renumber = [np.array([*(places[text] for text in table.texts[path]), -1]) for table in group]
             parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
         columns[path] = _joined(parts, -1 if path in texts else 0)[order]
-    return replace(group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable)
+    set_back = max(table.set_back for table in group)
+    return replace(
+        group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable, set_back=set_back
+    )
 
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import Ints
+from icrtool.errors import DataError
+from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
+from icrtool.records.tables import Bools, Ints, Role
 
-NEAR_NS = 2_000_000_000
-"""A header stamp this far from the log time (median) is another clock's: GPS time is 18 s off, a dead RTC years."""
+MOST_PIECES = 10.0
+"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
 
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
@@ -27,12 +29,16 @@ class StampedRows:
     log_ns : (n,) log times
     note : why the header's are not used, empty when they are
     delay_ns : median of log time minus header stamp, 0 without header stamps
+    replaced : header stamps of another clock that log times stand for
+    set_back : as `TopicTable.set_back`
     """
 
     header_ns: Ints | None
     log_ns: Ints
     note: str
     delay_ns: int
+    replaced: int = 0
+    set_back: SetBack = NOT_SET_BACK
 
     def on(self, clock: Literal["header", "log"]) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
@@ -41,6 +47,10 @@ class StampedRows:
 
 def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
+    return replace(_usable(table, path), set_back=table.set_back)
+
+
+def _usable(table: TopicTable, path: str) -> StampedRows:
     log_ns = table.log_time_ns
     if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
@@ -52,19 +62,54 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    header = np.where(np.abs(log_ns - header - delay) > NEAR_NS, log_ns - delay, header)
+    other = np.abs(log_ns - header - delay) > NEAR_NS
+    header[other] = log_ns[other] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
-    return StampedRows(header, log_ns, "", delay)
+    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)))
 
 
-def increasing(stamps: Ints) -> tuple[Ints, int, int]:
+def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
+    """Yield sentences about clocks that cannot be used, or that were set.
+
+    Raises
+    ------
+    DataError
+        The clock was set back, and times came again: nothing shows which of two samples came first.
+    """
+    if rows.set_back.pieces > MOST_PIECES:
+        why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
+        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
+    if rows.set_back.step_ns > NEAR_NS:
+        yield (
+            f"{name}: log time goes back by {rows.set_back.step_ns / 1e9:.0f} s; messages are sorted; if the clock was "
+            "set while recording, fit each part alone (--from, --to)"
+        )
+    if rows.note and rows.note != "no header":
+        yield f"{name}: {role}: {rows.note}; log time is used"
+    if rows.replaced > 1:
+        counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+        yield f"{name}: {role}: {counted}; log time is used for them"
+
+
+def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:
+    """Return the usable rows (n,) that make stamps strictly increasing; all rows as a slice, which copies nothing."""
+    if usable.all():
+        return increasing(stamps)[0]
+    rows = np.flatnonzero(usable)
+    return rows[increasing(stamps[rows])[0]]
+
+
+def increasing(stamps: Ints) -> tuple[Ints | slice, int, int]:
     """Return the rows that make stamps strictly increasing, how many went back, and how many were equal.
 
-    Rows are sorted by stamp; of rows with the same stamp the last one stays.
+    Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice.
     """
-    backwards = int(np.count_nonzero(np.diff(stamps) < 0))
+    steps = np.diff(stamps)
+    if (steps > 0).all():
+        return slice(None), 0, 0
+    backwards = int(np.count_nonzero(steps < 0))
     order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
     ordered = stamps[order]
     keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)

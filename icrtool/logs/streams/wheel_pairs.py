@@ -49,7 +49,8 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
     both = _while_both(left, right)
     if not both.any():
         return unusable("the two sides were not recorded at the same time")
-    moments, stamps = left.log_time_ns[both], StampedRows(None, left.log_time_ns[both], "no header", 0)
+    moments = left.log_time_ns[both]
+    stamps = StampedRows(None, moments, "no header", 0, set_back=max(left.set_back, right.set_back))
     integer = left.message_type in _BITS
     if _is_position(left.topic, values[0], config, integer=integer):
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"

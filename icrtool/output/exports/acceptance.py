@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
-from icrtool.output.atomic_file import atomic_file
+from icrtool.output.atomic_file import write_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
 from icrtool.output.text_format import run_title, xml_text
 
@@ -64,8 +64,7 @@ def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-rep
     for total in ("tests", "failures", "errors", "skipped"):
         root.set(total, str(sum(int(suite.get(total, "0")) for suite in root)))
     ET.indent(root)
-    with atomic_file(path) as partial:
-        partial.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+    write_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
 def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
@@ -87,8 +86,7 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
             parts.append(f"## {escaped_markdown(name)}\n\nCould not be used: {escaped_markdown(str(outcome))}\n")
         else:
             parts.append(format_markdown(outcome))
-    with atomic_file(path) as partial:
-        partial.write_bytes("\n".join(parts).encode("utf-8", errors="backslashreplace"))
+    write_file(path, "\n".join(parts))
 
 
 def format_markdown(report: DropoutReport) -> str:

@@ -39,7 +39,7 @@ LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
 """The histograms of a horizon share one scale: up to the largest p95 and a margin, but at most so many times that of
 the ICRs. The share of trials beyond it is written at its end."""
 
-MOSTLY_BEYOND_PCT = 50.0
+MOSTLY_BEYOND_PCT = 90.0
 
 
 def draw_summary(title: str, report: DropoutReport) -> Figure:

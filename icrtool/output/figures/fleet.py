@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
+from icrtool.output.atomic_file import atomic_file
 from icrtool.output.figures.style import drawable, inches, new_figure, save, style
 
 if TYPE_CHECKING:
@@ -44,10 +45,12 @@ def draw_fleet(
             "failures": draw_fleet_failures(title, reasons) if reasons else None,
         }
         for stem, figure in figures.items():
-            for old in directory.glob(f"{stem}.*"):
+            wanted = {directory / f"{stem}.{form}" for form in formats if figure is not None}
+            for file in wanted:
+                with atomic_file(file) as partial:
+                    save(cast("Figure", figure), partial.with_suffix(""), (file.suffix[1:],))
+            for old in set(directory.glob(f"{stem}.*")) - wanted:
                 old.unlink()
-            if figure is not None:
-                save(figure, directory / stem, formats)
 
 
 def draw_fleet_icrs(title: str, points: Sequence[IcrPoint]) -> Figure:

@@ -40,7 +40,7 @@ def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequen
     figure.subplots_adjust(**inches(figure, left=2.75, right=1.05, top=0.62, bottom=0.9))
     _draw_rows(axes, scores, h)
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("Error [m], logarithmic")

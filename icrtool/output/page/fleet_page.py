@@ -7,8 +7,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from icrtool.output.atomic_file import write_file
 from icrtool.output.page.pictures import pictures_in
-from icrtool.output.page.render import render, write_html
+from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.tables.dropout import metres_text
 from icrtool.output.text_format import distance_text, duration_text
@@ -77,7 +78,7 @@ def write_fleet_page(document: Mapping[str, Any], folder: Path) -> None:
     OutputError
         It cannot be written.
     """
-    write_html(fleet_page(document, folder), folder / PAGE_FILE)
+    write_file(folder / PAGE_FILE, fleet_page(document, folder))
 
 
 def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -8,12 +8,10 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from icrtool import __version__
 from icrtool.output import text_format
-from icrtool.output.atomic_file import atomic_file
 from icrtool.output.tables.dropout import metres_text
 from icrtool.records.plain_data import plain
 from icrtool.records.text import escaped
@@ -90,18 +88,6 @@ def _environment() -> Environment:
 def script_json(data: Mapping[str, Any]) -> str:
     """Return JSON that can stand in a script element, whatever text it holds."""
     return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
-
-
-def write_html(page: str, path: Path) -> None:
-    """Write a page, whole or not at all.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written.
-    """
-    with atomic_file(path) as partial:
-        partial.write_bytes(page.encode("utf-8", errors="backslashreplace"))
 
 
 def _metres(value: float | None) -> str:

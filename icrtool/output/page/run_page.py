@@ -14,11 +14,12 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
+from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import WITH_PLACE, Picture, drawn_pictures, pictures_in
-from icrtool.output.page.render import render, write_html
+from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
 from icrtool.output.text_format import duration_text, length_text, position_word
@@ -59,7 +60,7 @@ def write_page(
         The file cannot be written.
     """
     pictures = pictures_of_run(plots if plots is not None else run.directory)
-    write_html(run_page(run, report_document(report), pictures, coordinates=coordinates), Path(path))
+    write_file(Path(path), run_page(run, report_document(report), pictures, coordinates=coordinates))
 
 
 def run_page(

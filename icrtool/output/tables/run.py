@@ -129,7 +129,7 @@ def _recommended_rows(run: Run) -> list[Row]:
     values = ", ".join(f"{name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
     model = model_text(found["label"], found["model"], len(rows))
     return [
-        ("recommended", f"{model}: {values}; what error it makes: icrtool dropout-report"),
+        ("model", f"recommended: {model}: {values}; what error it makes: icrtool dropout-report"),
         ("controller", controller_text(found["controller"])),
     ]
 

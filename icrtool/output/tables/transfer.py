@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from typing import Any
 
 from icrtool.calibration.transfer import Cell, Pair, Transfer
+from icrtool.output.csv_file import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.text import table_cell
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
 
@@ -55,15 +53,7 @@ def _row(cell: Cell) -> dict[str, Any]:
 
 def transfer_csv(transfer: Transfer) -> bytes:
     """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_row(transfer.cells[0]))
-    writer.writerows(
-        [table_cell(value) if isinstance(value, str) else value if math.isfinite(value) else ""
-         for value in _row(cell).values()]
-        for cell in transfer.cells
-    )  # fmt: skip
-    return text.getvalue().encode()
+    return csv_bytes(_row(transfer.cells[0]), (_row(cell).values() for cell in transfer.cells))
 
 
 def format_transfer(transfer: Transfer) -> Text:

@@ -17,6 +17,7 @@ from icrtool.alignment.drive_windows import drive_arrays
 from icrtool.alignment.gyro_heading import estimate_heading
 from icrtool.alignment.heading_choice import DerivedHeading, derive_heading, fuse_heading
 from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.estimation.fit import fit
 from icrtool.records.tables import GyroAxes, HeadingSamples, OtherReceiver, RobotLog
 from support.exact_drives import CONFIG, simulate
 
@@ -195,6 +196,50 @@ def test_physics_logs_without_an_attitude_sensor_give_the_true_heading(shared_lo
         stamps = log.wheels.stamp_ns[0] + np.round((truth["t"] - truth["t"][0]) * 1e9).astype(np.int64)
         expected = stamps, np.unwrap(truth["heading"])
     assert math.sqrt((error_deg(found.smoothed, expected) ** 2).mean()) < LARGEST_RMS_DEG
+    # and so do the states, in turns too
+    table = fit(log, config).table
+    states = HeadingSamples(table.stamp_ns, table.heading_rad, table.std_heading_rad**2)
+    assert math.sqrt((error_deg(states, expected) ** 2).mean()) < LARGEST_RMS_DEG
+    assert coverage(states, expected) > 0.9
+
+
+def test_noise_of_the_fixes_is_no_drift_of_the_heading() -> None:
+    log, truth = without_heading(1)
+    rng = np.random.default_rng(3)
+    north, east = (one + rng.normal(0.0, 1.0, len(one)) for one in (log.gnss.north_m, log.gnss.east_m))
+    log = with_attitude(replace(log, gnss=replace(log.gnss, north_m=north, east_m=east)), truth, 1)
+    found = align_streams(log, CONFIG)
+    assert found.heading.source in ("orientation", "fused")
+    assert not any("drifts" in warning for warning in found.log.warnings)
+
+
+def test_a_slow_robot_with_positions_of_a_metre_gets_a_heading() -> None:
+    """The log of a robot at a quarter of the speed: a course of 6 m takes half a minute."""
+    log, truth = without_heading(4)
+    epoch, times = log.wheels.stamp_ns[0], 4
+
+    def slower(stamps: np.ndarray) -> np.ndarray:
+        return np.asarray(epoch + times * (stamps - epoch))
+
+    rng, gnss, wheels, gyro = np.random.default_rng(5), log.gnss, log.wheels, log.gyros[0]
+    north, east = (one + rng.normal(0.0, 1.0, len(one)) for one in (gnss.north_m, gnss.east_m))
+    slow = replace(
+        log,
+        wheels=replace(wheels, stamp_ns=slower(wheels.stamp_ns), left=wheels.left / times, right=wheels.right / times),
+        gnss=replace(gnss, stamp_ns=slower(gnss.stamp_ns), north_m=north, east_m=east),
+        gyros=(replace(gyro, stamp_ns=slower(gyro.stamp_ns), rates_radps=gyro.rates_radps / times),),
+    )
+    found = derive_heading(slow, WIDTH_M)
+    assert found.source == "gyro_course"
+    assert coverage(found.causal, (slower(truth[0]), truth[1])) > 0.9
+
+
+def test_a_gyro_that_shows_no_turn_gives_way_to_the_wheels() -> None:
+    log, truth = without_heading(2)
+    dead = replace(log.gyros[0], rates_radps=np.zeros_like(log.gyros[0].rates_radps))
+    found = derive_heading(replace(log, gyros=(dead,)), WIDTH_M)
+    assert found.source == "wheels_course"
+    assert coverage(found.causal, truth) > 0.9
 
 
 ROBOTS = {"tracked_gyro.bag": "pentzer-tracked", "wheeled_two_antennas": "segway-rmp400"}

@@ -64,3 +64,21 @@ def test_what_is_no_manifest_is_one_line(logs: Path, name: str, content: str, wh
     with pytest.raises(ConfigError, match=what) as error:
         read_manifest(logs / name)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "log\n" + "**/" * 2000 + "*\n"),
+        ("a.csv", "log\n" + "x" * 5000 + "\n"),
+        ("a.csv", "log\n" + "x" * 11_000_000),
+        ("a.toml", ".".join(["a"] * 20_000) + " = 1"),
+        ("a.toml", "logs = " + "[" * 50_000),
+    ],
+    ids=["pattern", "name", "size", "key", "values"],
+)
+def test_a_manifest_made_to_exhaust_is_refused(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError) as err:
+        read_manifest(tmp_path / name)
+    assert len(str(err.value).splitlines()) == 1

@@ -17,6 +17,7 @@ from icrtool.kernels.robust import (
     long_run_factor,
     mad_std,
     robust_least_squares,
+    sandwich_covariance,
     soft_l1_weights,
 )
 
@@ -124,3 +125,14 @@ def test_the_long_run_factor_gives_the_spread_of_the_mean_of_correlated_values()
     assert 0.8 * true < found < 2.0 * true
     white = np.median([long_run_factor(rng.normal(size=(count, 1)))[0] for _ in range(300)])
     assert 1.0 <= white < 1.6
+
+
+def test_weights_that_differ_by_hundreds_of_decades_leave_variances() -> None:
+    """Windows before a clock was set by an hour are forgotten: their weight is 1e-294."""
+    rng = np.random.default_rng(0)
+    jacobian = rng.standard_normal((30, 3))
+    jacobian[5:, 0] = 0.0
+    scale = np.where(np.arange(30) < 5, 1e147, 1.0)
+    for pull in (np.full(3, 1.0), np.full(3, 1e-200)):
+        covariance = sandwich_covariance(rng.standard_normal(30), jacobian, scale, np.arange(30) // 5, pull)[0]
+        assert (np.diag(covariance) > 0.0).all()

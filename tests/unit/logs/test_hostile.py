@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import time
 import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +14,16 @@ import pytest
 from mcap.writer import Writer
 
 from icrtool.config import load_config
-from icrtool.errors import ConfigError, DefinitionError, LogError
-from icrtool.logs.containers.channel import Channel, Cut
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
+from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
+from icrtool.estimation.fit import fit
+from icrtool.logs.containers.channel import Block, Channel, Cut
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, unpack_messages
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.cut import moment
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.dynamic_joints import collector_for
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
-from icrtool.logs.read_log import survey_log
+from icrtool.logs.read_log import read_log, survey_log
 from icrtool.records.text import LogText
 
 SEPARATOR = "=" * 80 + "\n"
@@ -237,6 +240,9 @@ def test_moments_are_seconds_or_times_with_a_zone() -> None:
         ("[dropout]\nhorizons_m = [" + ",".join(map(str, range(1, 100_000))) + "]", "dropout.horizons_m"),
         ("[robot]\nname = " + "[" * 100_000, "nested"),
         ("[robot]\nname = 1" + " " * 2_000_000, "bytes"),
+        (".".join(["a"] * 20_000) + " = 1", "nested"),
+        ("x = {" + ".".join(["a"] * 20_000) + " = 1}", "nested"),
+        ('[robot]\nname = "\\u001b[2J"', "robot.name"),
     ],
 )
 def test_configuration_out_of_bounds_is_refused_with_its_key(tmp_path: Path, text: str, key: str) -> None:
@@ -279,3 +285,85 @@ def test_thousands_of_pairs_of_topics_and_of_frames_take_no_quadratic_time(tmp_p
     survey = survey_log(path)
     assert time.process_time() - begin < LONGEST_S
     assert len(next(table for table in survey.tables if table.topic == "/imu").texts["header.frame_id"]) == 20_000
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"," * 2_000_000 + b"\n1", "columns"),
+        (b"t_s,v_left_mps,v_right_mps,north_m,east_m,heading_rad\n" + b"1,2,3,4,5,6,7,8\n" * 9, "more values"),
+        (b"t_s,v_left_mps,v_right_mps,north_m,east_m,heading_rad\n" + b"1," + b"9" * 400 + b",3,4,5,6\n" * 9, "number"),
+    ],
+    ids=["columns", "values", "digits"],
+)
+def test_a_table_that_is_none_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(content)
+    begin = time.process_time()
+    with pytest.raises(IcrToolError, match=words):
+        read_log(path)
+    assert time.process_time() - begin < LONGEST_S
+
+
+@pytest.mark.parametrize("column", ["t_s", "v_left_mps", "north_m", "position_std_m", "heading_rad", "heading_std_deg"])
+@pytest.mark.parametrize("values", [("1e308", "-1e308"), ("inf", "nan"), ("True", "False")])
+def test_a_column_of_nonsense_is_refused_in_one_line_or_left_out(
+    tmp_path: Path, column: str, values: tuple[str, str]
+) -> None:
+    columns = ["t_s", "v_left_mps", "v_right_mps", "north_m", "east_m", "position_std_m", "heading_rad"]
+    columns.append("heading_std_deg")
+    rows = [[0.05 * i, 0.9, 0.7, np.sin(0.02 * i), np.cos(0.02 * i), 0.01, 0.02 * i, 1.0] for i in range(200)]
+    for i, row in enumerate(rows):
+        row[columns.index(column)] = values[i % 2]  # type: ignore[call-overload]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(",".join(map(str, row)) for row in (columns, *rows)))
+    config = load_config(sets=["robot.track_width_m=0.5"])
+    for start in (None, 1.0):
+        with suppress(IcrToolError):
+            fit(read_log(path, config, start=start), config)
+
+
+def test_messages_that_each_inflate_a_thousand_times_are_left_out() -> None:
+    import zstandard
+
+    bomb = np.frombuffer(zstandard.compress(bytes(1 << 24)), np.uint8)
+    size, count = len(bomb), 200
+    start = size * np.arange(count)
+    block = Block(np.tile(bomb, count), np.zeros(count, np.int64), np.arange(count), start, start + size)
+    said: list[str] = []
+    held = sum(len(one.data) for one in unpack_messages(iter([block]), frozenset({0}), "zstd", said.append))
+    assert held < 1.2 * LARGEST_CHUNK_BYTES
+    assert "inflates" in said[0]
+
+
+def test_a_name_of_megabytes_costs_no_time() -> None:
+    assert len(LogText("n\x1b" * 10_000_000).raw) < 100_000
+
+
+def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
+    header = b"\4\0\0\0op=\5" + bytes(4 * 16_000)
+    record = len(header).to_bytes(4, "little") + header + bytes(4)
+    path = tmp_path / "log.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + record * 500)
+    begin = time.process_time()
+    with pytest.raises(LogError):
+        open_log(path)
+    assert time.process_time() - begin < LONGEST_S
+
+
+def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
+    from icrtool import config
+    from icrtool.fleet import manifest
+    from icrtool.logs import table_file
+    from icrtool.logs.containers import bag_directory, decompress, sqlite_bag
+    from icrtool.logs.messages import schema
+    from icrtool.records import text
+
+    promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
+    rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
+    stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"\d[\d,]*(?= |;)", row)]
+    assert stated == [
+        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, schema.DEEPEST, schema.MOST_FIELDS,
+        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
+        table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
+    ]  # fmt: skip
