@@ -13,7 +13,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
-from icrtool.estimation.noise_adaptation import LARGEST_HEADING_DEGPS, LARGEST_POSITION_MPS
+from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
 from icrtool.estimation.observability import Excitation
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.measurement_codes import GATED, UNSEEN, USED
@@ -68,8 +68,8 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
     ("noise", "words"),
     [
         (ProcessNoise(LARGEST_POSITION_MPS, FIELD_NOISE.heading_degps), "of the motion"),
-        (ProcessNoise(FIELD_NOISE.position_mps, LARGEST_HEADING_DEGPS), "of the turns"),
-        (ProcessNoise(LARGEST_POSITION_MPS / 4, LARGEST_HEADING_DEGPS / 4), ""),
+        (ProcessNoise(FIELD_NOISE.position_mps, 8 * FIELD_NOISE.heading_degps), "of the turns"),
+        (ProcessNoise(LARGEST_POSITION_MPS / 4, 4 * FIELD_NOISE.heading_degps), ""),
     ],
 )
 def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, words: str) -> None:
