@@ -11,6 +11,9 @@ from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 
 EPOCH_NS = 1_760_000_000_000_000_000
 Y_RIGHT, Y_LEFT, X = 0.74, -0.73, 0.05
+ROSBAG2_CHUNK_BYTES = 768 << 10
+"""A chunk is closed by the message that fills it."""
+
 CONTAINERS = {"hour.mcap": ("mcap", "zstd"), "hour.bag": ("bag", "lz4"), "hour_db3": ("db3", "none")}
 
 
@@ -67,7 +70,7 @@ def make_logs(folder: Path, seconds: float) -> dict[str, Path]:
 
 
 def add_images(log: Path, target: Path, gigabytes: float) -> Path:
-    """Copy an MCAP log and add chunks of images: 640 x 480 rgb8, compressible by half like real ones."""
+    """Copy an MCAP log in chunks of rosbag2's size and add images: 640 x 480 rgb8, half as large when compressed."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
@@ -78,7 +81,7 @@ def add_images(log: Path, target: Path, gigabytes: float) -> Path:
         reader = make_reader(source)
         summary = reader.get_summary()
         total = summary.statistics.message_count if summary and summary.statistics else 1
-        writer = Writer(sink, compression=CompressionType.ZSTD)
+        writer = Writer(sink, chunk_size=ROSBAG2_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start()
         channels: dict[int, int] = {}
         image_schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"uint8[] data")

@@ -4,8 +4,9 @@
 
 Physics drives, measured with sensors and troubles drawn at random with fixed seeds. The truth is the same fit to true
 poses and speeds. *Right*: each ICR within 3 stated standard deviations, and within 0.06 m or 10 % of half the ICRs'
-separation. *Hedged*: refused, not usable, an ICR that is not shown, an error that is larger but within two stated
-standard deviations, or a warning that sides or senses may be others. *Wrong*: anything else.
+separation; a stand that is called one. *Hedged*: refused, not usable, an ICR that is not shown, an error that is
+larger but within two stated standard deviations, or a warning that sides or senses may be others. *Wrong*: anything
+else.
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ def score(drive: TrueDrive, case: Case) -> Score:
     try:
         run = icrtool.fit(make_log(drive, case), robot_config(drive))
     except IcrToolError as error:
-        return Score(case, "hedged", f"refused: {error}", nothing, nothing)
+        true_reason = case.surface == "stand" and "stand" in str(error)
+        return Score(case, "right" if true_reason else "hedged", f"refused: {error}", nothing, nothing)
     found, std = final_icrs(run)
     usable = bool(run.summary["usable"])
     if case.surface == "stand":

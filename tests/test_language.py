@@ -22,8 +22,10 @@ DONE: tuple[str, ...] = (
     "errors",
     "estimation",
     "figures",
+    "fleet",
     "kernels",
     "logs",
+    "calibration",
     "motion",
     "records",
     "simulation",
@@ -38,6 +40,7 @@ DONE: tuple[str, ...] = (
 """Packages and modules of icrtool without a word from the left column. Add to it; take nothing from it."""
 
 PUBLISHED = (
+    "way_noise",
     "gyro_course",
     "wheels_course",
     "too_little_way_left",
@@ -57,7 +60,12 @@ PAGES = (
     "README.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
-    *(f"docs/{page}.md" for page in ("architecture", "configuration", "equations", "paper")),
+    "sample_logs/README.md",
+    *(
+        page.relative_to(ROOT).as_posix()
+        for page in sorted((ROOT / "docs").rglob("*.md"))
+        if page.name != "glossary.md"
+    ),
 )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -350,11 +351,12 @@ class _Problem:
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]
-        x, P = causal.x[last], causal.P[last]
-        carried = x[:, PSI] + (1 + x[:, SCALE]) * dG - x[:, BIAS] * dt
-        f = np.zeros((len(rows), x.shape[1]))
-        f[:, PSI], f[:, BIAS], f[:, SCALE] = 1.0, -dt, dG
-        variance = np.einsum("ni,nij,nj->n", f, P, f) + noises["angle"] ** 2 * dt
+        x, P = causal.x, causal.P
+        carried = x[last, PSI] + (1 + x[last, SCALE]) * dG - x[last, BIAS] * dt
+        variance = noises["angle"] ** 2 * dt
+        f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
+        for i, j in product(f, f):
+            variance += f[i] * P[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         scaled = (1 + constants[SCALE]) * G
         smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))

@@ -15,7 +15,7 @@ from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.heading_offset_cause import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.records.tables import Complexes, Floats, RobotLog
+from icrtool.records.tables import Floats, RobotLog
 
 FEWEST_WINDOWS = 8
 SIGNIFICANT_SIGMAS = 4.0
@@ -75,16 +75,10 @@ class CourseAngles(NamedTuple):
 def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
-    v = (drive.v_left + drive.v_right) / 2
-    psi = np.interp(drive.wheel_t + drive.wheel_dt / 2, drive.heading_t, drive.heading)
-
-    def between(rate: Complexes) -> Complexes:
-        total = np.concatenate([[0.0], np.cumsum((rate * drive.wheel_dt)[:-1])])
-        at = np.interp(drive.fix_t, drive.wheel_t, total)
-        return np.asarray(at[end] - at[begin], np.complex128)
-
+    v, nose = drive.mean_speed, drive.nose
     seen = drive.fix[end] - drive.fix[begin]
-    laid, other = between(v * np.exp(1j * psi)), between(v * np.exp(-1j * psi))
+    along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
+    laid, other = (at[end] - at[begin] for at in (along, mirrored))
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(

@@ -9,6 +9,7 @@ and the quantiles are scaled so that they hold there.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
@@ -17,14 +18,15 @@ import numpy as np
 from icrtool.calibration.held_out import HeldOut
 from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
-from icrtool.kernels.window_residuals import sums_at_knots
+from icrtool.kernels.window_residuals import OMEGA, sums_at_knots
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import Recording, Steps, cut_windows
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, cut_windows
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.tables import Complexes, Floats, Ints
+from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
-LENGTHS_M = (2.0, 5.0, 10.0, 20.0)
-"""Held-out windows of these lengths are compared."""
+LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
+"""Held-out windows of these lengths are compared; longer ones where the drives hold so many stretches of them."""
 
 SCALED_FROM_M = 5.0
 """Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
@@ -40,7 +42,7 @@ SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 4.0
 
 Values = TypeVar("Values", Floats, Complexes)
 
-SOURCES = len(ErrorSources._fields) - 2
+SOURCES = ErrorSources._fields.index("p95_factor")
 
 
 class Spread(NamedTuple):
@@ -90,23 +92,27 @@ class PathErrors(NamedTuple):
     of_sources: Spread
 
 
-def path_errors(steps: Steps, ends: Ends, fitted: FittedModel, width_m: float, delay_s: float = 0.0) -> PathErrors:
+def path_errors(
+    steps: Steps, ends: Ends, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
+) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
     Parameters
     ----------
-    delay_s : of the wheels relative to the times of the knots
+    own : constants of the recording
     """
-    motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
+    gyro = steps.gyro + own.gyro_later_s * steps.gyro_change()
+    motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
+    fixed[OMEGA] += own.gyro_bias_radps
     # the sources act all along the path, not at the ends of windows alone
-    at = np.union1d(ends.knot_t + delay_s, steps.t)
+    at = np.union1d(ends.knot_t + own.wheels_later_s, steps.t)
     row, share = steps.locate(at)
     knots, k = len(row), len(fitted.parameters)
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
     sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, row, share, rate, sums, by)
     theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
-    s, e = (np.searchsorted(at, ends.knot_t[rows] + delay_s) for rows in (ends.start, ends.end))
+    s, e = (np.searchsorted(at, ends.knot_t[rows] + own.wheels_later_s) for rows in (ends.start, ends.end))
     back = np.exp(-1j * theta[s])
     went = place[e] - place[s]
     turned_by = by[:, e, 0] - by[:, s, 0]
@@ -199,7 +205,7 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
     those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent.
     """
-    stretches = 0
+    stretches: Counter[float] = Counter()
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
     for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
         recording = recordings[fold.recording]
@@ -209,11 +215,13 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
             continue
         mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
         ends = Ends(windows.knot_t, windows.start[mine], windows.end[mine])
-        errors = path_errors(windows.steps, ends, fit, recording.width_m, own.wheels_later_s)
+        errors = path_errors(windows.steps, ends, fit, recording.width_m, own)
         row = np.searchsorted(recording.t_s, windows.knot_t)
         heading = recording.drive.heading[row]
         turned = errors.turned - (heading[ends.end] - heading[ends.start])
-        stretches += len(np.unique(np.floor(windows.start_m[mine] / CHOICE_HORIZON_M)))
+        for metres in LENGTHS_M:
+            starts = windows.start_m[mine & (windows.length_m == metres)]
+            stretches[metres] += len(np.unique(np.floor(starts / metres)))
         found.append(
             (
                 windows.length_m[mine],
@@ -222,24 +230,27 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
                 errors.moved - np.exp(-1j * own.heading_offset_rad) * windows.reference[mine],
             )
         )
+    measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
+    used = length <= measured_to_m
+    length = length[used]
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
         return None
-    sources = _stacked([one[1].of_sources for one in found])
-    known = _stacked([one[1].of_parameters for one in found])
-    turned, missed = np.concatenate([one[2] for one in found]), np.concatenate([one[3] for one in found])
+    sources = _stacked([one[1].of_sources for one in found], used)
+    known = _stacked([one[1].of_parameters for one in found], used)
+    turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
     variances = _fit_variances(length, sources, known, turned, missed)
     spread, far = sources.combined(variances).plus(known), length >= SCALED_FROM_M
     error = np.abs(missed)
-    level = min(95.0 * (1.0 + 1.0 / stretches), 100.0)
+    level = min(95.0 * (1.0 + 1.0 / stretches[CHOICE_HORIZON_M]), 100.0)
     share = np.percentile(error[far] / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
     mean = error[far].mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
     factors = np.clip([share, mean], [1.0, SMALLEST_FACTOR], LARGEST_FACTOR).tolist()
-    return ErrorSources(*variances.tolist(), *factors)
+    return ErrorSources(*(*variances.tolist(), *factors, measured_to_m))
 
 
-def _stacked(parts: Sequence[Spread]) -> Spread:
-    return Spread(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+def _stacked(parts: Sequence[Spread], used: Bools) -> Spread:
+    return Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
 
 
 def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:

@@ -49,7 +49,10 @@ def fit(
     ConfigError
         A start that preset ``field`` does not take.
     """
-    run = fit_filter(log, config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
+    # The callee alone holds the log, and frees what it needs no longer.
+    logs = [log]
+    del log
+    run = fit_filter(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
     return replace(run, summary=run.summary | {"recommended": recommendation(run)})
 
 

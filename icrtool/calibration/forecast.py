@@ -49,14 +49,16 @@ class Forecast(NamedTuple):
 
 
 def forecast_plan(
-    calibration: Calibration, east_m: Floats, north_m: Floats, speed_mps: Floats | None = None
-) -> Forecast:
+    calibration: Calibration, east_m: Floats, north_m: Floats, speed_mps: Floats | None = None, *,
+    with_gyro: bool = False,
+) -> Forecast:  # fmt: skip
     """Return the errors along a planned path.
 
     Parameters
     ----------
-    east_m, north_m : (p,) points of the path, driven in their order, forward
-    speed_mps : (p,) speed from each point on; default `SPEED_MPS`
+    east_m, north_m : (p,) points of the path, driven in their order
+    speed_mps : (p,) speed from each point on, negative in reverse; default `SPEED_MPS`
+    with_gyro : by the calibration's model with a gyro
 
     Raises
     ------
@@ -67,39 +69,41 @@ def forecast_plan(
         raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
     path, line = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
     step = np.diff(path)
-    direction = np.unwrap(np.angle(step))
+    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
+    if not (np.isfinite(speed).all() and np.abs(speed).min() > 0.0):
+        raise DataError("plan", "a speed that is zero or no number", "give speed_mps in m/s, negative in reverse")
+    speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_MPS)
     # a corner of the plan is turned over the steps around it, not on the spot
     width = max(round(calibration.width_m / STEP_M), 1)
-    direction = _smoothed(direction, width)
-    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
-    if not (np.isfinite(speed).all() and speed.min() > 0.0):
-        raise DataError("plan", "a speed that is not positive", "give speed_mps in m/s, forward")
-    speed = np.maximum(speed, SLOWEST_MPS)
-    held = np.abs(step) / speed
+    direction = _smoothed(np.unwrap(np.angle(step * np.sign(speed))), width)
+    held = np.abs(step / speed)
     turn = np.append(np.diff(direction), 0.0) / held
     left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
     t = np.concatenate([[0.0], np.cumsum(held)])
-    steps = Steps(t[:-1], held, left, right, np.zeros(len(held)), held / 2.0)
+    steps = Steps(t[:-1], held, left, right, turn, held / 2.0)
     length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
-    return _along(calibration, steps, t, path, length, float(direction[0]))
+    return _along(calibration, steps, t, path, length, float(direction[0]), with_gyro=with_gyro)
 
 
-def forecast_drive(calibration: Calibration, recording: Recording) -> Forecast:
-    """Return the errors of driving the path of a recording again, with its wheel speeds."""
+def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Forecast:
+    """Return the errors of driving the path of a recording again, with its wheel speeds (and gyro)."""
     drive = recording.drive
     steps = joined_steps(recording, samples_a_step(recording))
     place = drive.north + 1j * drive.east
-    return _along(calibration, steps, recording.t_s, place, drive.distance, float(drive.heading[0]))
+    heading = float(drive.heading[0])
+    return _along(calibration, steps, recording.t_s, place, drive.distance, heading, with_gyro=with_gyro)
 
 
-def forecast_trials(calibration: Calibration, recording: Recording, trials: Trials) -> tuple[Floats, Floats]:
+def forecast_trials(
+    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
+) -> tuple[Floats, Floats]:
     """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
     steps = joined_steps(recording, samples_a_step(recording))
     some = trials.ends >= 0
     start, end = np.broadcast_to(trials.starts[:, None], trials.ends.shape)[some], trials.ends[some]
     rows, places = np.unique(np.concatenate([start, end]), return_inverse=True)
     ends = Ends(recording.t_s[rows], places[: len(start)], places[len(start) :])
-    _, expected, p95 = _errors(calibration, steps, ends)
+    _, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
     found = np.full((2, *trials.ends.shape), np.nan)
     found[0][some], found[1][some] = expected, p95
     return found[0], found[1]
@@ -147,15 +151,16 @@ def _smoothed(values: Floats, width: int) -> Floats:
 
 
 def _along(
-    calibration: Calibration, steps: Steps, t: Floats, place: Complexes, length: Floats, heading: float
-) -> Forecast:
+    calibration: Calibration, steps: Steps, t: Floats, place: Complexes, length: Floats, heading: float, *,
+    with_gyro: bool,
+) -> Forecast:  # fmt: skip
     """Return the forecast after each metre of a path; `t`, `place`, `length` (n,) at its points."""
     metres = np.arange(1.0, np.floor(length[-1]) + 1.0)
     if not len(metres):
         raise DataError("path", f"{length[-1]:.2f} m long", "a forecast needs a metre at least")
     rows = np.searchsorted(length, metres)
     ends = Ends(np.concatenate([t[:1], t[rows]]), np.zeros(len(rows), np.int64), np.arange(1, len(rows) + 1))
-    spread, expected, p95 = _errors(calibration, steps, ends)
+    spread, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
     c, s = np.cos(heading), np.sin(heading)
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
@@ -166,9 +171,11 @@ def _along(
     )  # fmt: skip
 
 
-def _errors(calibration: Calibration, steps: Steps, ends: Ends) -> tuple[Spread, Floats, Floats]:
+def _errors(calibration: Calibration, steps: Steps, ends: Ends, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
     """Return moments, expected and 95 % error of windows."""
-    sources, fitted = calibration.sources, calibration.fitted
+    fitted, sources = calibration.fitted, calibration.sources
+    if with_gyro and calibration.gyro is not None:
+        fitted, sources = calibration.gyro, calibration.gyro_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")

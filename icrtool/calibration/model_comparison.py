@@ -19,10 +19,10 @@ from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_pred
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import FrozenIcrs, Summary
+from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
 from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
-from icrtool.motion.trials import Trials
+from icrtool.motion.trials import STARTS_A_CALL, Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
 from icrtool.records.run import Run, half_width_m
 from icrtool.records.tables import Floats
@@ -179,10 +179,21 @@ def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOu
         else:
             # the filter's ICRs are those of the speeds that it saw
             drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-            ends = np.full((len(drive.distance), trials.ends.shape[1]), -1, np.int64)
-            ends[trials.starts] = trials.ends
-            summary = summarise(open_loop_errors(drive, _icrs_of(run, name), ends)[trials.starts])
+            summary = summarise(_errors_of_filter(drive, _icrs_of(run, name), trials))
         yield ModelScore(name, LABELS[name], FITTED_TO[name], False, summary)
+
+
+def _errors_of_filter(drive: Drive, icrs: FrozenIcrs, trials: Trials) -> Floats:
+    """Return the errors (k, h) [m] of the filter's ICRs, some starts at a time."""
+    order = np.argsort(trials.starts, kind="stable")
+    starts, errors = trials.starts[order], np.empty(trials.ends.shape)
+    for lo in range(0, len(drive.distance), STARTS_A_CALL):
+        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+        some = slice(*np.searchsorted(starts, [lo, hi]))
+        ends = np.full((hi - lo, trials.ends.shape[1]), -1, np.int64)
+        ends[starts[some] - lo] = trials.ends[order[some]]
+        errors[order[some]] = open_loop_errors(drive, icrs, ends, lo)[starts[some] - lo]
+    return errors
 
 
 def _turned_scores(

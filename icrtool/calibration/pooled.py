@@ -30,8 +30,8 @@ from icrtool.records.tables import Floats
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
-GYRO_PRIOR_STD = np.array([10.0, 0.02])
-"""Of scale, whose sign is open, and bias [rad/s]: on a circle only this separates the two."""
+GYRO_PRIOR_STD = np.array([10.0, 0.02, 0.2])
+"""Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
 
 GYRO_SCALE_RANGE = 0.1
 """A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
@@ -80,9 +80,12 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         return plain
     step = np.append(np.diff(heading.angle_rad), 0.0)
     rate = np.divide(step, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
-    slope, _ = _gyro_line(plain, rate)
+    slope, _, later_s = _gyro_line(plain, rate)
     if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
         return plain
+    ends = np.append(plain.t_s, plain.t_s[-1] + drive.dt_s[-1]) + later_s
+    turned = np.diff(np.interp(ends, plain.t_s, heading.angle_rad))
+    rate = np.divide(turned, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
     return replace(plain, gyro_radps=np.sign(slope) * rate, gyro_reversed=slope < 0.0)
 
 
@@ -95,24 +98,27 @@ def scaled_gyro(recording: Recording) -> Floats:
     """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
     if recording.gyro_radps is None:
         return np.zeros(len(recording.t_s))
-    slope, bias = _gyro_line(recording, recording.gyro_radps)
+    slope, bias, _ = _gyro_line(recording, recording.gyro_radps)
     rate: Floats = slope * recording.gyro_radps + bias
     return rate
 
 
-def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float]:
-    """Return scale and bias [rad/s] with which a turn rate (n,) makes the turns of the reference over seconds."""
+def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]:
+    """Return scale, bias [rad/s] and lead [s] with which a turn rate (n,) makes the reference's turns over seconds."""
     t, held = recording.t_s, recording.held_s
     every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
-        return float("nan"), float("nan")
+        return float("nan"), float("nan"), 0.0
     sums = np.concatenate([[0.0], np.cumsum(held * rate)[:-1]])
-    turned = np.diff(recording.drive.heading[every])
-    columns = np.column_stack([np.diff(sums[every]), np.diff(t[every])])
-    found = robust_least_squares(
-        lambda x: (columns @ x - turned, columns), np.zeros(2), np.zeros(2), GYRO_PRIOR_STD, overlap=10.0
-    )
-    return float(found.x[0]), float(found.x[1])
+    turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
+
+    def evaluate(x: Floats) -> tuple[Floats, Floats]:
+        at = t[every] + x[2]
+        by_scale, by_lead = (np.diff(np.interp(at, t, column)) for column in (sums, x[0] * rate))
+        return x[0] * by_scale + x[1] * lasting - turned, np.column_stack([by_scale, lasting, by_lead])
+
+    zero = np.zeros(3)
+    return tuple(robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
 
 
 def calibrate(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
@@ -170,6 +176,7 @@ def calibration_from(
         held_out=tuple(scores),
         controller=controller_errors(recordings, wheels),
         sources=measure_error_sources(recordings, wheels),
+        gyro_sources=None if gyro is None else measure_error_sources(recordings, gyro),
         warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,

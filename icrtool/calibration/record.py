@@ -100,6 +100,7 @@ class ErrorSources(NamedTuple):
     distance_wander_m2pm : of the distance, for each metre
     heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
     p95_factor, expected_factor : measured over predicted
+    measured_to_m : length of the longest windows; a longer forecast extrapolates
     """
 
     heading_start_rad2: float
@@ -112,6 +113,7 @@ class ErrorSources(NamedTuple):
     position_noise_m2: float
     p95_factor: float
     expected_factor: float
+    measured_to_m: float = 20.0
 
 
 class Odometry(NamedTuple):
@@ -137,7 +139,8 @@ class Calibration:
     logs : what it was fitted to
     held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
     controller : errors of what a controller can express; None where the drive is too short to measure them
-    sources : of the errors beside those of the parameters; None where the drive is too short to measure them
+    sources, gyro_sources : of the errors beside those of the parameters, wheels alone and with a gyro; None where the
+        drive is too short to measure them
     warnings : what to know before use
     created : date and time, UTC, ISO 8601
     name : stem of its file; empty for one just made
@@ -157,6 +160,7 @@ class Calibration:
     tool_version: str
     name: str = field(default="", compare=False)
     sources: ErrorSources | None = None
+    gyro_sources: ErrorSources | None = None
 
     @property
     def recommended(self) -> str:
@@ -258,14 +262,16 @@ class Calibration:
             "recommended": self.recommended,
             "why": self.why,
             **fitted_document(self.fitted, self.robot, self.typical),
-            "gyro": None if self.gyro is None else {"model": self.gyro.model.name, **_plain(self.gyro)},
+            "gyro": None
+            if self.gyro is None
+            else {"model": self.gyro.model.name, **_plain(self.gyro), "error_sources": _sources(self.gyro_sources)},
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
             "controller": plain(
                 self.controller_numbers()._asdict() | ({} if self.controller is None else self.controller._asdict())
             ),
-            "error_sources": None if self.sources is None else self.sources._asdict(),
+            "error_sources": _sources(self.sources),
             "warnings": list(self.warnings),
         }
 
@@ -293,6 +299,10 @@ def _controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapp
         left * geometry.radius_left, left * std["radius_left"],
         right * geometry.radius_right, right * std["radius_right"],
     )  # fmt: skip
+
+
+def _sources(sources: ErrorSources | None) -> dict[str, float] | None:
+    return None if sources is None else sources._asdict()
 
 
 def _plain(one: FittedModel) -> dict[str, Any]:

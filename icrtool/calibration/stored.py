@@ -55,7 +55,7 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
     """
     if document["schema"] != CALIBRATION_SCHEMA:
         raise ValueError(f"schema {document['schema']!r}")
-    gyro, controller, sources = document["gyro"], document["controller"], document.get("error_sources")
+    gyro, controller = document["gyro"], document["controller"]
     fitted = _fitted(document["model"], document)
     try:
         found = Calibration(
@@ -71,14 +71,13 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
             warnings=tuple(map(_text, document["warnings"])),
             created=_text(document["created"]),
             tool_version=_text(document["tool_version"]),
-            sources=None if sources is None else _record(ErrorSources, sources),
+            sources=_sources(document),
+            gyro_sources=None if gyro is None else _sources(gyro),
         )
     except msgspec.ValidationError as err:
         raise ValueError(str(err)) from err
     if not np.isfinite(list(found.typical)).all():
         raise ValueError("typical")
-    if found.sources is not None and not all(0.0 <= value < np.inf for value in found.sources):
-        raise ValueError("error sources")
     with np.errstate(all="ignore"):
         geometry, covariance = found.geometry()
         if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
@@ -101,6 +100,14 @@ def _record(kind: type[Record], document: Mapping[str, Any]) -> Record:
     given: tuple[Any, ...] = kind(**{name: value for name, value in document.items() if name in kind._fields})
     values = [float("nan") if value is None else escaped(value) if isinstance(value, str) else value for value in given]
     return msgspec.convert(values, kind)
+
+
+def _sources(document: Mapping[str, Any]) -> ErrorSources | None:
+    given = document.get("error_sources")
+    found = None if given is None else _record(ErrorSources, given)
+    if found is not None and not all(0.0 <= value < np.inf for value in found):
+        raise ValueError("error sources")
+    return found
 
 
 def _fitted(name: str, document: Mapping[str, Any]) -> FittedModel:

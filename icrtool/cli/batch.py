@@ -39,7 +39,11 @@ if TYPE_CHECKING:
 @click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
               help="Distance over which 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option(
-    "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
+    "--gate",
+    "gates",
+    metavar="TEXT",
+    multiple=True,
+    help="Acceptance limit: exit status 3 if it is not met; repeatable.",
 )
 @click.option("--ladder/--no-ladder", default=True, show_default=True,
               help="Compare all models on distance they were not fitted to.")  # fmt: skip
@@ -63,8 +67,8 @@ def command(
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
 
     A FOLDER is searched recursively. A MANIFEST (CSV or TOML) lists logs or patterns with their robot, configuration,
-    group and tags. A log that fails, hangs or kills its process costs only itself. The same command continues an
-    interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
+    group and tags. A log that fails, hangs or ends its process does not affect the others. The same command continues
+    an interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
 
     Exit status: 3 if a gate failed, else 1 if a log could not be used.
 

@@ -71,7 +71,11 @@ class Request:
               help="Report how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
 @click.option(
-    "--gate", "gates", metavar="TEXT", multiple=True, help="A bound to hold, exit status 3 if not; repeatable."
+    "--gate",
+    "gates",
+    metavar="TEXT",
+    multiple=True,
+    help="Acceptance limit: exit status 3 if it is not met; repeatable.",
 )
 @options.baseline
 @click.option("--calibration", "calibrations", metavar="CAL.json", type=click.Path(path_type=Path), multiple=True,

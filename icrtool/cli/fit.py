@@ -75,7 +75,7 @@ def command(
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
-    robot.wheel_radius_m=… give what the messages do not.
+    robot.wheel_radius_m=… give what the messages do not hold.
 
     \b
     Example:
@@ -200,11 +200,11 @@ def fit_log(log: Path, directory: Path, request: FitRequest) -> Run:
         from icrtool.logs.read_log import read_log
 
         stages.begin("reading")
-        measured = read_log(log, request.config, stages.share, start=request.start, end=request.end)
+        logs = [read_log(log, request.config, stages.share, start=request.start, end=request.end)]
         from icrtool.calibration.fit import fit
 
         run = fit(
-            measured,
+            logs.pop(),  # whose columns are freed where they are needed no longer
             request.config,
             warm_start=start,
             changes_s=request.changes_s,
@@ -218,7 +218,7 @@ def fit_log(log: Path, directory: Path, request: FitRequest) -> Run:
     options.warn((*run.warnings, *_other_robot(request, start), *notes), quiet=request.quiet)
     from icrtool.records.samples import ROLE_WORDS
 
-    for stream in measured.streams:
-        if request.verbose or ("chosen over" in stream.why and not request.quiet):
-            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
+    for stream in run.summary["streams"]:
+        if request.verbose or ("chosen over" in stream["why"] and not request.quiet):
+            click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
     return run

@@ -31,10 +31,11 @@ def command(
     calibration_file: Path, path: Path, budgets: tuple[float, ...], output: Path | None, plot: Path | None,
     as_json: bool, quiet: bool,
 ) -> None:  # fmt: skip
-    """Forecast the error of driving a path without GNSS, with a calibrated motion model and the wheels alone.
+    """Forecast the error of driving a path without GNSS, with a calibrated motion model.
 
     Expected and 95 % error after each metre from the start of the path, by the covariance of the calibration and the
-    error growth that it measured on distance it was not fitted to.
+    error growth that it measured on distance it was not fitted to: wheels alone and, where the calibration has it, with
+    a gyro. A negative speed_mps in a plan drives in reverse.
 
     \b
     Example:
@@ -45,33 +46,41 @@ def command(
     from icrtool.output.atomic_file import check_place, write_file
     from icrtool.output.calibration_file import open_calibration
     from icrtool.output.figures.calibration_picture import check_picture, write_forecast_picture
-    from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast
+    from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
     if output is not None:
         check_place(output)
     if plot is not None:
         check_picture(plot)
     calibration = open_calibration(calibration_file)
-    forecast = _forecast(calibration, path)
+    forecast, gyro = _forecasts(calibration, path)
     if output is not None:
-        write_file(output, forecast_csv(forecast))
+        write_file(output, forecast_csv(forecast, gyro))
     if plot is not None:
-        write_forecast_picture(forecast, path.name, budgets, plot)
+        write_forecast_picture(forecast, path.name, budgets, measured_to_m(calibration), plot, gyro)
     if as_json:
-        print_json("forecast", forecast_document(forecast, calibration, budgets))
+        print_json("forecast", forecast_document(forecast, calibration, budgets, gyro))
     elif not quiet:
-        show(format_forecast(forecast, calibration, budgets))
+        show(format_forecast(forecast, calibration, budgets, gyro))
 
 
-def _forecast(calibration: Calibration, path: Path) -> Forecast:
-    """Forecast along a run's path, or along the points of a table."""
+def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:
+    """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
     from icrtool.calibration.forecast import forecast_drive, forecast_plan
     from icrtool.output.run_directory import is_run_directory
     from icrtool.output.tables.forecast import read_plan
 
+    with_gyro = calibration.gyro_sources is not None
     if not is_run_directory(path):
-        return forecast_plan(calibration, *read_plan(path))
-    from icrtool.calibration.pooled import recording_of
+        plan = read_plan(path)
+        return forecast_plan(calibration, *plan), forecast_plan(
+            calibration, *plan, with_gyro=True
+        ) if with_gyro else None
+    from icrtool.calibration.pooled import gyro_recording_of
     from icrtool.output.stored_run import open_run
 
-    return forecast_drive(calibration, recording_of(open_run(path)))
+    recording = gyro_recording_of(open_run(path))
+    with_gyro = with_gyro and recording.gyro_radps is not None
+    return forecast_drive(calibration, recording), (
+        forecast_drive(calibration, recording, with_gyro=True) if with_gyro else None
+    )

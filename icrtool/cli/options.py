@@ -71,8 +71,8 @@ def place(command: Command) -> Command:
 def baseline(command: Command) -> Command:
     """Add --baseline and --strict-gates, as `baseline` and `strict`."""
     command = click.option("--strict-gates", "strict", is_flag=True,
-                           help="A gate on the baseline fails by its number, not only beyond the interval of the "
-                           "difference.")(command)  # fmt: skip
+                           help="A gate on the baseline fails by its number alone, also where the interval of the "
+                           "difference reaches the bound.")(command)  # fmt: skip
     return click.option("--baseline", metavar="REPORT.json|DIR", type=click.Path(path_type=Path),
                         help="Earlier report, run or batch to compare with; a gate may then read "
                         "\"icr.p95@10m <= 1.1 * baseline\".")(command)  # fmt: skip

@@ -15,7 +15,9 @@ from icrtool.cli.fit import RUNS
 @click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
               help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
-@click.option("--no-coordinates", is_flag=True, help="Leave out where on the globe a run was: to pass the page on.")
+@click.option(
+    "--no-coordinates", is_flag=True, help="Leave out where on the globe a run was, for a page that is passed on."
+)
 @click.option("-q", "--quiet", is_flag=True, help="Print no results.")
 def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.

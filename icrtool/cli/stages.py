@@ -8,6 +8,8 @@ import time
 from types import TracebackType
 from typing import Self
 
+from icrtool.records.memory import give_back_freed
+
 CLEAR = "\r\x1b[K"
 REFRESH_S = 0.1
 """The share done is rewritten at most this often."""
@@ -48,6 +50,7 @@ class Stages:
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""
+        give_back_freed()
         self._stage = stage
         self._shown_s = time.monotonic()
         if self.on_terminal:

@@ -90,8 +90,8 @@ class FilterSetup:
     t0: float
     x0: Floats
     P0: Floats
-    gnss_index: Ints
-    heading_index: Ints
+    gnss_index: Ints | slice
+    heading_index: Ints | slice
 
 
 def check_start(config: Config) -> None:
@@ -186,7 +186,10 @@ def _seconds(stamps_ns: Ints, epoch_ns: int) -> Floats:
     return (stamps_ns - epoch_ns) / 1e9
 
 
-def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints:
+def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | slice:
+    """Return the rows outside the outages; without one a slice, which copies nothing."""
+    if not outages_ns:
+        return slice(None)
     kept = np.ones(len(stamps_ns), np.bool_)
     for begin, end in outages_ns:
         kept &= (stamps_ns < begin) | (stamps_ns >= end)

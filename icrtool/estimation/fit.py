@@ -38,11 +38,14 @@ def fit(
     begin("aligning")
     log = choose_reference(log, config)
     measurements = align(log, config)
+    name, inputs, datum, rejected = log.name, log.inputs, log.datum, log.rejected_fixes
+    # Its columns that the filter does not use take as much memory as half of the states.
+    del log
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
     begin("summary")
     run = Run(
-        name=log.name,
+        name=name,
         config=config,
         table=filtered.table,
         in_gap=filtered.in_gap,
@@ -51,7 +54,7 @@ def fit(
         gnss=filtered.gnss,
         heading=filtered.heading,
         smoothed=None,
-        summary=summarise(log, measurements, filtered, config),
+        summary=summarise(measurements, filtered, config, inputs=inputs, datum=datum, rejected_fixes=rejected),
     )
     return replace(run, smoothed=smoother.smooth(run)) if smooth else run
 

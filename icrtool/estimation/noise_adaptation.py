@@ -61,6 +61,7 @@ def run_adaptively(
     setup, output = run(sensors, noise)
     if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
         return AdaptedRun(sensors, setup, output, noise)
+    del setup, output  # of a long log, as large as all that the next run makes
     part = _busiest_part(sensors)
     best = find_noise(
         lambda tried: innovation_cost(run(part, tried)[1]),
@@ -68,10 +69,7 @@ def run_adaptively(
         positions=settings.process_position_mps == "auto",
         headings=settings.process_heading_degps is None,
     )
-    if best != noise:
-        noise = best
-        setup, output = run(sensors, noise)
-    return AdaptedRun(sensors, setup, output, noise)
+    return AdaptedRun(sensors, *run(sensors, best), best)
 
 
 def _busiest_part(sensors: SensorData) -> SensorData:

@@ -69,17 +69,20 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
     for first, last in zip([0, *(edges + 1)], [*edges, len(table) - 1], strict=True):
         piece = open_loop_path(drive, y_icr_right, y_icr_left, x_icr, int(first), int(last))
-        ahead_north, ahead_east = piece.north - table.north_m[first], piece.east - table.east_m[first]
+        stretch = slice(first, last + 1)
         if first:
             # The error at the gap's begin is carried over it: the displacement turned by `turned`, less itself.
             step_north = table.north_m[first] - table.north_m[first - 1]
             step_east = table.east_m[first] - table.east_m[first - 1]
-            miss_north += step_north * np.cos(turned) - step_east * np.sin(turned) - step_north
-            miss_east += step_north * np.sin(turned) + step_east * np.cos(turned) - step_east
-        stretch = slice(first, last + 1)
-        north[stretch] = table.north_m[first] + miss_north + ahead_north * np.cos(turned) - ahead_east * np.sin(turned)
-        east[stretch] = table.east_m[first] + miss_east + ahead_north * np.sin(turned) + ahead_east * np.cos(turned)
-        heading[stretch] = piece.heading + turned
+            cos, sin = np.cos(turned), np.sin(turned)
+            miss_north += step_north * cos - step_east * sin - step_north
+            miss_east += step_north * sin + step_east * cos - step_east
+            ahead_north, ahead_east = piece.north - table.north_m[first], piece.east - table.east_m[first]
+            north[stretch] = table.north_m[first] + miss_north + ahead_north * cos - ahead_east * sin
+            east[stretch] = table.east_m[first] + miss_east + ahead_north * sin + ahead_east * cos
+            heading[stretch] = piece.heading + turned
+        else:
+            north[stretch], east[stretch], heading[stretch] = piece
         miss_north, miss_east = north[last] - table.north_m[last], east[last] - table.east_m[last]
         turned += float(piece.heading[-1] - table.heading_rad[last])
     return OdometryPath(north, east, heading, float(np.hypot(miss_north, miss_east)))

@@ -151,15 +151,16 @@ def noise_of(run: Run) -> ProcessNoise:
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:
+    """Return the recorded states; their columns are those of the output, whose variances become deviations."""
     first = len(wheels.stamp_ns) - len(output.x)
     stamps = wheels.stamp_ns[first:]
-    std = np.sqrt(np.maximum(output.variance, 0.0))
-    means, deviations = ([np.ascontiguousarray(column) for column in values.T] for values in (output.x, std))
+    std = np.maximum(output.variance, 0.0, out=output.variance)
+    np.sqrt(std, out=std)
     return States(
         stamp_ns=stamps,
         t_s=(stamps - stamps[0]) / 1e9,
-        **dict(zip(STATE_COLUMNS, means, strict=True)),
-        **{f"std_{name}": column for name, column in zip(STATE_COLUMNS, deviations, strict=True)},
+        **dict(zip(STATE_COLUMNS, output.x.T, strict=True)),
+        **{f"std_{name}": column for name, column in zip(STATE_COLUMNS, std.T, strict=True)},
         v_left_mps=wheels.v_left_mps[first:],
         v_right_mps=wheels.v_right_mps[first:],
         distance_m=output.distance,
@@ -167,16 +168,19 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 
 
 def _outcome(
-    stamps: Ints, index: Ints, table: States, nis: Floats, code: Codes, difference: Floats
+    stamps: Ints, index: Ints | slice, table: States, nis: Floats, code: Codes, difference: Floats
 ) -> MeasurementOutcome:
     """Return the kernel's outcomes in the rows of the stream: it was given some of the measurements."""
+    t_s = (stamps - table.stamp_ns[0]) / 1e9
+    if isinstance(index, slice):
+        return MeasurementOutcome(stamps, t_s, nis, code, difference)
     all_nis, all_code, all_difference = (
         np.full(len(stamps), np.nan),
         np.zeros(len(stamps), np.uint8),
         np.full(len(stamps), np.nan),
     )
     all_nis[index], all_code[index], all_difference[index] = nis, code, difference
-    return MeasurementOutcome(stamps, (stamps - table.stamp_ns[0]) / 1e9, all_nis, all_code, all_difference)
+    return MeasurementOutcome(stamps, t_s, all_nis, all_code, all_difference)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

@@ -26,6 +26,9 @@ LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 
 
 WORTH_WARNING_SHARE = 0.1
+USELESS_HEADING_DEGPS = 50.0
+"""The heading by wheels with more noise than this errs by 5 deg after a second."""
+
 UNUSABLE_SHARE = 0.3
 """With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
 
@@ -42,6 +45,8 @@ def unusable_reasons(
             reasons.append(f"{100 * share:.0f} % of the {word} rejected")
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
         reasons.append("the wheels explain next to nothing of the motion")
+    elif noise.heading_degps > USELESS_HEADING_DEGPS:
+        reasons.append("the wheels explain next to nothing of the turns: do they slip, as on ice?")
     return reasons
 
 

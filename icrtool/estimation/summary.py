@@ -23,7 +23,7 @@ from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
-from icrtool.records.tables import Bools, Floats, Ints, RobotLog, States
+from icrtool.records.tables import Bools, Datum, Floats, InputFile, Ints, States
 
 SETTLED_S = 2.0
 """An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
@@ -38,17 +38,26 @@ MOST_LISTED = 50
 """Jumps of the position that run.json lists."""
 
 
-def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, config: Config) -> dict[str, Any]:
+def summarise(
+    measurements: Measurements,
+    filtered: Filtered,
+    config: Config,
+    *,
+    inputs: tuple[InputFile, ...],
+    datum: Datum | None,
+    rejected_fixes: dict[str, int],
+) -> dict[str, Any]:
     """Return all numbers and warnings of a run as plain data, equal to what run.json gives back.
 
     Parameters
     ----------
-    log : as it was read
-    measurements : what the alignment made of it
+    measurements : what the alignment made of a log
     filtered : what the filter made of that
     config : the effective configuration
+    inputs, datum, rejected_fixes : of the log
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
+    name = sensors.name
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
@@ -56,26 +65,26 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
     warnings = [
         *measurements.warnings,
-        *run_warnings(log.name, table, filtered.gnss, filtered.heading, multiplier),
-        *([] if measurements.antenna_is_known else antenna_warning(log.name, table, filtered.covariance)),
+        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
+        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
         *(
-            f"{log.name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s"
+            f"{name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s"
             for t in filtered.changes_s
             if t not in changes_s
         ),
-        *noise_warnings(log.name, config, filtered.noise),
-        *(f"{log.name}: {sentence}" for sentence in excitation.sentences),
+        *noise_warnings(name, config, filtered.noise),
+        *(f"{name}: {sentence}" for sentence in excitation.sentences),
     ]
     document: dict[str, Any] = plain(
         {
             "schema": RUN_SCHEMA,
             "tool_version": __version__,
-            "log": log.name,
-            "inputs": [asdict(file) for file in log.inputs],
+            "log": name,
+            "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
             "warnings": warnings,
-            "alignment": {name: asdict(finding) for name, finding in measurements.findings.items()},
+            "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
             "unusable_because": "; ".join(unusable) if unusable else None,
@@ -88,7 +97,7 @@ def summarise(log: RobotLog, measurements: Measurements, filtered: Filtered, con
             "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
-            "gnss": gnss_summary(log, filtered.gnss, sensors.fixes.down_weighted)
+            "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
             | measurements.sections["gnss"]
             | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss),
             "heading": measurements.sections["heading"] | counts(filtered.heading),
@@ -335,16 +344,17 @@ def counts(outcome: MeasurementOutcome) -> dict[str, int]:
     return {"used": int(np.count_nonzero(outcome.used)), "rejected": int(np.count_nonzero(outcome.rejected))}
 
 
-def gnss_summary(log: RobotLog, gnss: MeasurementOutcome, down_weighted: Bools) -> dict[str, Any]:
+def gnss_summary(
+    datum: Datum | None, rejected_fixes: dict[str, int], gnss: MeasurementOutcome, down_weighted: Bools
+) -> dict[str, Any]:
     """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
     by_gate = int(np.count_nonzero(gnss.rejected))
     difference = gnss.difference[gnss.used & ~down_weighted]
-    datum = log.datum
     return {
         "used": int(np.count_nonzero(gnss.used)),
-        "rejected": by_gate + sum(log.rejected_fixes.values()),
+        "rejected": by_gate + sum(rejected_fixes.values()),
         "rejected_by_gate": by_gate,
-        "rejected_by_reason": dict(log.rejected_fixes),
+        "rejected_by_reason": dict(rejected_fixes),
         "recoveries": int(np.count_nonzero(gnss.code == RECOVERED)),
         "mean_difference_m": float(difference.mean()) if len(difference) else None,
         "max_difference_m": float(difference.max()) if len(difference) else None,

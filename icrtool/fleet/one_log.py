@@ -72,7 +72,7 @@ def decode_request(line: bytes) -> Request:
 
 
 def process(request: Request, stage: Stage) -> Row:
-    """Fit a log, analyse the run, write both, and return its row; a log that cannot be used gives a row that says why.
+    """Fit a log, analyse the run, write both, and return its row; one that cannot be used gives a row with the reason.
 
     Parameters
     ----------
@@ -128,9 +128,9 @@ def _results(request: Request, stage: Stage) -> Row:
     directory = path_of(request.directory)
     check_target(directory, path_of(request.path), overwrite=request.overwrite)
     stage("reading")
-    log = read_log(path_of(request.path), request.config)
+    logs = [read_log(path_of(request.path), request.config)]
     stage("filtering")
-    run = fit(log, request.config)
+    run = fit(logs.pop(), request.config)
     stage("writing the run")
     run.write(directory, plots=request.plots)
     stage("dropout analysis")

@@ -24,6 +24,7 @@ import msgspec
 
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.fleet.row import Row
+from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished
 
 GRACE_S = 0.3
@@ -59,7 +60,7 @@ class Worker:
         self._errors: IO[bytes] | None = None
 
     def run(self, request: Request, timeout_s: float, stage: Stage) -> Row:
-        """Process a log; one that hangs or kills the process gives a row that says so."""
+        """Process a log; one that hangs or kills the process gives a row with the reason."""
         process, errors = self._started()
         begin_of_errors = errors.seek(0, os.SEEK_END)
         end = time.monotonic() + timeout_s
@@ -183,12 +184,16 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(100_000)
 
-    def say(line: Line) -> None:
+    def send(line: Line) -> None:
         output.write(msgspec.json.encode(line) + b"\n")
         output.flush()
 
+    def begin(stage: str) -> None:
+        give_back_freed()
+        send(Line(stage))
+
     for text in _lines_of(requests):
-        say(Line(row=process(decode_request(text), lambda stage: say(Line(stage)))))
+        send(Line(row=process(decode_request(text), begin)))
 
 
 def _lines_of(stream: IO[bytes]) -> Iterator[bytes]:

@@ -232,11 +232,17 @@ def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
-    state, out = start_state(data, t0, x0, P0), empty_output(data, last - first)
-    events = last + len(data.gnss_t) + len(data.heading_t)
-    for begin, end in pairwise((*range(first, last, max(last * BLOCK_EVENTS // max(events, 1), 1)), last)):
-        filter_rows(data, begin, end, state, parameters, output_rows(out, begin - first, end - first), None)
-    return out._replace(P=state.P)
+    state, events = start_state(data, t0, x0, P0), last + len(data.gnss_t) + len(data.heading_t)
+    size = max(last * BLOCK_EVENTS // max(events, 1), 1)
+    block = empty_output(data, min(size, last - first))
+    # The kernel writes row by row; here each column is contiguous, so that the states need no copy of them.
+    x, variance, distance = np.empty((6, last - first)).T, np.empty((6, last - first)).T, np.empty(last - first)
+    for begin, end in pairwise((*range(first, last, size), last)):
+        count, rows = end - begin, slice(begin - first, end - first)
+        out = block._replace(x=block.x[:count], variance=block.variance[:count], distance=block.distance[:count])
+        filter_rows(data, begin, end, state, parameters, out, None)
+        x[rows], variance[rows], distance[rows] = out.x, out.variance, out.distance
+    return block._replace(x=x, variance=variance, distance=distance, P=state.P)
 
 
 def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> FilterState:
@@ -268,12 +274,6 @@ def empty_output(data: Measurements, rows: int) -> FilterOutput:
         heading_innovation=np.full(n_heading, np.nan),
         P=np.empty(21),
     )
-
-
-def output_rows(out: FilterOutput, begin: int, end: int) -> FilterOutput:
-    """Return a view of an output that holds its recorded states [begin, end) only."""
-    rows = slice(begin, end)
-    return out._replace(x=out.x[rows], variance=out.variance[rows], distance=out.distance[rows])
 
 
 def empty_nodes(events: int) -> Nodes:

@@ -114,6 +114,7 @@ def robust_least_squares(
     group: Ints | None = None,
     overlap: float = 1.0,
     most_steps: int = 15,
+    settled: float = SETTLED,
 ) -> RobustFit:
     """Minimise a soft-L1 loss of residuals under a normal prior by Gauss-Newton steps.
 
@@ -126,6 +127,7 @@ def robust_least_squares(
     group : (m,) residuals of one group depend on one another, others do not; default each its own
     overlap : so many residuals count as one independent one
     most_steps : at most this many steps
+    settled : length of the last step in standard deviations, all parameters together
 
     Notes
     -----
@@ -142,14 +144,15 @@ def robust_least_squares(
         information = information + np.diag(pull)
         gradient = gradient + pull * (x - prior_mean)
         step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
-        if -float(gradient @ step) < SETTLED**2:
+        if -float(gradient @ step) < settled**2:
             # too short to evaluate for: residuals follow it to first order
             x, residuals, converged = x + step, residuals + jacobian @ step, True
             break
         before = _cost(residuals / scale, overlap, pull, x - prior_mean)
         tried = evaluate(x + step)
         for _ in range(MOST_HALVINGS):
-            if _cost(tried[0] / scale, overlap, pull, x + step - prior_mean) <= before:
+            after = _cost(tried[0] / scale, overlap, pull, x + step - prior_mean)
+            if after <= before:
                 break
             step = step / 2.0
             tried = evaluate(x + step)
@@ -157,6 +160,9 @@ def robust_least_squares(
             # no part of the step lowers the cost: the Jacobian of noisy data shows no further
             break
         x, (residuals, jacobian) = x + step, tried
+        if before - after < settled**2:
+            converged = True
+            break
     scale = scale_by_kind(residuals, kinds)
     groups = np.arange(len(residuals)) if group is None else group
     covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, pull, overlap)

@@ -22,7 +22,7 @@ from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.gyro import find_gyro, find_gyros
+from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.position_sources import PositionSource
@@ -35,7 +35,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.stamps import clock_notes, increasing
+from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
@@ -61,7 +61,12 @@ NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A log after one pass: its channels, all candidates, the messages that could not be read, its files."""
+    """A log after one pass: its channels, all candidates, the messages that could not be read, its files.
+
+    Attributes
+    ----------
+    tables : of their columns those that candidates do not hold: stamps, turn rates, static transforms
+    """
 
     name: LogText
     path: LogText
@@ -113,12 +118,17 @@ def survey_log(
         channels = tuple(container.channels)
     finally:
         container.close()
+    candidates = find_candidates(tables, config, unread)
+    for table in tables:
+        # What only the candidates were made of goes: half of what a log takes.
+        for name in table.columns.keys() - {*GYRO_FIELDS, *FIELDS}:
+            del table.columns[name]
     return Survey(
         name=LogText(log_name(path)),
         path=LogText(str(path)),
         channels=channels,
         tables=tuple(tables),
-        candidates=find_candidates(tables, config, unread),
+        candidates=candidates,
         problems=problems,
         inputs=inputs,
     )
@@ -226,10 +236,12 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
         if topic in unreadable
     ]
-    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock)
+    stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, stamps)
     log = RobotLog(
         name, samples, gnss, heading, datum, streams, survey.inputs, rejected, tuple(warnings), antenna, gyro,
-        find_gyros(survey.tables, clock), _other_receivers(survey.candidates, position, datum, config, clock, name),
+        find_gyros(survey.tables, clock, stamps),
+        _other_receivers(survey.candidates, position, datum, config, clock, name),
     )  # fmt: skip
     return longest_part(log)
 
@@ -387,8 +399,6 @@ def _headings(
     if config.frames.heading != "auto":
         convention, why = config.frames.heading, "configured"
     stamps = source.stamps.on(clock)
-    rows = np.flatnonzero(source.usable)
-    order, _, _ = increasing(stamps[rows])
-    rows = rows[order]
+    rows = usable_rows(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"

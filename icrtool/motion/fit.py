@@ -22,6 +22,9 @@ from icrtool.records.tables import Bools, Floats
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
 """Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
 
+SETTLED = 0.1
+"""Delays have kinks, where a shorter last step is not found."""
+
 OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
 
@@ -62,11 +65,17 @@ class WindowResiduals:
 
     def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None) -> None:
         steps = windows.steps
-        self._motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
+        motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
         if wheels is not None:
-            self._motion = self._motion._replace(turn=wheels.twist(self._motion)[OMEGA])
-        self._model, self._windows = model, windows
-        self._fixed, self._axes, self._columns = model_columns(model, self._motion)
+            motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
+        self._windows = windows
+        self._fixed, self._axes, self._columns = model_columns(model, motion)
+        self._gains, self._gyro_change = np.zeros(0), steps.gyro_change()
+        if model.uses_gyro:
+            # the gyro's bias and time are two more columns of the turn rate
+            self._gains = gyro_gains(model)
+            self._axes = np.append(self._axes, [OMEGA, OMEGA])
+            self._columns = np.concatenate([self._columns, np.ones((2, len(steps.t)))])
         self._reference = np.column_stack([windows.reference.real, windows.reference.imag])
         self._root = np.sqrt(windows.length_m)
 
@@ -80,14 +89,13 @@ class WindowResiduals:
         windows, steps, k = self._windows, self._windows.steps, len(parameters)
         offset, delay = constants[:OF_WHEELS].tolist()
         fixed, axes, columns, values = self._fixed, self._axes, self._columns, parameters
-        if self._model.uses_gyro:
+        if len(self._gains):
             bias, later = constants[OF_WHEELS:].tolist()
-            gyro, by_time = steps.gyro_read(later)
-            fixed, axes, columns = model_columns(self._model, self._motion._replace(gyro=gyro))
-            by_gyro = 1.0 + parameters @ gyro_gains(self._model)
-            # the gyro's bias and time are two more columns of the turn rate
-            columns = np.concatenate([columns, [np.ones(len(gyro)), by_gyro * by_time]])
-            axes, values = np.append(axes, [OMEGA, OMEGA]), np.concatenate([parameters, [bias, 0.0]])
+            shift = later * self._gyro_change
+            fixed, columns, values = fixed.copy(), columns.copy(), np.concatenate([parameters, [bias, 0.0]])
+            fixed[OMEGA] += shift
+            columns[:k] += self._gains[:, None] * shift
+            columns[-1] = (1.0 + parameters @ self._gains) * self._gyro_change
         row, share = steps.locate(windows.knot_t + delay)
         terms, knots, count = len(axes), len(row), len(windows.start)
         rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
@@ -185,7 +193,13 @@ class Pool:
             return residuals[rows], jacobian[rows]
 
         found = robust_least_squares(
-            evaluate, mean if start is None else start, mean, std, group=self.group[rows], overlap=self.overlap(rows)
+            evaluate,
+            mean if start is None else start,
+            mean,
+            std,
+            group=self.group[rows],
+            overlap=self.overlap(rows),
+            settled=SETTLED,
         )
         k, own = len(self.model.terms), len(self._constant_std)
         constants = (LogConstants(*one) for one in found.x[k:].reshape(-1, own).tolist())

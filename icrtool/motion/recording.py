@@ -34,9 +34,6 @@ STRETCH_M = 20.0
 
 FEWEST_WINDOWS = 10
 
-AFTER_S = 1e-7
-"""A rate at a step's end is that of the next step, whatever the rounding of its time."""
-
 MOVING_MPS = 0.01
 """Slower than this the robot stands: its starts are copies of one another."""
 
@@ -49,7 +46,8 @@ class Recording:
     ----------
     t_s : (n,) time of each state [s]
     drive : wheel speeds at the configured radius and the reference
-    gyro_radps : (n,) turn rate over the interval after each state, clockwise; None without a gyro
+    gyro_radps : (n,) turn rate over the interval after each state, clockwise, read when the reference turns; None
+        without a gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
@@ -88,7 +86,7 @@ class LogConstants(NamedTuple):
     heading_offset_rad : added to the heading of the reference
     wheels_later_s : the wheels are read this much later than the poses
     gyro_bias_radps : added to the turn rate of a model with a gyro
-    gyro_later_s : the gyro is read this much later than the wheels
+    gyro_later_s : the gyro is read this much later than the wheels, to first order
     """
 
     heading_offset_rad: float = 0.0
@@ -127,15 +125,13 @@ class Steps(NamedTuple):
         passed = np.clip(at - t[row], 0.0, held)
         return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
 
-    def gyro_read(self, later_s: float) -> tuple[Floats, Floats]:
-        """Return the mean turn rate (n,) of the gyro read later, and its derivative by that time, after steps' ends."""
-        turned, ends = np.concatenate([[0.0], np.cumsum(self.held * self.gyro)]), []
-        for begin in (self.t, self.t + self.held):
-            row, share = self.locate(begin + later_s)
-            rate = self.gyro[self.locate(begin + later_s + AFTER_S)[0]]
-            ends.append((turned[row] + share * self.held[row] * self.gyro[row], rate))
-        share_s = np.where(self.held > 0.0, self.held, np.inf)
-        return (ends[1][0] - ends[0][0]) / share_s, (ends[1][1] - ends[0][1]) / share_s
+    def gyro_change(self) -> Floats:
+        """Return the derivative of the gyro's turn rate by time (n,) [rad/s^2]; 0 where it cannot be formed."""
+        middle = self.t + self.held / 2.0
+        apart = np.append(middle[1:], middle[-1]) - np.append(middle[:1], middle[:-1])
+        risen = np.append(self.gyro[1:], self.gyro[-1]) - np.append(self.gyro[:1], self.gyro[:-1])
+        change: Floats = np.divide(risen, apart, out=np.zeros(len(risen)), where=apart > 0.0)
+        return change
 
 
 class Windows(NamedTuple):

@@ -20,6 +20,9 @@ from icrtool.motion.recording import (
 )
 from icrtool.records.tables import Complexes, Floats, Ints
 
+STARTS_A_CALL = 1 << 16
+"""States of which the trials are cut, or driven, at a time."""
+
 
 class Trials(NamedTuple):
     """Trials of one recording.
@@ -54,7 +57,13 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
         moving = np.append(np.diff(drive.distance) > MOVING_MPS * drive.dt_s[:-1], False)
         every = samples_a_step(recording)
         starts = np.flatnonzero(moving)[::every]
-    return Trials(starts, trial_ends(drive, np.array(horizons_m, np.float64))[starts])
+    horizons, ends = np.array(horizons_m, np.float64), np.empty((len(starts), len(horizons_m)), np.int64)
+    # A table of the ends of all states would be the largest of the analysis.
+    for lo in range(0, len(drive.distance), STARTS_A_CALL):
+        some = slice(*np.searchsorted(starts, [lo, lo + STARTS_A_CALL]))
+        found = trial_ends(drive, horizons, lo, min(lo + STARTS_A_CALL, len(drive.distance)))
+        ends[some] = found[starts[some] - lo]
+    return Trials(starts, ends)
 
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
@@ -101,7 +110,7 @@ def predicted_path(
     Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
     of = steps if steps is not None else joined_steps(recording, 1)
-    gyro = of.gyro_read(own.gyro_later_s)[0] if fitted.model.uses_gyro else of.gyro
+    gyro = of.gyro + own.gyro_later_s * of.gyro_change()
     v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left, of.v_right, recording.width_m, gyro))
     turned = of.held * (omega + own.gyro_bias_radps)
     heading = np.concatenate([[0.0], np.cumsum(turned)])

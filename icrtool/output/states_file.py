@@ -31,6 +31,9 @@ CHUNK_ROWS = 1024
 CHUNKS_A_PIECE = 16
 """Chunks written at a time: a thread that asks for the interpreter again waits longer than it takes to write one."""
 
+PARQUET_ROWS = 1 << 17
+"""Rows of a row group: a group is held in memory until it is written."""
+
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
 
@@ -66,8 +69,12 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
     if states == "parquet":
         import pyarrow.parquet as pq
 
+        floats = [name for name in COLUMNS if name not in INTEGER_COLUMNS]
         with path.open("xb") as file:
-            pq.write_table(_arrow(table.columns()), file, compression="zstd")
+            pq.write_table(
+                _arrow(table.columns()), file, compression="zstd", row_group_size=PARQUET_ROWS,
+                use_dictionary=False, use_byte_stream_split=floats,
+            )  # fmt: skip
         return file_b2sum(path)
     digest, pieces = hashlib.blake2b(), _csv_pieces(table)
 
@@ -109,7 +116,10 @@ def read_states(path: Path, states: StatesFormat) -> States:
             stored = pc.read_csv(path, convert_options=options)
         if dict(zip(stored.schema.names, stored.schema.types, strict=True)) != types:
             raise StatesFileError("its columns are not those of the states")
-        return States(**{name: _array(stored.column(name)) for name in COLUMNS})
+        columns = dict(zip(stored.schema.names, stored.columns, strict=True))
+        del stored
+        # Each column's memory goes back before the next is copied.
+        return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
     except (pa.ArrowInvalid, pa.ArrowKeyError) as err:
         raise StatesFileError(" ".join(str(err).split())) from err
 

@@ -85,7 +85,7 @@ def decompress(data: bytes | memoryview, compression: str, size: int, *, partial
     if decoder is None:
         raise DecompressionError(f"compression {compression!r} is not known")
     try:
-        out = decoder(data, size)
+        out = decoder(data, size, partial)
     except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
         raise DecompressionError(str(err) or "not enough memory") from err
     if len(out) != size and not partial:
@@ -93,22 +93,25 @@ def decompress(data: bytes | memoryview, compression: str, size: int, *, partial
     return out
 
 
-def _lz4(data: bytes | memoryview, size: int) -> bytes:
+def _lz4(data: bytes | memoryview, size: int, _: bool) -> bytes:
     import lz4.frame
 
     decoder = lz4.frame.LZ4FrameDecompressor()
     return bytes(decoder.decompress(data, max_length=size + 1))
 
 
-def _bz2(data: bytes | memoryview, size: int) -> bytes:
+def _bz2(data: bytes | memoryview, size: int, _: bool) -> bytes:
     return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
 
 
-def _zstd(data: bytes | memoryview, size: int) -> bytes:
+def _zstd(data: bytes | memoryview, size: int, partial: bool) -> bytes:
     import zstandard
 
+    decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
     try:
-        with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
+        if not partial and zstandard.frame_content_size(data) == size:
+            return decompressor.decompress(data)
+        with decompressor.stream_reader(data) as reader:
             return bytes(reader.read(size + 1))
     except zstandard.ZstdError as err:
         raise DecompressionError(str(err)) from err

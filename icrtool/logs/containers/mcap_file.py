@@ -18,17 +18,17 @@ from icrtool.logs.containers.channel import (
     Bytes,
     Channel,
     Cut,
-    Problems,
     ros_type_name,
     with_possible_times,
 )
+from icrtool.logs.containers.chunked_file import ChunkedFile
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     DecompressionError,
     Inflation,
     unpack_messages,
 )
-from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, RecordTable
+from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -39,10 +39,21 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
-_FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
+_FOOTER, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 7, 8, 11, 15
 _HEAD_BYTES, _FOOTER_BYTES = 9, 20
 _CHECKSUM_BYTES = 4
 _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
+
+
+_INDEX_HEAD_BYTES = _HEAD_BYTES + 6
+_LARGEST_BLOCK_BYTES = (1 << 17) + 1024
+"""Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
+
+SMALL_PART = 0.5
+"""A chunk of which less is wanted is decompressed up to the last wanted message; its checksum is not computed.
+
+Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
+"""
 
 
 class _Chunk(NamedTuple):
@@ -53,6 +64,7 @@ class _Chunk(NamedTuple):
     channels : those it holds, None without an entry
     index_length : length of the message index records that follow it
     begin_ns, end_ns : first and last log time in it, 0 without an entry
+    size : of its records, decompressed
     """
 
     at: int
@@ -61,9 +73,10 @@ class _Chunk(NamedTuple):
     index_length: int = 0
     begin_ns: int = 0
     end_ns: int = 0
+    size: int = 0
 
 
-class McapFile:
+class McapFile(ChunkedFile):
     """One MCAP file.
 
     Parameters
@@ -77,21 +90,15 @@ class McapFile:
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
-        self._path = path
+        super().__init__(path)
         self._message_compression = message_compression
-        self.files = [path]
-        self.problems = Problems(path.name)
-        self._table = RecordTable()
-        self._inflation = Inflation()
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
-        self._stream = path.open("rb")
         try:
-            self._size = path.stat().st_size
             if self._stream.read(len(MAGIC)) != MAGIC:
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
-            self._chunks = self._read_index()
+            self._chunks: list[_Chunk] | None = self._read_index()
             if self._chunks is None:
                 for _ in self._read_in_order(learn=True):
                     pass
@@ -99,23 +106,6 @@ class McapFile:
             self.close()
             raise
         self.channels = [self._channel(number) for number in sorted(self._channels)]
-
-    def share_read(self) -> float:
-        """Return the share of the file that has been read, 0 to 1."""
-        return self._stream.tell() / max(self._size, 1)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._stream.close()
-
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message by the index, None without one."""
-        begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
-        return min(begins, default=None)
-
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message by the index, None without one."""
-        return max((chunk.end_ns for chunk in self._chunks or () if chunk.end_ns), default=None)
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, chunk by chunk."""
@@ -129,7 +119,46 @@ class McapFile:
     def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         for chunk in chunks:
             if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
-                yield from self._read_chunk(chunk)
+                needed = self._needed(chunk, wanted)
+                part = self._read_part(chunk, needed) if needed is not None else None
+                if part is not None:
+                    yield part
+                else:
+                    yield from self._read_chunk(chunk)
+
+    def _needed(self, chunk: _Chunk, wanted: frozenset[int]) -> int | None:
+        """Return where in a chunk the last wanted message ends, by its message index; None where most is wanted."""
+        if chunk.channels is None or chunk.channels <= wanted or chunk.index_length > LARGEST_CHUNK_BYTES:
+            return None
+        self._stream.seek(chunk.at + chunk.length)
+        index, at = self._stream.read(chunk.index_length), 0
+        found = []
+        while at + _INDEX_HEAD_BYTES <= len(index):
+            opcode, length, channel = struct.unpack_from("<BQH", index, at)
+            at += _HEAD_BYTES + length
+            if opcode != _MESSAGE_INDEX or length < _INDEX_HEAD_BYTES - _HEAD_BYTES or at > len(index):
+                return None
+            count = (length - _INDEX_HEAD_BYTES + _HEAD_BYTES) // 16
+            offsets = np.frombuffer(index, "<u8", 2 * count, at - 16 * count)[1::2]
+            found.append(np.stack([offsets, np.full(count, channel in wanted, np.uint64)]))
+        if not found or not chunk.size:
+            return None
+        begin, is_wanted = np.concatenate(found, axis=1)
+        order = np.argsort(begin)
+        end = np.append(begin[order][1:], np.uint64(chunk.size))
+        sizes = np.where(is_wanted[order], end - begin[order], 0)
+        return int(end[sizes > 0].max(initial=0)) if sizes.sum() < SMALL_PART * chunk.size else None
+
+    def _read_part(self, chunk: _Chunk, needed: int) -> Block | None:
+        """Return the messages in the first `needed` bytes of a chunk; None where all of it has to be read for them."""
+        self._stream.seek(chunk.at)
+        content = self._stream.read(min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
+        try:
+            records = np.frombuffer(_chunk_records(content, self._inflation, cut=True, needed=needed), np.uint8)
+        except DecompressionError:
+            return None
+        rows, stop = self._table.scan_mcap(records)
+        return self._messages(records, rows, learn=False) if stop >= needed else None
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -166,7 +195,8 @@ class McapFile:
                     held = frozenset(index.message_index_offsets) or None
                     start, length = index.chunk_start_offset + _HEAD_BYTES, index.chunk_length - _HEAD_BYTES
                     times = index.message_start_time, index.message_end_time
-                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times))
+                    size = index.uncompressed_size
+                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times, size))
                 case None:
                     return None
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
@@ -359,8 +389,14 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     return record
 
 
-def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
-    """Return the records of a chunk record's content, decompressed and checked against its checksum."""
+def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> bytes:
+    """Return the records of a chunk record's content, decompressed and checked against its checksum.
+
+    Parameters
+    ----------
+    cut : the content is cut off; what can be decompressed is not checked
+    needed : so many bytes of a content that is cut off are enough
+    """
     if len(content) < 40:
         raise DecompressionError("its header is cut off")
     size = int.from_bytes(content[16:24], "little")
@@ -373,7 +409,7 @@ def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool) -> bytes:
     packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
     if len(packed) < length and not cut:
         raise DecompressionError("its header is damaged")
-    data = inflation.decompress(packed, compression, size, partial=cut)
+    data = inflation.decompress(packed, compression, min(size, needed) if cut else size, partial=cut)
     if checksum and not cut and zlib.crc32(data) != checksum:
         raise DecompressionError("its checksum is wrong")
     return data

@@ -10,9 +10,10 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, Problems, ros_type_name
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation
-from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE, RecordTable
+from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, ros_type_name
+from icrtool.logs.containers.chunked_file import ChunkedFile
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError
+from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE
 from icrtool.records.tables import Ints
 from icrtool.records.text import LogText
 
@@ -55,7 +56,7 @@ class _Chunk(NamedTuple):
     end_ns: int
 
 
-class Ros1Bag:
+class Ros1Bag(ChunkedFile):
     """One ROS 1 bag.
 
     Raises
@@ -65,17 +66,11 @@ class Ros1Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.files = [path]
-        self.problems = Problems(path.name)
-        self._table = RecordTable()
-        self._inflation = Inflation()
+        super().__init__(path)
         self._connections: dict[int, Channel] = {}
-        self._stream = path.open("rb")
         try:
-            self._size = path.stat().st_size
             self._check_start()
-            self._chunks = self._read_index()
+            self._chunks: list[_Chunk] | None = self._read_index()
             if self._chunks is None:
                 self.problems.add("has no index (not closed, or cut off); read from start to end")
                 for _ in self._read_in_order(learn=True):
@@ -84,23 +79,6 @@ class Ros1Bag:
             self.close()
             raise
         self.channels = list(self._connections.values())
-
-    def share_read(self) -> float:
-        """Return the share of the file that has been read, 0 to 1."""
-        return self._stream.tell() / max(self._size, 1)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._stream.close()
-
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message by the index, None without one."""
-        begins = [chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns]
-        return min(begins, default=None)
-
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message by the index, None without one."""
-        return max((chunk.end_ns for chunk in self._chunks or () if chunk.end_ns), default=None)
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted connections, chunk by chunk."""

@@ -26,6 +26,9 @@ _ROWS_AT_ONCE = 16_384 + 8
 _FIRST_ROWS = 64
 """Rows of a topic's first table; the next ones have twice as many: a log may hold thousands of topics."""
 
+_MOST_EXPECTED = 1 << 22
+"""Numbers of a column that memory is set aside for on the log's word alone."""
+
 _LARGEST_TABLE = 1 << 22
 _MOST_BYTES_AT_ONCE = 1 << 24
 """Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
@@ -108,9 +111,9 @@ class TopicTable:
         return self.columns[path], self.texts[path]
 
     def floats(self, *paths: str) -> NDArray[np.float64]:
-        """Return the first of these columns as float64, NaN everywhere when the type has none."""
+        """Return the first of these columns as float64, not to be written to; NaN everywhere when the type has none."""
         values = self.find(*paths)
-        return np.full(len(self), np.nan) if values is None else values.astype(np.float64)
+        return np.full(len(self), np.nan) if values is None else values.astype(np.float64, copy=False)
 
     def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
         """Return the table of the chosen messages."""
@@ -147,6 +150,55 @@ class _Rows:
         )
 
 
+class _Column:
+    """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
+
+    Parameters
+    ----------
+    lacking : what integers are where a row has fewer elements than others; floats are NaN there
+    """
+
+    def __init__(self, lacking: int) -> None:
+        self._lacking = lacking
+        self._rows = 0
+        self._values: NDArray[Any] = np.empty(0, np.int64)
+
+    def add(self, part: NDArray[Any], expected: int) -> None:
+        """Add rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
+        before, held = self._rows, self._values
+        self._rows += len(part)
+        one = _single_row(part)
+        if before == 0:
+            self._values = part if one is None else one
+        elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
+            width = max(part.shape[1:], held.shape[1:])
+            if len(held) < self._rows or width > held.shape[1:]:
+                likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
+                self._values = np.empty((*width, max(2 * before, self._rows, likely)), held.dtype).T
+                self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
+            self._put(before, part)
+
+    def _put(self, begin: int, part: NDArray[Any]) -> None:
+        rows = self._values[begin : begin + len(part)]
+        if part.ndim == 2 and part.shape[1] < rows.shape[1]:
+            rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
+            rows = rows[:, : part.shape[1]]
+        rows[...] = part
+
+    def taken(self) -> NDArray[Any]:
+        """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
+        values = self._values
+        return values[: self._rows] if len(values) > 1 else np.broadcast_to(values, (self._rows, *values.shape[1:]))
+
+
+def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
+    """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
+    bits = rows.view(np.int64)
+    if len(rows) == 0 or np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]):
+        return None
+    return rows[:1].copy()
+
+
 @dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
@@ -165,8 +217,8 @@ class TopicCollector:
     _layout: Layout | None = None
     _source: str = ""
     _rows: _Rows = field(default_factory=_Rows)
-    _times: list[Ints] = field(default_factory=list)
-    _parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _times: _Column = field(default_factory=lambda: _Column(0))
+    _columns: dict[str, _Column] = field(default_factory=dict)
     _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
@@ -249,10 +301,12 @@ class TopicCollector:
         if not readable.all():
             table, times_ns = table[readable], times_ns[readable]
         self._unreadable += filled - len(table)
-        self._times.append(times_ns)
+        expected = self.channel.count or 0
+        self._times.add(times_ns, expected)
         for path, slot in self.layout.slots.items():
-            take = self._text_numbers if slot.kind == "string" else self.layout.numbers
-            self._parts.setdefault(path, []).append(take(table, path))
+            is_text = slot.kind == "string"
+            values = (self._text_numbers if is_text else self.layout.numbers)(table, path)
+            self._columns.setdefault(path, _Column(-1 if is_text else 0)).add(values, expected)
         rows.filled = 0
 
     def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
@@ -275,16 +329,13 @@ class TopicCollector:
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
         self._settle()
-        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
-        self._times.clear()
+        times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
+        self._times, self._columns, self._unreadable = _Column(0), {}, 0
         order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
-        unreadable, self._unreadable = self._unreadable, 0
-        gathered, self._parts = self._parts, {}
-        for path, parts in gathered.items():
-            values = _joined(parts, -1 if path in self._texts else 0)
-            parts.clear()
+        for path in [*gathered]:
+            values = gathered.pop(path).taken()
             if path in self._texts:
                 texts[path] = list(self._texts[path].values())
             columns[path] = values if order is None else values[order]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
-from icrtool.logs.streams.stamps import increasing, stamp_rows
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
 from icrtool.records.tables import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
@@ -24,8 +24,15 @@ MOST_BAD = 0.01
 """A topic is not used where a larger share of its rates is not finite."""
 
 
+NOTHING_KNOWN: Mapping[str, StampedRows] = {}
+
+
 def find_gyro(
-    tables: Sequence[TopicTable], wheels_topic: str, heading_topic: str, clock: Literal["header", "log"]
+    tables: Sequence[TopicTable],
+    wheels_topic: str,
+    heading_topic: str,
+    clock: Literal["header", "log"],
+    known: Mapping[str, StampedRows] = NOTHING_KNOWN,
 ) -> GyroSamples | None:
     """Return the turn rates of the best inertial unit, None without one.
 
@@ -35,6 +42,7 @@ def find_gyro(
     wheels_topic, heading_topic : the unit that is also the source of the heading is preferred, then one in the wheels'
         namespace, then the one with more samples
     clock : the clock of the other streams
+    known : stamps of topics that were read before
     """
     home = wheels_topic.strip("/").split("/")[0]
     found = []
@@ -50,26 +58,25 @@ def find_gyro(
     if not found:
         return None
     _, topic, rate, sound, table = max(found, key=lambda one: one[:2])
-    stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
-    order, _, _ = increasing(stamps[rows])
-    rows = rows[order]
+    stamps = (known.get(topic) or stamp_rows(table)).on(clock)
+    rows = usable_rows(stamps, sound)
     sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     return GyroSamples(topic, stamps[rows], sign * rate[rows])
 
 
-def find_gyros(tables: Sequence[TopicTable], clock: Literal["header", "log"]) -> tuple[GyroAxes, ...]:
-    """Return the turn rates of every inertial unit, about all three axes."""
+def find_gyros(
+    tables: Sequence[TopicTable], clock: Literal["header", "log"], known: Mapping[str, StampedRows] = NOTHING_KNOWN
+) -> tuple[GyroAxes, ...]:
+    """Return the turn rates of every inertial unit, about all three axes; parameters as of `find_gyro`."""
     found = []
     for table in tables:
         if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in GYRO_AXES):
             continue
-        rates = np.column_stack([table.floats(axis) for axis in GYRO_AXES])
-        with np.errstate(invalid="ignore"):
-            sound = (np.abs(rates) <= FASTEST_RADPS).all(axis=1)
-        if np.count_nonzero(~sound) > MOST_BAD * len(rates) or not np.ptp(rates[sound], axis=0).any():
+        axes = [table.floats(axis) for axis in GYRO_AXES]
+        sound = np.logical_and.reduce([np.abs(rates) <= FASTEST_RADPS for rates in axes])
+        if np.count_nonzero(~sound) > MOST_BAD * len(sound) or not any(np.ptp(rates[sound]) for rates in axes):
             continue
-        stamps, rows = stamp_rows(table).on(clock), np.flatnonzero(sound)
-        order, _, _ = increasing(stamps[rows])
-        rows = rows[order]
-        found.append(GyroAxes(table.topic, stamps[rows], rates[rows]))
+        stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
+        rows = usable_rows(stamps, sound)
+        found.append(GyroAxes(table.topic, stamps[rows], np.array([rates[rows] for rates in axes]).T))
     return tuple(found)

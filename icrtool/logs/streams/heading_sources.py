@@ -95,7 +95,7 @@ def no_heading(table: TopicTable, problem: str) -> HeadingSource:
 
 
 def _quaternion(table: TopicTable, path: str) -> Floats:
-    return np.column_stack([table.column(f"{path}.{axis}") for axis in "xyzw"]).astype(np.float64)
+    return np.array([table.column(f"{path}.{axis}") for axis in "xyzw"], np.float64).T
 
 
 def frame_convention(table: TopicTable) -> tuple[Convention, str]:

@@ -42,9 +42,12 @@ def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, B
     with np.errstate(over="ignore"):
         norm = np.sqrt(np.einsum("ij,ij->i", q, q))
     usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
-    unit = np.where(usable[:, None], q, np.nan) / np.where(usable, norm, 1.0)[:, None]
-    order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
-    x, y, z, w = unit[:, order].T
+    unit = q / np.where(usable, norm, np.nan)[:, None]
+    if usable.all():
+        order, note = _written_order(unit, yaw_rate_radps)
+    else:
+        order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
+    x, y, z, w = (unit[:, place] for place in order)
     upright = float(np.median(np.abs(1 - 2 * (x * x + y * y))[usable])) if usable.any() else 1.0
     if upright >= UPRIGHT_COSINE:
         return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), usable, note

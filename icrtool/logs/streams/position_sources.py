@@ -67,7 +67,6 @@ class PositionSource:
     metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
     variance : (n, 3) north, east, covariance of both [m^2]; NaN where not stated
     usable : (n,) rows to use; `rejected` counts the others by reason
-    has_orientation : the same message holds the heading in the same frame
     stated_class : uint8 (n,) how the position was solved, None where no message states it
     """
 
@@ -79,7 +78,6 @@ class PositionSource:
     variance: Floats
     usable: Bools
     rejected: dict[str, int] = field(default_factory=dict)
-    has_orientation: bool = False
     score: float = 0.0
     why: str = ""
     problem: str = ""
@@ -295,7 +293,7 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
         count = int(np.count_nonzero(~usable))
         return PositionSource(
             table.topic, table.message_type, stamp_rows(table), None, np.column_stack([y, x]), variance, usable,
-            {"not finite": count} if count else {}, has_orientation=True, score=score, why=what, problem=problem,
+            {"not finite": count} if count else {}, score=score, why=what, problem=problem,
         )  # fmt: skip
 
     return read

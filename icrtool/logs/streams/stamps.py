@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
-from icrtool.records.tables import Ints, Role
+from icrtool.records.tables import Bools, Ints, Role
 
 MOST_PIECES = 10.0
 """Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
@@ -63,7 +63,7 @@ def _usable(table: TopicTable, path: str) -> StampedRows:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
     other = np.abs(log_ns - header - delay) > NEAR_NS
-    header = np.where(other, log_ns - delay, header)
+    header[other] = log_ns[other] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
@@ -93,12 +93,23 @@ def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
         yield f"{name}: {role}: {counted}; log time is used for them"
 
 
-def increasing(stamps: Ints) -> tuple[Ints, int, int]:
+def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:
+    """Return the usable rows (n,) that make stamps strictly increasing; all rows as a slice, which copies nothing."""
+    if usable.all():
+        return increasing(stamps)[0]
+    rows = np.flatnonzero(usable)
+    return rows[increasing(stamps[rows])[0]]
+
+
+def increasing(stamps: Ints) -> tuple[Ints | slice, int, int]:
     """Return the rows that make stamps strictly increasing, how many went back, and how many were equal.
 
-    Rows are sorted by stamp; of rows with the same stamp the last one stays.
+    Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice.
     """
-    backwards = int(np.count_nonzero(np.diff(stamps) < 0))
+    steps = np.diff(stamps)
+    if (steps > 0).all():
+        return slice(None), 0, 0
+    backwards = int(np.count_nonzero(steps < 0))
     order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
     ordered = stamps[order]
     keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)

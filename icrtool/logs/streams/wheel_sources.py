@@ -126,7 +126,10 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
     means: list[Floats | None] = []
     for places in (left, right):
         finite = [place for place in places if np.isfinite(values[:, place]).any()]
-        means.append(values.T[finite].astype(np.float64).mean(axis=0) if finite else None)
+        if len(finite) == 1:
+            means.append(values[:, finite[0]].astype(np.float64, copy=False))
+        else:
+            means.append(values.T[finite].astype(np.float64, copy=False).mean(axis=0) if finite else None)
     return means[0], means[1]
 
 
@@ -162,17 +165,16 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     # Joints by their place among the wheels, left ones first; -1 for all others.
     wheel = np.full(len(texts) + 1, -1)
     wheel[left + right] = np.arange(lefts + rights)
-    wheels = wheel[codes]
+    # All messages list the same joints in the same order: one row stands for them.
+    wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if codes.strides[0] == 0 else wheel[codes]
     alike = _rows_alike(wheels, lefts, rights)
     if not alike.any():
         return no_motion(table, "left and right wheels come in different messages")
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
-    positions, speeds = (_by_wheel(table.find(path), wheels, lefts + rights) for path in paths[1:])
-    position, speed = (
-        _side_means(values, [*range(lefts)], [*range(lefts, lefts + rights)])
-        for values in (_unwound(positions), speeds)
-    )
+    sides = [*range(lefts)], [*range(lefts, lefts + rights)]
+    position = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
+    speed = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
     return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
 

@@ -48,13 +48,16 @@ def write_picture(name: str, residuals: WindowResiduals, file: Path) -> None:
     save_picture(draw, file)
 
 
-def write_forecast_picture(forecast: Forecast, title: str, budgets_m: tuple[float, ...], file: Path) -> None:
+def write_forecast_picture(
+    forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, file: Path,
+    gyro: Forecast | None = None,
+) -> None:  # fmt: skip
     """Draw a forecast, as `write_picture`."""
 
     def draw() -> Figure:
         from icrtool.output.figures.forecast import draw_forecast
 
-        return draw_forecast(forecast, title, budgets_m)
+        return draw_forecast(forecast, title, budgets_m, measured_m, gyro)
 
     save_picture(draw, file)
 

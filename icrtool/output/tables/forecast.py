@@ -20,9 +20,6 @@ PLAN_COLUMNS = ("east_m", "north_m")
 
 SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
-MEASURED_TO_M = 20.0
-"""Held-out windows are this long at most; beyond it the forecast extrapolates."""
-
 LARGEST_PLAN_BYTES = 50_000_000
 
 
@@ -55,30 +52,44 @@ def read_plan(file: Path) -> tuple[Floats, Floats, Floats | None]:
     return east, north, speed[0] if speed else None
 
 
-def forecast_csv(forecast: Forecast) -> str:
+def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:
     """Return a row for each metre."""
-    names = [f"{name}_error_m" if name in {"expected", "p95"} else name for name in _names(forecast)]
-    lines = [",".join(names)]
-    lines += [",".join(f"{value:.6g}" for value in row) for row in zip(*forecast, strict=True)]
+    columns = _columns(forecast, gyro)
+    lines = [",".join(columns)]
+    lines += [",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)]
     return "\n".join(lines) + "\n"
 
 
-def _names(forecast: Forecast) -> list[str]:
-    return [name.removesuffix("_m") if name in {"expected_m", "p95_m"} else name for name in forecast._fields]
+def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
+    """Return the columns of a forecast, last the errors with a gyro."""
+    error = {"expected_m": "expected_error_m", "p95_m": "p95_error_m"}
+    columns = {error.get(name, name): column for name, column in forecast._asdict().items()}
+    if gyro is not None:
+        columns |= {"expected_error_gyro_m": gyro.expected_m, "p95_error_gyro_m": gyro.p95_m}
+    return columns
 
 
-def forecast_document(forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...]) -> dict[str, Any]:
+def forecast_document(
+    forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
+) -> dict[str, Any]:
     """Return plain data."""
-    columns = dict(zip(forecast_csv(forecast).split("\n", 1)[0].split(","), forecast, strict=True))
+    budgets = [{"budget_m": budget, "distance_m": reach(forecast, budget)} for budget in budgets_m]
+    if gyro is not None:
+        budgets = [one | {"distance_gyro_m": reach(gyro, one["budget_m"])} for one in budgets]
     return {
         "schema": "icrtool/forecast/1",
         "calibration": {"name": calibration.name, "model": calibration.recommended, "created": calibration.created},
-        "measured_to_m": MEASURED_TO_M,
-        "budgets": [{"budget_m": budget, "distance_m": reach(forecast, budget)} for budget in budgets_m],
+        "measured_to_m": measured_to_m(calibration),
+        "budgets": budgets,
         "not_shown": list(calibration.fitted.not_shown),
         "warnings": list(calibration.warnings),
-        "along": {name: column.tolist() for name, column in columns.items()},
+        "along": {name: column.tolist() for name, column in _columns(forecast, gyro).items()},
     }
+
+
+def measured_to_m(calibration: Calibration) -> float:
+    """Return the length [m] of the longest held-out windows; beyond it a forecast extrapolates."""
+    return 0.0 if calibration.sources is None else calibration.sources.measured_to_m
 
 
 def reach(forecast: Forecast, budget_m: float) -> float:
@@ -92,27 +103,31 @@ def reach(forecast: Forecast, budget_m: float) -> float:
     return float(distance[k - 1] + share * (distance[k] - distance[k - 1]))
 
 
-def format_forecast(forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...]) -> Text:
+def format_forecast(
+    forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
+) -> Text:
     """Return the table of a forecast, no line end."""
     total = float(forecast.distance_m[-1])
     logs = "1 log" if len(calibration.logs) == 1 else f"{len(calibration.logs)} logs"
     model = f"{calibration.fitted.model.label} (model {calibration.recommended}) from {logs}"
+    kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []
     for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
         k = int(metres) - 1
-        row = (forecast.expected_m[k], forecast.p95_m[k], forecast.heading_std_deg[k])
-        rows.append((f"{metres:g}", f"{row[0]:.2f}", f"{row[1]:.2f}", f"{row[2]:.1f}"))
+        errors = [f"{column[k]:.2f}" for _, one in kinds for column in (one.expected_m, one.p95_m)]
+        rows.append((f"{metres:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
+    head = [f"{name}{kind} [m]" for kind, _ in kinds for name in ("expected", "95 %")]
     blocks: list[Block] = [
         f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
         "",
-        Table("r", rows, ("distance [m]", "expected [m]", "95 % [m]", "heading ± [deg]")),
+        Table("r", rows, ("distance [m]", *head, "heading ± [deg]")),
         "",
     ]
     for budget in budgets_m:
-        distance = reach(forecast, budget)
-        far = "all of it" if distance >= total else f"{distance:.1f} m"
-        blocks.append(f"within {budget:g} m (95 %): {far}")
-    if total > MEASURED_TO_M:
-        blocks.append(f"errors were measured up to {MEASURED_TO_M:g} m; what is beyond is extrapolated")
+        far = [(kind, reach(one, budget)) for kind, one in kinds]
+        reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
+        blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
+    if total > (longest := measured_to_m(calibration)):
+        blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
     blocks += [f"not shown by the calibration's driving: {name}" for name in calibration.fitted.not_shown]
     return Text([*blocks, *calibration.warnings])

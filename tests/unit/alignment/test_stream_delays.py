@@ -10,6 +10,7 @@ import pytest
 
 from icrtool.alignment.drive_windows import cut_windows, drive_arrays
 from icrtool.alignment.estimator import estimate_alignment
+from icrtool.alignment.stream_delays import Delay, StreamDelays, _clear_delays
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run
@@ -143,3 +144,35 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
     assert found is not None
     assert found.estimate("heading_delay")[0] == pytest.approx(0.3, abs=DELAY_TOLERANCE_S)
     assert most < 50e6
+
+
+@pytest.mark.parametrize(
+    ("heading", "after", "expected"),
+    [
+        (0.01, 0.02, (0.0, 0.0)),
+        (0.01, 0.2, (0.0, 0.2)),
+        (0.2, -0.2, (0.2, 0.0)),
+        (0.2, 0.02, (0.2, 0.2)),
+        (0.3, 0.3, (0.3, 0.6)),
+        # the robot's own turn leads its wheels': no clock
+        (-0.1, 0.12, (0.0, 0.0)),
+        (0.08, 0.0, (0.0, 0.0)),
+    ],
+)
+def test_the_likeliest_delays_are_corrected(heading: float, after: float, expected: tuple[float, float]) -> None:
+    found = _clear_delays(Delay(heading, 0.03), Delay(heading + after, 0.06), Delay(after, 0.05), together=False)
+    assert (found["heading"], found["position"]) == pytest.approx(expected)
+
+
+def test_clocks_that_show_no_difference_are_known_better_than_the_drive_shows() -> None:
+    log, nothing = stop_and_go(), Delay(0.0, 0.03)
+
+    def unknown(after: float, std: float) -> float:
+        return StreamDelays(log, nothing, nothing, Delay(after, std), False, 0.0, 0.0, ()).clock_std_s
+
+    assert unknown(0.0, 0.05) == pytest.approx(0.05 / 2.0)
+    assert unknown(0.12, 0.05) > 0.1
+    # a drive that shows nothing leaves half of the prior
+    assert unknown(0.0, 0.15) == pytest.approx(0.15 / np.sqrt(2.0))
+    corrected = StreamDelays(log, nothing, nothing, Delay(0.2, 0.05), False, 0.0, 0.2, ())
+    assert corrected.clock_std_s == 0.05

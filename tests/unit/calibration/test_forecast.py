@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,3 +155,39 @@ def test_a_plan_that_cannot_be_driven_is_one_error(
 ) -> None:
     with pytest.raises(DataError, match="plan"):
         forecast_plan(calibration, np.zeros(2), np.array(north), None if speed is None else np.array(speed))
+
+
+def test_reverse_along_a_path_is_as_uncertain_as_forward(calibration: Calibration) -> None:
+    """Out and back in one line: the robot keeps its heading where it changes direction."""
+    east = np.array([0.0, 10.0, 0.0])
+    there_and_back = forecast_plan(calibration, east, 0.0 * east, np.array([0.5, -0.5, -0.5]))
+    assert np.isfinite(there_and_back.p95_m).all()
+    # a turn on the spot would add the error of a turn by 180 degrees
+    turned = forecast_plan(calibration, east, 0.0 * east, np.array([0.5, 0.5, 0.5]))
+    assert there_and_back.heading_std_deg[-1] < turned.heading_std_deg[-1]
+    with pytest.raises(DataError, match="speed"):
+        forecast_plan(calibration, east, 0.0 * east, np.zeros(3))
+
+
+def test_a_gyro_narrows_the_forecast_and_holds() -> None:
+    parameters = draw_parameters(SIX, np.random.default_rng([1, 3]))
+    logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
+    found = calibrate(logs).calibration
+    assert found.gyro_sources is not None
+    assert calibration_of(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
+    new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
+    trials = cut_trials(new, HORIZONS_M)
+    errors = predictor(found, new, with_gyro=True)(trials)
+    expected, p95 = forecast_trials(found, new, trials, with_gyro=True)
+    wheels, _ = forecast_trials(found, new, trials)
+    inside = np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0)
+    assert np.all(inside > 0.85)
+    assert np.nanmean(expected[:, 2]) < np.nanmean(wheels[:, 2])
+
+
+def test_long_drives_measure_errors_further_than_short_ones(calibration: Calibration) -> None:
+    assert calibration.sources is not None
+    assert calibration.sources.measured_to_m == 20.0
+    longer = calibrate([make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]).calibration
+    assert longer.sources is not None
+    assert longer.sources.measured_to_m >= 50.0

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from icrtool.config import load_config
 from icrtool.dropout_analysis.trials import dropout
+from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
-from icrtool.estimation.run_warnings import rejected_share
+from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
+from icrtool.estimation.observability import Excitation
+from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.measurement_codes import GATED, UNSEEN, USED
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
@@ -57,6 +62,23 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
     assert run.usable
     assert run.summary["unusable_because"] is None
     assert "NOT USABLE" not in format_run(run) + format_dropout(dropout(run, [5.0]))
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        (ProcessNoise(LARGEST_POSITION_MPS, FIELD_NOISE.heading_degps), "of the motion"),
+        (ProcessNoise(FIELD_NOISE.position_mps, 8 * FIELD_NOISE.heading_degps), "of the turns"),
+        (ProcessNoise(LARGEST_POSITION_MPS / 4, 4 * FIELD_NOISE.heading_degps), ""),
+    ],
+)
+def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, words: str) -> None:
+    code, none = np.full(4, USED, np.uint8), np.zeros(4)
+    outcome = MeasurementOutcome(np.arange(4), none, none, code, none)
+    excitation = SimpleNamespace(verdicts={"y_icr_right_m": "shown"})
+    reasons = unusable_reasons(cast(Excitation, excitation), outcome, outcome, noise)
+    assert bool(reasons) is bool(words)
+    assert words in " ".join(reasons)
 
 
 def test_the_rejected_share_counts_what_the_filter_saw() -> None:
