@@ -56,6 +56,9 @@ SAME_CLOCK_STD_S = 1e-3
 STEP_S, TURN_STEP_S = 0.02, 0.1
 """Delays are differentiated over the first step to either side, noisy headings over the second."""
 
+SMOOTH_S = 0.2
+"""Noise of the heading is smoothed over this time for the motion sideways, of which it would show too little."""
+
 OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
@@ -250,6 +253,16 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive)
 
 
+def _smooth(t: Floats, angle: Floats) -> Floats:
+    """Return the mean of an angle (h,) over `SMOOTH_S` to either side of its times t (h,): noise is no turn."""
+    area = np.concatenate([[0.0], np.cumsum(np.diff(t) * (angle[1:] + angle[:-1]) / 2)])
+    begin, end = np.maximum(t - SMOOTH_S, t[0]), np.minimum(t + SMOOTH_S, t[-1])
+    reach = np.minimum(t - begin, end - t)
+    size = np.maximum(2.0 * reach, 1e-9)
+    mean = (np.interp(t + reach, t, area) - np.interp(t - reach, t, area)) / size
+    return np.where(reach > 0.0, mean, angle)
+
+
 class _Model:
     """Residuals of the windows and their Jacobian."""
 
@@ -258,6 +271,7 @@ class _Model:
         self.v, self.u = drive.mean_speed, drive.half_difference
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
+        self.smooth_heading = _smooth(drive.heading_t, drive.heading)
         self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
         self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
             windows.turn_begin, drive.heading_t, drive.heading
@@ -300,7 +314,9 @@ class _Model:
         """Return the measured heading as a unit vector, and its rate [rad/s] (n,)."""
         edges = self._heading_at(np.append(self.drive.wheel_t, self.drive.wheel_t[-1] + self.drive.wheel_dt[-1]), x)
         dt = np.maximum(self.drive.wheel_dt, 1e-9)
-        rate = np.where(self.drive.wheel_dt > 0.0, np.diff(edges) / dt, 0.0)
+        ends = np.append(self.drive.wheel_t, self.drive.wheel_t[-1] + self.drive.wheel_dt[-1]) + x[TH]
+        smooth = np.interp(ends, self.drive.heading_t, self.smooth_heading)
+        rate = np.where(self.drive.wheel_dt > 0.0, np.diff(smooth) / dt, 0.0)
         return np.exp(0.5j * (edges[1:] + edges[:-1])), rate
 
     def _smooth_turn(self, t: Floats, x: Floats) -> Complexes:

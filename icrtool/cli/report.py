@@ -64,7 +64,8 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):
-        page = _page_of_run(source, coordinates=coordinates)
+        with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
+            page = _page_of_run(source, coordinates=coordinates)
     elif schema_of(source / FLEET_FILE).startswith(FLEET_FAMILY):
         with _as_written(source / FLEET_FILE, "run icrtool batch again"):
             page = fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source)

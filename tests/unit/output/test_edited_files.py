@@ -136,3 +136,21 @@ def test_an_edited_calibration_is_refused_in_one_line_or_can_be_used(run_place: 
             refusals[what] = str(err)
     assert used
     assert not [what for what, text in refusals.items() if not text.isprintable() or len(text) > LONGEST_LINE]
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "wrong"),
+    [("alignment", "wheel_scale", -1), ("alignment", "x_icr_m", None), ("gnss", "jump_list", 1e300)],
+)
+def test_a_page_of_an_edited_run_is_refused_in_one_line(
+    run_place: Path, tmp_path: Path, section: str, key: str, wrong: object
+) -> None:
+    from icrtool.cli.commands import icrtool as command
+
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    document = json.loads((place / "run.json").read_text())
+    document[section][key] = wrong
+    write_run(place, document)
+    with pytest.raises(IcrToolError, match="is not as this version of icrtool writes it"):
+        command.main(["report", str(place), "-o", str(tmp_path / "x.html")], standalone_mode=False)
+    assert not (tmp_path / "x.html").exists()
