@@ -25,8 +25,8 @@ from unseen_logs import Case, draw_case, make_log, true_log
 import icrtool
 from icrtool.config import Config, parse_config
 from icrtool.errors import IcrToolError
+from icrtool.kernels.arrays import Floats
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import Floats
 
 SIGMAS, HONEST_SIGMAS, LEAST_M, SHARE = 3.0, 2.0, 0.06, 0.1
 HEDGE = "would explain the log as well"

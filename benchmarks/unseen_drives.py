@@ -25,7 +25,7 @@ from skid_steer import (
     plan_lawnmower,
 )
 
-from icrtool.records.tables import Floats
+from icrtool.kernels.arrays import Floats
 
 PLANS = (plan_curved, plan_lawnmower, plan_figure_eight)
 HUSKY = replace(

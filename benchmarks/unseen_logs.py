@@ -8,20 +8,20 @@ from dataclasses import dataclass, fields
 import numpy as np
 from unseen_drives import TrueDrive
 
-from icrtool.records.samples import FIXED_FIX, OTHER_FIX
-from icrtool.records.tables import (
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.records.samples import (
+    FIXED_FIX,
+    OTHER_FIX,
     Datum,
-    Floats,
     GyroAxes,
     GyroSamples,
     HeadingSamples,
-    Ints,
     OtherReceiver,
     PositionFixes,
-    RobotLog,
     StreamChoice,
     WheelSamples,
 )
+from icrtool.records.tables import RobotLog
 
 START_NS = 1_760_000_000_000_000_000
 DATUM = Datum(47.0, -71.0, 100.0)

@@ -9,8 +9,10 @@ import numpy as np
 from icrtool.alignment.courses import TurnRate
 from icrtool.alignment.drive_windows import DriveArrays, fix_std_m
 from icrtool.alignment.gyro_heading import AbsoluteHeading
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import mad_std
-from icrtool.records.tables import Floats, PositionFixes, RobotLog
+from icrtool.records.samples import PositionFixes
+from icrtool.records.tables import RobotLog
 
 ATTITUDE_CELL_S, PAIR_CELL_S = 1.0, 0.5
 """Headings are averaged over this time, the turn in it corrected for."""

@@ -18,7 +18,8 @@ from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements, SensorData
 from icrtool.records.run import half_width_m
-from icrtool.records.tables import PositionFixes, RobotLog
+from icrtool.records.samples import PositionFixes
+from icrtool.records.tables import RobotLog
 
 
 def align(log: RobotLog, config: Config) -> Measurements:

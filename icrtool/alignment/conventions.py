@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
-from icrtool.records.tables import Floats, Ints, RobotLog
+from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 """How far robots lie from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry = 0."""

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays
+from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.robust import huber_weights, mad_std
-from icrtool.records.tables import Complexes, Floats
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
 ENOUGH_COURSES = 24.0

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.gnss_steps import bend_std_m, unbroken
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.records.measurements import Fixes
-from icrtool.records.tables import Bools, Complexes, Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 
 WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_POSITION_STD = 12.0

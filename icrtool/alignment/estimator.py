@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
+from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
-from icrtool.records.tables import Complexes, Floats
 
 NAMES = (
     "scale",

@@ -14,18 +14,9 @@ import numpy as np
 from icrtool.alignment.gnss_steps import FixSteps
 from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
-from icrtool.records.tables import (
-    FIXED_FIX,
-    FLOAT_FIX,
-    NOT_STATED,
-    OTHER_FIX,
-    RTK_FIX,
-    Bools,
-    Bytes,
-    Floats,
-    Ints,
-    RobotLog,
-)
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
+from icrtool.records.tables import RobotLog
 
 LARGEST_SANE_GNSS_STD_M = 100.0
 """A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.records.measurements import Fixes
-from icrtool.records.tables import Bools, Complexes, Floats, Ints, PositionFixes
+from icrtool.records.samples import PositionFixes
 
 FEWEST_STEPS = 40
 """Fewer steps show no noise; a stretch is evaluated by as many."""

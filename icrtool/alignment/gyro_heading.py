@@ -19,8 +19,8 @@ import numpy as np
 
 from icrtool.alignment.courses import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.alignment.drive_windows import DriveArrays
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import long_run_factor, mad_std
-from icrtool.records.tables import Floats, Ints
 
 if TYPE_CHECKING:
     from icrtool.kernels.heading_kalman import HeadingEvents, HeadingModel, HeadingPasses

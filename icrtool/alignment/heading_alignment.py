@@ -15,7 +15,8 @@ from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.heading_offset_cause import NO_NAME, OffsetName, name_offset
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.records.tables import Floats, RobotLog
+from icrtool.kernels.arrays import Floats
+from icrtool.records.tables import RobotLog
 
 FEWEST_WINDOWS = 8
 SIGNIFICANT_SIGMAS = 4.0

@@ -15,7 +15,9 @@ from icrtool.alignment.estimator import ATTITUDE_STD_RAD
 from icrtool.alignment.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
 from icrtool.alignment.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
-from icrtool.records.tables import Floats, GyroAxes, GyroSamples, HeadingSamples, RobotLog, StreamChoice
+from icrtool.kernels.arrays import Floats
+from icrtool.records.samples import GyroAxes, GyroSamples, HeadingSamples, StreamChoice
+from icrtool.records.tables import RobotLog
 
 Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from icrtool.records.tables import Datum
+from icrtool.records.samples import Datum
 
 LIKE_RAD = math.radians(1.0)
 """An offset is named after what it equals to within this: compasses in robots are no better. One that is not known

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from icrtool.alignment.gnss_steps import FEWEST_STEPS, FixSteps
-from icrtool.records.tables import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints
 
 USUAL_M2 = 2 * 0.005**2
 """Stretches are not compared below this variance, both axes."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from icrtool.alignment.gnss_quality import LARGEST_SANE_GNSS_STD_M
 from icrtool.config import FilterConfig
-from icrtool.records.tables import Floats, HeadingSamples, PositionFixes
+from icrtool.kernels.arrays import Floats
+from icrtool.records.samples import HeadingSamples, PositionFixes
 
 LARGEST_SANE_HEADING_STD_RAD = math.radians(60.0)
 """A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""

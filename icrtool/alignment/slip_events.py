@@ -13,9 +13,9 @@ import numpy as np
 
 from icrtool.alignment.slip_extent import Extent, find_extent
 from icrtool.alignment.slip_windows import Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData
-from icrtool.records.tables import Bools, Floats, Ints
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_WINDOW_S = 16.0

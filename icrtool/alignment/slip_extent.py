@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.slip_windows import Windows
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.records.events import SlipKind
-from icrtool.records.tables import Bools, Floats
 
 SHORTEST_EVENT_S = 0.5
 FEWEST_STEPS = 2

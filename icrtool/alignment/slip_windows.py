@@ -12,9 +12,9 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.robust import mad_std
 from icrtool.records.measurements import SensorData
-from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
 KNOT_S = 0.1
 """Fixes closer together than this are thinned: they show little more, and their noise much."""

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from icrtool.alignment.estimator import PRIOR_STD, SLIPPING, TP, AlignmentFit
 from icrtool.config import Config
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
+from icrtool.records.samples import HeadingSamples, PositionFixes
+from icrtool.records.tables import RobotLog
 
 SIGNIFICANT_SIGMAS = 2.5
 SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1

@@ -8,8 +8,9 @@ import numpy as np
 
 from icrtool.alignment.courses import TurnRate, course_changes
 from icrtool.alignment.drive_windows import DriveArrays
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import huber_weights, mad_std
-from icrtool.records.tables import Floats, GyroAxes
+from icrtool.records.samples import GyroAxes
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
 """Skid-steer robots turn about this much of what their wheels would without slip."""

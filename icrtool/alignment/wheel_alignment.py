@@ -12,7 +12,8 @@ from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.alignment.estimator import SLIPPING, AlignmentFit
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.records.tables import RobotLog, WheelSamples
+from icrtool.records.samples import WheelSamples
+from icrtool.records.tables import RobotLog
 
 SMALLEST_TURN_RAD = math.radians(20.0)
 

@@ -9,8 +9,10 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
-from icrtool.records.tables import Bools, Floats, Ints, PositionFixes, RobotLog, WheelSamples, WheelUnit
+from icrtool.records.samples import PositionFixes, WheelSamples, WheelUnit
+from icrtool.records.tables import RobotLog
 
 WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3

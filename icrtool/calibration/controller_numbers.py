@@ -10,12 +10,12 @@ import numpy as np
 from icrtool.calibration.held_out import Fold, HeldOut
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
 from icrtool.motion.fit import PooledFit
 from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_model, track_geometry
 from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.tables import Floats
 
 POSE_AFTER_M = CHOICE_HORIZON_M
 TWIST_OVER_M = 1.0

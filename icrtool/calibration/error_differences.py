@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.trials import Drive
-from icrtool.records.tables import Floats, Ints
 
 RESAMPLES, LEVEL = 300, 0.95
 

@@ -18,11 +18,11 @@ import numpy as np
 from icrtool.calibration.held_out import HeldOut
 from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, cut_windows
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.tables import Bools, Complexes, Floats, Ints
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10

@@ -9,11 +9,11 @@ import numpy as np
 from icrtool.calibration.error_growth import SOURCES, Ends, PathErrors, Spread, mean_error, path_errors, radius
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
 from icrtool.motion.trials import Trials
-from icrtool.records.tables import Complexes, Floats, Ints
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.trials import Summary
 from icrtool.motion.fit import Pool, PooledFit
@@ -33,7 +34,6 @@ from icrtool.motion.models import (
 from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.tables import Bools, Floats
 
 HORIZONS_M = (5.0, 10.0, 20.0)
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.tables import Floats
 
 FEWEST_TO_CHOOSE = 3
 """With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""

@@ -17,6 +17,7 @@ from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
 from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
 from icrtool.calibration.record import Calibration
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
@@ -25,7 +26,6 @@ from icrtool.motion.recording import Recording
 from icrtool.motion.trials import STARTS_A_CALL, Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
 from icrtool.records.run import Run, half_width_m
-from icrtool.records.tables import Floats
 
 FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
 """Names of the table's rows (public) and of the models of the family that they are."""

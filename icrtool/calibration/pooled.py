@@ -18,6 +18,7 @@ from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_o
 from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool
@@ -25,7 +26,6 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
-from icrtool.records.tables import Floats
 
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
-from icrtool.records.tables import Floats, Ints, RobotLog
+from icrtool.records.tables import RobotLog
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
 

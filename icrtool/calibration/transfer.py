@@ -26,13 +26,13 @@ from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, held_out_predictor, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import CHOICE_HORIZON_M, DEFAULT_SEED
 from icrtool.records.run import Run
-from icrtool.records.tables import Floats
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
 

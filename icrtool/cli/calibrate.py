@@ -142,12 +142,13 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
     from icrtool.alignment.corrections import align_streams
     from icrtool.alignment.estimator import window_residuals
+    from icrtool.alignment.reference_choice import choose_reference
     from icrtool.alignment.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibration_picture import write_picture
     from icrtool.output.stored_run import log_of
 
     log = read_log(source if run.directory is None else log_of(run), run.config)
-    fit = align_streams(with_wheel_speeds(log, run.config), run.config).fit
+    fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit
     if fit is not None:
         write_picture(run.name, window_residuals(fit), plot)

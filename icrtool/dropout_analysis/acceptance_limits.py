@@ -12,10 +12,10 @@ import numpy as np
 from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Summary
 from icrtool.records.dropout import BudgetDistance, Gate, Verdict
-from icrtool.records.tables import Floats
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(

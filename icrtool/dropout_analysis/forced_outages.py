@@ -10,10 +10,10 @@ import numpy as np
 from icrtool.dropout_analysis.starts import standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.ekf import run_filter
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, drive_of
-from icrtool.records.tables import Bools, Floats
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from icrtool.kernels.arrays import Ints
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.trials import OpenLoopPath
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, drive_of
-from icrtool.records.tables import Ints
 
 COMPARED_S = 1.0
 """Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.trials import TrialCounts
 from icrtool.records.dropout import (
     BudgetDistance,
@@ -28,7 +29,6 @@ from icrtool.records.dropout import (
     Verdict,
 )
 from icrtool.records.late_output import call_output
-from icrtool.records.tables import Floats, Ints
 
 if TYPE_CHECKING:
     import pandas as pd

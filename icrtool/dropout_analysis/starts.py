@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.estimation.observability import WEAK_SHARE
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.open_loop import STANDING
 from icrtool.kernels.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import Bools, Floats
 
 Starts = Literal["moving", "all"]
 """``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""

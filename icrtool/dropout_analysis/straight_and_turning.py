@@ -9,12 +9,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import models_of
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive
 from icrtool.records.dropout import TurningSplit
 from icrtool.records.run import Run, drive_of
-from icrtool.records.tables import Floats
 
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)

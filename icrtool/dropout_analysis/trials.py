@@ -14,6 +14,7 @@ from icrtool.dropout_analysis.reference_error import reference_error
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.block_sums import block_sums
 from icrtool.kernels.error_statistics import (
     Blocks,
@@ -31,7 +32,6 @@ from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialC
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.run import Run, drive_of, straight_drive
-from icrtool.records.tables import Bools, Floats
 
 BOOTSTRAP_RESAMPLES = 300
 BOOTSTRAP_LEVEL = 0.95

@@ -11,12 +11,12 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter_records import FilterParameters, Measurements
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
-from icrtool.records.tables import Bools, Floats, Ints
 
 
 class ProcessNoise(NamedTuple):

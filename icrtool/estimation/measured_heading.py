@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run
-from icrtool.records.tables import Floats, Ints
 
 LONGEST_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""

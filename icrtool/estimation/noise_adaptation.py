@@ -9,12 +9,12 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.ekf import run_filter
 from icrtool.kernels.filter_records import FilterOutput
 from icrtool.kernels.measurement_codes import UNSEEN
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
-from icrtool.records.tables import Floats
 
 TOLERATED_NIS = 1.25
 """Mean NIS of a stream, each counted up to its gate, per degree of freedom: 1 is expected where the noise is right."""

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from icrtool.estimation.icr_uncertainty import DriveWindows, prior_std
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
-from icrtool.records.tables import Floats, States
+from icrtool.records.tables import States
 
 Excited = Literal["shown", "weak", "not shown"]
 

@@ -17,10 +17,12 @@ from icrtool.estimation.filter_setup import (
     wheel_gap_s,
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
-from icrtool.records.tables import Bools, Floats, Ints, States, WheelSamples
+from icrtool.records.samples import WheelSamples
+from icrtool.records.tables import States
 
 OUTAGE_S = 2.0
 """Longer than this without a usable fix is a GNSS outage."""

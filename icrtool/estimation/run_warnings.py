@@ -10,10 +10,11 @@ from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
 from icrtool.estimation.observability import Excitation
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import UNSEEN
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
-from icrtool.records.tables import Floats, States
+from icrtool.records.tables import States
 
 SHORT_DRIVE_M, SMALL_TURN_RAD = 1.0, math.radians(20.0)
 """What drives and turns less has shown nothing of the ICRs."""

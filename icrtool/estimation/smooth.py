@@ -7,10 +7,11 @@ from dataclasses import fields
 import numpy as np
 
 from icrtool.estimation.run_filter import set_up_again
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.smoother import run_smoother
 from icrtool.records.run import STATE_COLUMNS, Run
-from icrtool.records.tables import Floats, States
+from icrtool.records.tables import States
 
 
 def smooth(run: Run) -> States:

@@ -16,6 +16,7 @@ from icrtool.estimation.observability import Excitation, find_excitation, nomina
 from icrtool.estimation.odometry import Odometry, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import RECOVERED
@@ -23,7 +24,8 @@ from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
-from icrtool.records.tables import Bools, Datum, Floats, InputFile, Ints, States
+from icrtool.records.samples import Datum, InputFile
+from icrtool.records.tables import States
 
 SETTLED_S = 2.0
 """An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""

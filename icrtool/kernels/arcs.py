@@ -9,13 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import body_velocity
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SMALLEST_TURN_RAD = 1e-4
 """Below this sin(a)/a is taken from its series, which is then exact to the last bit."""

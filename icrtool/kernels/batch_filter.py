@@ -6,14 +6,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf import REFERENCE_STEP_S, filter_rows
 from icrtool.kernels.filter_records import FilterOutput, FilterParameters, FilterState, Measurements
-from icrtool.kernels.kinematics import Floats, euler_step
-
-Ints = NDArray[np.int64]
+from icrtool.kernels.kinematics import euler_step
 
 
 class Batch(NamedTuple):

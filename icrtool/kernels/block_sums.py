@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.trials import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from icrtool.kernels.error_statistics import Blocks

@@ -12,10 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, keep_sides, measured_column, predict, wrap
 from icrtool.kernels.filter_records import FilterOutput, FilterParameters, FilterState, Measurements, Nodes
-from icrtool.kernels.kinematics import Floats, body_velocity
+from icrtool.kernels.kinematics import body_velocity
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 REFERENCE_STEP_S = 0.01

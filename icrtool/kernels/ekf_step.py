@@ -13,8 +13,9 @@ from typing import cast
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.kinematics import Floats, step_jacobian
+from icrtool.kernels.kinematics import step_jacobian
 
 NORTH, EAST, HEADING = (cast(int, np.int64(axis)) for axis in range(3))
 """Which state is measured. Typed: numba compiles one more copy of a function for every plain number in a call."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from icrtool.kernels.arrays import Floats, Ints
 
 
 def rows_at_steps(progress: Floats, step: float) -> Ints:

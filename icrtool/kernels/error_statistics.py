@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.trials import Bools, Floats, Histogram, Intervals, Ints, Summary
+from icrtool.kernels.trials import Histogram, Intervals, Summary
 
 TAIL = 0.05
 """Share of trials above the 95th percentile."""

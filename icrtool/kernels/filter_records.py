@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.kinematics import GUARDED, Floats
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.kinematics import GUARDED
 
 Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 class FilterParameters(NamedTuple):

@@ -13,12 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.compiled import njit
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 HUBER_SIGMAS = 2.5
 

@@ -5,12 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
-
-Floats = NDArray[np.float64]
 
 MIN_ICR_SEPARATION_M = 1e-6
 """Floor of W = |y_l - y_r|: two coincident ICRs have no finite turn rate (Section 2 rules them out physically)."""

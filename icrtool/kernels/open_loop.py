@@ -11,9 +11,10 @@ import math
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import euler_step
-from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints, OpenLoopPath, TrialCounts
+from icrtool.kernels.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
 
 SHORT = -1
 """No trial: less than the horizon is left of the log's distance."""

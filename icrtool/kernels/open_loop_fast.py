@@ -22,10 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import icr_separation
 from icrtool.kernels.open_loop import compiled_drive, compiled_icrs, integrate_trials
-from icrtool.kernels.trials import Drive, Floats, FrozenIcrs, Ints
+from icrtool.kernels.trials import Drive, FrozenIcrs
 
 TOLERANCE_M = 1e-11
 """Largest error [m] of an end position by the moments left out. With rounding the total stays well below 1e-9 m."""

@@ -11,10 +11,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from icrtool.kernels.arrays import Floats, Ints
 
 MAD_TO_STD = 1.4826
 """Standard deviation over median absolute deviation, for normal values."""

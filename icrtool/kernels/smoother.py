@@ -16,14 +16,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf import empty_nodes, empty_output, filter_rows, start_state
 from icrtool.kernels.filter_records import FilterParameters, Measurements, Nodes
-from icrtool.kernels.kinematics import Floats, step_jacobian
-
-Ints = NDArray[np.int64]
+from icrtool.kernels.kinematics import step_jacobian
 
 CHUNK_ROWS = 8192
 """Wheel samples whose nodes are kept at once: some 15 MB."""

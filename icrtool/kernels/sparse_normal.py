@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
-
-Floats = NDArray[np.float64]
 
 
 @njit

@@ -10,12 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""

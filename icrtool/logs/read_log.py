@@ -16,6 +16,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import split_files
@@ -40,18 +41,17 @@ from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_sta
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.logs.table_file import is_table, read_table
-from icrtool.records.tables import (
+from icrtool.records.samples import (
     Datum,
     HeadingSamples,
     InputFile,
-    Ints,
     OtherReceiver,
     PositionFixes,
-    RobotLog,
     Role,
     StreamChoice,
     rate_and_jitter,
 )
+from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]

@@ -10,7 +10,8 @@ from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
 from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
-from icrtool.records.tables import RobotLog, rate_and_jitter
+from icrtool.records.samples import rate_and_jitter
+from icrtool.records.tables import RobotLog
 
 
 def survey_document(survey: Survey) -> dict[str, Any]:

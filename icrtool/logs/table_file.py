@@ -11,7 +11,8 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.logs.cut import Moment, longest_part, moment, nanoseconds
-from icrtool.records.tables import InputFile, RobotLog
+from icrtool.records.samples import InputFile
+from icrtool.records.tables import RobotLog
 
 if TYPE_CHECKING:
     import pandas as pd

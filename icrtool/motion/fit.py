@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
-from icrtool.records.tables import Bools, Floats
 
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
 """Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
-from icrtool.records.tables import Floats, Ints
 
 Axis = int
 

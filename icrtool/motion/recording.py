@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.kernels.trials import Drive
-from icrtool.records.tables import Complexes, Floats, Ints
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.open_loop import trial_ends
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
@@ -18,7 +19,6 @@ from icrtool.motion.recording import (
     joined_steps,
     samples_a_step,
 )
-from icrtool.records.tables import Complexes, Floats, Ints
 
 STARTS_A_CALL = 1 << 16
 """States of which the trials are cut, or driven, at a time."""

@@ -13,6 +13,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
+from icrtool.kernels.arrays import Ints
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
@@ -24,7 +25,6 @@ from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.trials_file import trials_file
 from icrtool.records.dropout import ExampleTrial, ModelResult
-from icrtool.records.tables import Ints
 
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"

@@ -13,10 +13,12 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Ints
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
-from icrtool.records.tables import GyroSamples, HeadingSamples, Ints, States, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
+from icrtool.records.tables import States
 
 MEASUREMENTS_FILE = "measurements.npz"
 

@@ -15,7 +15,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from icrtool.records.tables import Floats, Ints, States
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.records.tables import States
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -12,6 +12,7 @@ import numpy as np
 
 from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, RunError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.split_files import numbered_file, split_path
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, FilterInputs, read_measurements
 from icrtool.output.run_directory import (
@@ -27,7 +28,7 @@ from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
-from icrtool.records.tables import Ints, States
+from icrtool.records.tables import States
 from icrtool.records.text import LogText, escaped
 
 FIT_AGAIN = "fit the log again"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from icrtool.dropout_analysis.trials import ErrorSink
-from icrtool.records.tables import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 
 ROWS_A_GROUP = 1 << 18
 """Rows written at a time: 6 MB."""

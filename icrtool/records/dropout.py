@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
-from icrtool.records.tables import Floats, Ints
 
 OutageKind = Literal["forced", "real"]
 

@@ -24,12 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.records.samples import (
     Datum,
-    Floats,
     GyroSamples,
     HeadingSamples,
-    Ints,
     PositionFixes,
     Role,
     StreamChoice,

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.events import SlipEvent
-from icrtool.records.tables import Bools, Bytes, Floats, GyroSamples, HeadingSamples, Ints, StreamChoice, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icrtool.config import Config
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.trials import Drive
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
-from icrtool.records.tables import Bools, Bytes, Floats, Ints, States
+from icrtool.records.tables import States
 
 if TYPE_CHECKING:
     import pandas as pd

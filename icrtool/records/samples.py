@@ -6,13 +6,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Complexes = NDArray[np.complex128]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
+from icrtool.kernels.arrays import Bytes, Floats, Ints
+
 Role = Literal["wheels", "gnss", "heading"]
 
 ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from icrtool.records.tables import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,62 +6,23 @@ from dataclasses import dataclass, fields
 from html import escape
 from typing import TYPE_CHECKING
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.records.frames import parts_from_frames
 from icrtool.records.samples import (
-    FIXED_FIX,
-    FLOAT_FIX,
-    NOT_STATED,
-    OTHER_FIX,
-    RTK_FIX,
-    Bools,
-    Bytes,
-    Complexes,
     Datum,
-    Floats,
     GyroAxes,
     GyroSamples,
     HeadingSamples,
     InputFile,
-    Ints,
     OtherReceiver,
     PositionFixes,
-    Role,
     StreamChoice,
     WheelSamples,
-    WheelUnit,
-    rate_and_jitter,
 )
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = [
-    "FIXED_FIX",
-    "FLOAT_FIX",
-    "NOT_STATED",
-    "OTHER_FIX",
-    "RTK_FIX",
-    "Bools",
-    "Bytes",
-    "Complexes",
-    "Datum",
-    "Floats",
-    "GyroAxes",
-    "GyroSamples",
-    "HeadingSamples",
-    "InputFile",
-    "Ints",
-    "OtherReceiver",
-    "PositionFixes",
-    "RobotLog",
-    "Role",
-    "States",
-    "StreamChoice",
-    "WheelSamples",
-    "WheelUnit",
-    "rate_and_jitter",
-]
 
 
 @dataclass(frozen=True, slots=True, repr=False)

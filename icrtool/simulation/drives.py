@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.errors import ConfigError
 from icrtool.kernels.arcs import drive, follow, poses_at
-from icrtool.records.tables import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 
 Icrs = tuple[float, float, float]

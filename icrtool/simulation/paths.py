@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from icrtool.records.tables import Floats
+from icrtool.kernels.arrays import Floats
 
 PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "straight"]
 PATH_KINDS: tuple[PathKind, ...] = get_args(PathKind)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.records.sensor_columns import SensorColumns
-from icrtool.records.tables import Floats, Ints
 from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sense
 
 START_NS = 1_760_000_000_000_000_000

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError
-from icrtool.records.tables import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.simulation.drives import DrivePlan, Sensors, check_drive
 from icrtool.simulation.paths import PathKind, PathPlan
 from icrtool.simulation.study_runs import Progress

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from icrtool.errors import ConfigError
-from icrtool.records.tables import Floats
+from icrtool.kernels.arrays import Floats
 from icrtool.simulation.drives import Icrs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
-from icrtool.records.tables import Floats
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult
 from icrtool.simulation.study_measures import inverted, trace
 from icrtool.simulation.study_runs import Chunk, Progress, run_scenarios, with_start

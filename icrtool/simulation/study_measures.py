@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arcs import drive
-from icrtool.records.tables import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.simulation.study_runs import Chunk
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")

@@ -13,9 +13,11 @@ import numpy as np
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.batch_filter import Batch, BatchOutput, run_batch
 from icrtool.kernels.kinematics import GUARDED
-from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, Icrs, Readings, Sensors, Truth, check_drive, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 

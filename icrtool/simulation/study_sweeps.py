@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.records.tables import Floats
+from icrtool.kernels.arrays import Floats
 from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics

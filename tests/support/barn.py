@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.config import Config, parse_config
-from icrtool.records.tables import (
-    Datum,
-    HeadingSamples,
-    InputFile,
-    PositionFixes,
-    RobotLog,
-    StreamChoice,
-    WheelSamples,
-)
+from icrtool.records.samples import Datum, HeadingSamples, InputFile, PositionFixes, StreamChoice, WheelSamples
+from icrtool.records.tables import RobotLog
 
 RATE_HZ = 50
 START_NS = 1_760_000_000_000_000_000

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from icrtool.records.samples import HeadingSamples, PositionFixes, StreamChoice, WheelSamples
+from icrtool.records.tables import RobotLog
 from support.matrix_filter import step_state
 
 EPOCH_NS = 1_760_000_000_000_000_000

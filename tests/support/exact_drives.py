@@ -8,7 +8,8 @@ import numpy as np
 
 from icrtool.config import parse_config
 from icrtool.kernels.arcs import drive, poses_at
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from icrtool.records.samples import HeadingSamples, PositionFixes, StreamChoice, WheelSamples
+from icrtool.records.tables import RobotLog
 
 EPOCH_NS = 1_760_000_000_000_000_000
 ICRS = (0.52, -0.44, 0.1)

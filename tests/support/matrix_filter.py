@@ -10,10 +10,11 @@ import math
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
 from icrtool.kernels.ekf_step import wrap
 from icrtool.kernels.filter_records import FilterOutput, FilterParameters, Measurements
-from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, Floats
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 

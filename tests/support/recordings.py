@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.trials import Drive
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import Recording
-from icrtool.records.tables import Floats
 
 WIDTH_M = 0.6
 SLOWEST_TURN = 0.15

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from icrtool.errors import LogError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO
 from icrtool.logs.containers.mcap_file import McapFile
@@ -18,7 +19,6 @@ from icrtool.logs.containers.one_recording import Span, check_spans, storage_fil
 from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.records import unfinished
-from icrtool.records.tables import Ints
 
 _LARGEST_METADATA_BYTES, _MOST_FILES, _DEEPEST = 1 << 18, 10_000, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""

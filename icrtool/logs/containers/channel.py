@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from icrtool.records.tables import Ints
+from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.records.text import LogText, escaped, shortened
-
-Bytes = NDArray[np.uint8]
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 

@@ -12,15 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import (
-    WHOLE,
-    Block,
-    Bytes,
-    Channel,
-    Cut,
-    ros_type_name,
-    with_possible_times,
-)
+from icrtool.kernels.arrays import Bytes
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name, with_possible_times
 from icrtool.logs.containers.chunked_file import ChunkedFile
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,

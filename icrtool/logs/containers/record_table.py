@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.kernels.compiled import njit
-from icrtool.logs.containers.channel import Bytes
-from icrtool.records.tables import Ints
 
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
 BAG_MESSAGE, BAG_CONNECTION = 2, 7

@@ -10,11 +10,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import WHOLE, Block, Bytes, Channel, Cut, ros_type_name
+from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
 from icrtool.logs.containers.chunked_file import ChunkedFile
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError
 from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE
-from icrtool.records.tables import Ints
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"

@@ -7,8 +7,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.kernels.compiled import njit
-from icrtool.logs.containers.channel import Bytes
 from icrtool.logs.messages.schema import (
     BEGIN_LOOP,
     END_LOOP,
@@ -20,7 +20,6 @@ from icrtool.logs.messages.schema import (
     TAKE_STRING,
     Layout,
 )
-from icrtool.records.tables import Bools, Ints
 
 _MAX_NESTING = 8
 _MOST_REMEMBERED = 512

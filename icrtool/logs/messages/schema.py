@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
-from icrtool.records.tables import Ints
+from icrtool.kernels.arrays import Ints
 
 SKIP, TAKE, SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE, BEGIN_LOOP, END_LOOP = range(8)
 """Operations. A row of the program is (operation, element size, count, column, capacity, stride, jump)."""

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_into, empty_table
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
-from icrtool.records.tables import Ints
 from icrtool.records.text import LogText
 
 _FIRST_CAPACITY = 8

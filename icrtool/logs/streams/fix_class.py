@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, Bytes, Ints
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 
 GBAS = 2
 """NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""

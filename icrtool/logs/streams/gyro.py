@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
-from icrtool.records.tables import GyroAxes, GyroSamples
+from icrtool.records.samples import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
 GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.orientation import nose_yaw
 from icrtool.logs.streams.position_sources import (
@@ -22,7 +23,6 @@ from icrtool.logs.streams.position_sources import (
     solved,
 )
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows
-from icrtool.records.tables import Bools, Floats
 
 Convention = Literal["enu", "ned"]
 

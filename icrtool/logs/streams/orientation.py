@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icrtool.records.tables import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats
 
 QUATERNION_NORM_TOLERANCE = 0.1
 UPRIGHT_COSINE = math.cos(math.radians(45.0))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.fix_class import (
     GPSFIX_STATUS,
@@ -18,7 +19,6 @@ from icrtool.logs.streams.fix_class import (
     class_by_type,
 )
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows
-from icrtool.records.tables import Bools, Bytes, Floats, Ints
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"

@@ -18,8 +18,7 @@ from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource
 from icrtool.logs.streams.wheel_names import right_twin
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_motion
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, no_motion
-from icrtool.records.samples import ROLE_WORDS
-from icrtool.records.tables import Role
+from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
 
 Source = TypeVar("Source", WheelMotion, PositionSource, HeadingSource)

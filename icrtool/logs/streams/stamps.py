@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Bools, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
-from icrtool.records.tables import Bools, Ints, Role
+from icrtool.records.samples import Role
 
 MOST_PIECES = 10.0
 """Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""

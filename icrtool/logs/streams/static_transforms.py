@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.records.tables import Floats
 
 TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_sources import COMMANDED, Unit, WheelMotion, motion_of
-from icrtool.records.tables import Bools, Floats
 from icrtool.records.text import LogText
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.position_sources import REFERENCE_WORDS
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows
 from icrtool.logs.streams.wheel_names import wheel_joints
-from icrtool.records.tables import Bools, Floats, Ints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
 

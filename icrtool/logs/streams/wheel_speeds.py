@@ -6,9 +6,10 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.streams.stamps import increasing
 from icrtool.logs.streams.wheel_sources import Unit, WheelMotion
-from icrtool.records.tables import Floats, Ints, WheelSamples
+from icrtool.records.samples import WheelSamples
 
 MOST_NOT_FINITE = 0.01
 """A larger share of wheel samples without a number is reported."""

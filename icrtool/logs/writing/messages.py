@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rosbags.typesys.store import Typestore
 
+    from icrtool.kernels.arrays import Ints
     from icrtool.logs.writing.records import WriteOptions
     from icrtool.records.sensor_columns import SensorColumns
-    from icrtool.records.tables import Ints
 
 GRAVITY_MPS2 = 9.81
 HEIGHT_STD_RATIO = 2.0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from icrtool import __version__
 from icrtool.dropout_analysis.trials import errors_from_states
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.logs.writing.containers import write_mcap
 from icrtool.logs.writing.messages import (
@@ -37,7 +38,7 @@ from icrtool.output.exports.paths import (
     rows_apart,
 )
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import FIXED_FIX, Floats, Ints
+from icrtool.records.samples import FIXED_FIX
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

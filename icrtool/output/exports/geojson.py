@@ -11,6 +11,7 @@ import orjson
 from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.measurement_codes import GATED, UNSEEN
 from icrtool.output.exports.paths import (
     LABELS,
@@ -25,7 +26,6 @@ from icrtool.output.exports.paths import (
 from icrtool.output.figures.decimate import places
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import Floats, Ints
 
 STATE_CELL_M = 0.2
 """A state becomes a point where the path enters another cell of a grid of this side."""

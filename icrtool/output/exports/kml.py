@@ -7,6 +7,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.exports.paths import (
     LABELS,
     ExportPath,
@@ -21,7 +22,6 @@ from icrtool.output.exports.paths import (
 )
 from icrtool.output.text_format import distance_text, duration_text, run_title, xml_text
 from icrtool.records.run import Run
-from icrtool.records.tables import Floats
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 

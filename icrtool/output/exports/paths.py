@@ -15,10 +15,11 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, odometry
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.trials import FrozenIcrs
 from icrtool.output.figures.decimate import places
 from icrtool.records.run import Run
-from icrtool.records.tables import Floats, Ints, States
+from icrtool.records.tables import States
 
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
 

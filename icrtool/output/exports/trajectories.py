@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.exports.paths import ExportPath
-from icrtool.records.tables import Floats
 
 TrajectoryFormat = Literal["evo", "kitti"]
 

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from icrtool.alignment.estimator import WindowResiduals
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import ICR, inches, new_figure
-from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.records.tables import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 
 LINE_POINTS = 2400
 """Points of a drawn line: some three per pixel column of every figure."""

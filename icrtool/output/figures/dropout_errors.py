@@ -9,10 +9,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import ICR, MEAN, NO_SLIP, Pen, fill_bins, inches, new_figure
 from icrtool.output.text_format import metres_text
 from icrtool.records.dropout import ModelResult, Outage
-from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

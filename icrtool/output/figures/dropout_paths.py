@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.lines import Line2D
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
 from icrtool.output.text_format import duration_text, metres_text
 from icrtool.records.dropout import ExampleTrial, Outage
-from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
@@ -22,7 +23,6 @@ from icrtool.output.figures.style import (
 )
 from icrtool.output.text_format import metres_text, position_word, run_title
 from icrtool.records.run import Run
-from icrtool.records.tables import Bools, Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
@@ -26,7 +27,6 @@ from icrtool.output.figures.style import (
 )
 from icrtool.output.text_format import run_title, signed
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.lines import Line2D
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change
 from icrtool.output.figures.study_special import draw_consistency, draw_initial
 from icrtool.output.figures.style import Pen, inches, new_figure, save, style
 from icrtool.output.tables.study import capital, runs_text, study_title
-from icrtool.records.tables import Floats
 from icrtool.simulation.studies import KINDS, StudyName, StudyResult
 from icrtool.simulation.study_measures import ICR_NAMES
 

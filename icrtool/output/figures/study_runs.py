@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.lines import Line2D
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import inches, new_figure
 from icrtool.output.tables.study import capital, runs_text, study_title
-from icrtool.records.tables import Floats
 from icrtool.simulation.studies import KINDS, StudyResult
 
 if TYPE_CHECKING:

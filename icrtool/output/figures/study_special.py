@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.patches import Patch
 
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import inches, new_figure
 from icrtool.output.tables.study import runs_text, study_title
-from icrtool.records.tables import Floats
 from icrtool.simulation.studies import StudyResult
 from icrtool.simulation.study_initial import GUARDS
 

@@ -15,7 +15,7 @@ from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from icrtool.records.tables import Floats
+from icrtool.kernels.arrays import Floats
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.ticker import ScalarFormatter
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures.decimate import places
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
@@ -23,7 +24,7 @@ from icrtool.output.figures.style import (
 from icrtool.output.text_format import distance_text, duration_text, metres_text, position_word, run_title
 from icrtool.records.measurements import Fixes
 from icrtool.records.run import Run
-from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, OTHER_FIX, Bools, Floats
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrtool.records.tables import Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 
 _TYPES = {"f32": "<f4", "f64": "<f8", "i32": "<i4", "u8": "u1"}
 

@@ -16,11 +16,11 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
+from icrtool.kernels.arrays import Bools, Ints
 from icrtool.motion.recording import Recording
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
-from icrtool.records.tables import Bools, Ints
 
 MOST_STEPS = 150_000
 """Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""

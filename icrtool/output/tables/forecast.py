@@ -11,10 +11,10 @@ import numpy as np
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.errors import RunError
+from icrtool.kernels.arrays import Floats
 from icrtool.logs.table_file import csv_frame
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text
-from icrtool.records.tables import Floats
 
 PLAN_COLUMNS = ("east_m", "north_m")
 

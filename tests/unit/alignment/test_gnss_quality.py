@@ -13,24 +13,24 @@ from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.config import load_config
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
+from icrtool.kernels.arrays import Bools
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.logs.read_log import read_log
 from icrtool.logs.writing.log import WriteOptions, write_log
 from icrtool.records.run import Run
-from icrtool.records.tables import (
+from icrtool.records.samples import (
     FIXED_FIX,
     FLOAT_FIX,
     NOT_STATED,
     OTHER_FIX,
     RTK_FIX,
-    Bools,
     Datum,
     HeadingSamples,
     PositionFixes,
-    RobotLog,
     StreamChoice,
     WheelSamples,
 )
+from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.record import simulate
 from support.drives import EPOCH_NS as START_NS

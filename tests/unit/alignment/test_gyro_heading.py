@@ -18,7 +18,8 @@ from icrtool.alignment.gyro_heading import estimate_heading
 from icrtool.alignment.heading_choice import DerivedHeading, derive_heading, fuse_heading
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import GyroAxes, HeadingSamples, OtherReceiver, RobotLog
+from icrtool.records.samples import GyroAxes, HeadingSamples, OtherReceiver
+from icrtool.records.tables import RobotLog
 from support.exact_drives import CONFIG, simulate
 
 LARGEST_RMS_DEG = 0.3

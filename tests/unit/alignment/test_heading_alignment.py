@@ -13,8 +13,10 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
+from icrtool.kernels.arrays import Floats
 from icrtool.records.run import Run
-from icrtool.records.tables import Datum, Floats, HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log
 from support.matrix_filter import step_state
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from icrtool.alignment.heading_offset_cause import name_offset, utm_convergence_deg
-from icrtool.records.tables import Datum
+from icrtool.records.samples import Datum
 
 SIGMA_RAD = math.radians(0.1)
 AUTUMN_2025_NS = 1_760_000_000_000_000_000

@@ -10,7 +10,8 @@ import pytest
 from icrtool.alignment.reference_choice import agreement, choose_reference
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import RobotLog, StreamChoice
+from icrtool.records.samples import StreamChoice
+from icrtool.records.tables import RobotLog
 from support.drives import make_log
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.slip_events import find_slip_events
+from icrtool.kernels.arrays import Floats
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, SensorData
-from icrtool.records.tables import Floats, GyroSamples, HeadingSamples, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
 
 START_NS = 1_760_000_000_000_000_000
 RATE_HZ, SECONDS, WIDTH_M = 100, 120.0, 0.6

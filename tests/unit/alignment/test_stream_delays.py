@@ -14,7 +14,8 @@ from icrtool.alignment.stream_delays import Delay, StreamDelays, _clear_delays
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run
-from icrtool.records.tables import Datum, HeadingSamples, PositionFixes, RobotLog, StreamChoice, WheelSamples
+from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
+from icrtool.records.tables import RobotLog
 from support.matrix_filter import step_state
 
 START_NS = 1_760_000_000_000_000_000

@@ -12,7 +12,7 @@ from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import HeadingSamples, PositionFixes
+from icrtool.records.samples import HeadingSamples, PositionFixes
 from support.drives import make_log
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])

@@ -13,7 +13,8 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.tables import GyroSamples, HeadingSamples, PositionFixes, RobotLog, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log

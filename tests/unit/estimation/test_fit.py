@@ -15,7 +15,8 @@ from icrtool.estimation.filter_setup import chi2_gate
 from icrtool.estimation.fit import fit
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.records.run import WarmStart
-from icrtool.records.tables import PositionFixes, RobotLog, WheelSamples
+from icrtool.records.samples import PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log

@@ -13,7 +13,8 @@ import pytest
 import icrtool
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run
-from icrtool.records.tables import HeadingSamples, PositionFixes, RobotLog
+from icrtool.records.samples import HeadingSamples, PositionFixes
+from icrtool.records.tables import RobotLog
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap"
 CONFIG = icrtool.load_config(robot="segway-rmp400")

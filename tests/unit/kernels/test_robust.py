@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import (
     LOSS_SIGMAS,
-    Floats,
     RobustFit,
     huber_weights,
     long_run_factor,

@@ -15,7 +15,7 @@ from icrtool.logs.streams.fix_class import (
     class_by_status,
     class_by_type,
 )
-from icrtool.records.tables import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 
 
 def table_of(path: str, values: Any, texts: list[str] | None = None) -> TopicTable:

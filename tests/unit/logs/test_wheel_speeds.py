@@ -7,11 +7,13 @@ import pytest
 
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
 from icrtool.logs.streams.wheel_speeds import wheel_samples
-from icrtool.records.tables import Floats, HeadingSamples, Ints, PositionFixes, RobotLog
+from icrtool.records.samples import HeadingSamples, PositionFixes
+from icrtool.records.tables import RobotLog
 
 RADIUS_M, STEP_NS = 0.1, 20_000_000
 CONFIG = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}"])

@@ -9,11 +9,11 @@ import pytest
 
 from icrtool.calibration.held_out import hold_out
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
 from icrtool.motion.fit import Pool, WindowResiduals
 from icrtool.motion.models import MODELS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_windows
 from icrtool.motion.trials import cut_trials, predicted_path, trial_errors
-from icrtool.records.tables import Floats
 from support.recordings import WIDTH_M, draw_parameters, make_recording
 
 EIGHT = MODELS["eight"]

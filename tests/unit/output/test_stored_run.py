@@ -27,7 +27,7 @@ from icrtool.output.stored_run import log_of, newest_run, open_run
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import Run
-from icrtool.records.tables import GyroSamples
+from icrtool.records.samples import GyroSamples
 from support.barn import configured, simulate
 
 
