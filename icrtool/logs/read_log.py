@@ -119,10 +119,7 @@ def survey_log(
     finally:
         container.close()
     candidates = find_candidates(tables, config, unread)
-    for table in tables:
-        # What only the candidates were made of goes: half of what a log takes.
-        for name in table.columns.keys() - {*GYRO_FIELDS, *FIELDS}:
-            del table.columns[name]
+    drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),
         path=LogText(str(path)),
@@ -132,6 +129,13 @@ def survey_log(
         problems=problems,
         inputs=inputs,
     )
+
+
+def drop_used_columns(tables: list[TopicTable]) -> None:
+    """Remove the columns that only candidates were made of: half of what a log takes."""
+    for table in tables:
+        for name in table.columns.keys() - {*GYRO_FIELDS, *FIELDS}:
+            del table.columns[name]
 
 
 def read_log(

@@ -68,7 +68,7 @@ def test_the_jobs_of_the_page_write_what_they_pass_on(place: Path) -> None:
 def test_a_gate_beyond_the_interval_fails_and_says_where(place: Path, icrtool, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.chdir(place)
     run = place / "icrtool-runs" / "field"
-    gate = "icr_final.p95@2m <= 0.01 * baseline"
+    gate = "icr_final.p95@1m <= 0.01 * baseline"
     status, out, err = icrtool(
         "dropout-report", run, "--baseline", "baseline", "--gate", gate, "--plots", "none", "--junit",
         tmp_path / "j.xml", "--markdown", tmp_path / "m.md", "--no-ladder",

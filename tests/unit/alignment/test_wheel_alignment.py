@@ -114,7 +114,7 @@ def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backward
     log = readings_log(sense(truth, sensors, 90.0, np.random.default_rng(0)), sensors)
     run = fit(log, CONFIG)
     # The ICRs do lie to one side of the origin; nothing is said of wheels and heading.
-    assert all("to the left of the antenna" in warning for warning in run.warnings)
+    assert all("to the left of the position sensor" in warning for warning in run.warnings)
     final = run.summary["icr"]["final"]
     assert [final[name] for name in final] == pytest.approx(icrs, abs=ICR_TOLERANCE_M)
 

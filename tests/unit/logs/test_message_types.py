@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -274,7 +275,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Written]:
                 decoded = decode_rosbags(path, store)
         if container == "db3 without definitions":
             forget_definitions(path)
-        return Written(path, survey_log(path), decoded)
+        # with all columns, also those that candidates were made of
+        with mock.patch("icrtool.logs.read_log.drop_used_columns"):
+            return Written(path, survey_log(path), decoded)
 
     def get(container: str) -> Written:
         if container not in done:
