@@ -73,11 +73,10 @@ def labelled(rows: Iterable[tuple[str, str]]) -> list[Table]:
 def _lines(block: Block) -> Iterable[str]:
     if isinstance(block, Table):
         return _table_lines(block)
-    if isinstance(block, Line) and block.look == "as is":
+    if isinstance(block, Line):
         return block.text.split("\n")
-    text = block.text if isinstance(block, Line) else str(block)
-    indent = " " * (len(text) - len(text.lstrip()) + 2)
-    return _wrap(text, "", indent) or [""]
+    indent = " " * (len(block) - len(block.lstrip()) + 2)
+    return _wrap(str(block), "", indent) or [""]
 
 
 def _table_lines(table: Table) -> Iterator[str]:
