@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.fit import run_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -107,24 +108,10 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
     with options.progress_bar("reading", quiet=quiet) as progress:
         found = []
         for i, source in enumerate(sources):
-            found.append(_run(source, config))
+            found.append(run_of(source, config))
             if progress is not None:
                 progress((i + 1) / len(sources))
     return found
-
-
-def _run(source: Path, config: Config) -> Run:
-    """Read a run, or fit a log."""
-    from icrtool.output.run_directory import is_run_directory
-
-    if is_run_directory(source):
-        from icrtool.output.stored_run import open_run
-
-        return open_run(source)
-    from icrtool.estimation.fit import fit
-    from icrtool.logs.read_log import read_log
-
-    return fit(read_log(source, config), config)
 
 
 def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> LogCalibration:

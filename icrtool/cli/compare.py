@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.fit import run_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
-    from icrtool.config import Config
     from icrtool.records.run import Run
 
 
@@ -56,7 +56,9 @@ def command(
     groups: dict[str, list[Run]] = {}
     with options.progress_bar("reading", quiet=quiet) as progress:
         for number, (name, path) in enumerate(found, start=1):
-            groups.setdefault(name, []).append(_run(path, config, verbose=verbose))
+            if verbose:
+                click.echo(str(path), err=True)
+            groups.setdefault(name, []).append(run_of(path, config))
             if progress is not None:
                 progress(number / len(found))
     transfer = compare_groups(groups)
@@ -114,19 +116,3 @@ def _expand(place: Path) -> list[Path]:
         return [place]
     runs = sorted(file.parent for file in place.rglob(RUN_FILE) if is_run_directory(file.parent))
     return runs or [one.path for one in find_recordings([place])]
-
-
-def _run(path: Path, config: Config, *, verbose: bool) -> Run:
-    """Read a run, or fit a log."""
-    from icrtool.output.run_directory import is_run_directory
-
-    if verbose:
-        click.echo(str(path), err=True)
-    if is_run_directory(path):
-        from icrtool.output.stored_run import open_run
-
-        return open_run(path)
-    from icrtool.estimation.fit import fit
-    from icrtool.logs.read_log import read_log
-
-    return fit(read_log(path, config), config)

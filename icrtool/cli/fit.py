@@ -222,3 +222,17 @@ def fit_log(log: Path, directory: Path, request: FitRequest) -> Run:
         if request.verbose or ("chosen over" in stream["why"] and not request.quiet):
             click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
     return run
+
+
+def run_of(path: Path, config: Config) -> Run:
+    """Read a run, or fit a log without a recommendation; nothing is written."""
+    from icrtool.output.run_directory import is_run_directory
+
+    if is_run_directory(path):
+        from icrtool.output.stored_run import open_run
+
+        return open_run(path)
+    from icrtool.estimation.fit import fit
+    from icrtool.logs.read_log import read_log
+
+    return fit(read_log(path, config), config)

@@ -100,12 +100,8 @@ def _watch(arrived: int, over: threading.Event) -> None:
 
 
 def end_by_force(status: int) -> None:
-    """Remove what this process is writing, end its processes, and end it, whatever its threads do."""
+    """Remove what this process is writing, and end it, whatever its threads do."""
     # No import here: the main thread may hold its lock.
-    active_children = getattr(sys.modules.get("multiprocessing"), "active_children", list)
-    for child in active_children():
-        child.kill()
-        child.join(GRACE_S / 4)
     remove_unfinished()
     with suppress(OSError):
         if status == INTERRUPTED:

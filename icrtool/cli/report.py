@@ -58,9 +58,9 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
 
     from icrtool.errors import RunError
     from icrtool.output.atomic_file import write_file
-    from icrtool.output.json_file import schema_of
+    from icrtool.output.json_file import FLEET_FILE, schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
-    from icrtool.output.page.fleet_page import FLEET_FAMILY, FLEET_FILE, fleet_page
+    from icrtool.output.page.fleet_page import FLEET_FAMILY, fleet_page
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(source):

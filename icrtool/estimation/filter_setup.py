@@ -320,6 +320,11 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
 
 
+def _travel_difference(data: Measurements) -> Floats:
+    """Return how much further the left side has travelled than the right, since the first sample (n,) [m]."""
+    return np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(data.wheel_t))])
+
+
 def _response_variance(data: Measurements, width_m: float) -> Floats:
     """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
 
@@ -327,8 +332,7 @@ def _response_variance(data: Measurements, width_m: float) -> Floats:
     heading by up to `RESPONSE_S` times that change. Within a change these errors have one sign, so that white noise as
     large as a step's own error would leave most of it to the ICRs. `width_m` is the ICRs' separation.
     """
-    t = data.wheel_t
-    turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
+    t, turned = data.wheel_t, _travel_difference(data) / width_m
     before, now, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, 0.0, CHANGE_S))
     change = (after - 2.0 * now + before) / CHANGE_S
     return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
@@ -341,8 +345,7 @@ def _wheel_averaging_s(data: Measurements) -> float:
     what a slope is fitted to makes the slope smaller (Fuller 1987): the ICRs would be too far apart. Counts of a coarse
     encoder average out within some of them. The noise is that of second differences of means over equal times.
     """
-    t = data.wheel_t
-    turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))])
+    t, turned = data.wheel_t, _travel_difference(data)
     for span_s in AVERAGING_S:
         mean = np.diff(np.interp(np.arange(t[0], t[-1], max(span_s, (t[-1] - t[0]) / len(t))), t, turned))
         if len(mean) < FEWEST_MEANS:

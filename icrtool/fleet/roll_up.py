@@ -15,13 +15,11 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError, LogError
 from icrtool.fleet.row import Row
 from icrtool.output.atomic_file import write_file
-from icrtool.output.json_file import json_bytes
+from icrtool.output.json_file import FLEET_FILE, json_bytes
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
-
-FLEET_FILE = "fleet.json"
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,7 @@ from icrtool.dropout_analysis.baseline import BaselineReport, BaselineRow
 from icrtool.errors import ConfigError
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
-
-FLEET_FILE = "fleet.json"
+from icrtool.output.json_file import FLEET_FILE
 
 METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
 

@@ -10,6 +10,9 @@ from typing import Any
 from icrtool.records.plain_data import plain
 from icrtool.records.text import LogText
 
+FLEET_FILE = "fleet.json"
+"""What a batch found, in its folder."""
+
 
 def schema_of(file: Path) -> str:
     """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none."""

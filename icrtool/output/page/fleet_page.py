@@ -14,7 +14,6 @@ from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.tables.dropout import metres_text
 from icrtool.output.text_format import distance_text, duration_text
 
-FLEET_FILE = "fleet.json"
 PLOTS = "plots"
 
 FLEET_FAMILY = "icrtool/fleet/"
