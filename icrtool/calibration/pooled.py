@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,10 @@ from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
-from icrtool.motion.fit import Pool
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
+from icrtool.motion.fit import Pool, PooledFit
+from icrtool.motion.models import FittedModel
+from icrtool.motion.recording import LogConstants, Recording, cut_windows
+from icrtool.motion.trials import Trials, model_errors
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 
@@ -204,13 +206,15 @@ ErrorsOf = Callable[[Trials], Floats]
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated_path`."""
-    path = calibrated_path(calibration, recording, with_gyro=with_gyro)
-    return lambda trials: trial_errors(recording, trials, path)
+    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated_model`."""
+    fitted, own = calibrated_model(calibration, recording, with_gyro=with_gyro)
+    return lambda trials: model_errors(recording, trials, fitted, own)
 
 
-def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> PathAt:
-    """Return the path that a calibration makes of a recording.
+def calibrated_model(
+    calibration: Calibration, recording: Recording, *, with_gyro: bool = False
+) -> tuple[FittedModel, LogConstants]:
+    """Return the model of a calibration, and the constants of a recording for it.
 
     Parameters
     ----------
@@ -234,7 +238,7 @@ def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
-    return predicted_path(recording, fitted, pool.own_constants(0, fitted.parameters))
+    return fitted, pool.own_constants(0, fitted.parameters)
 
 
 def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
@@ -250,24 +254,26 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
     mine = [f for f, fold in enumerate(table.folds) if fold.recording == i]
     edges = np.array([table.folds[f].begin_m for f in mine])
 
+    windows = cache(lambda: [cut_windows(recording)])
+
     @cache
-    def path_without(first: int, last: int) -> PathAt | None:
+    def fit_without(first: int, last: int) -> tuple[PooledFit, LogConstants] | None:
         fit, own = table.without[mine[first]], table.own[mine[first]]
-        if first != last:
-            windows = [cut_windows(recording)]
-            fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
-            (kept,), _ = mask_windows(windows, [fold])
-            if np.count_nonzero(kept) < FEWEST_RESIDUALS:
-                return None
-            fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
-            own = fit.constants[0]
-        return predicted_path(recording, fit, own)
+        if first == last:
+            return fit, own
+        fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
+        (kept,), _ = mask_windows(windows(), [fold])
+        if np.count_nonzero(kept) < FEWEST_RESIDUALS:
+            return None
+        fit = Pool(windows(), [recording.width_m], fit.model).fit(kept, fit.solution.x)
+        return fit, fit.constants[0]
+
+    fitting = Lock()
 
     def errors_of(trials: Trials) -> Floats:
         errors: Floats = np.full(trials.ends.shape, np.nan)
         distance = recording.drive.distance
         first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
-        # Block by block of the start: tables of all trials would need more memory than their errors.
         for a in np.flatnonzero(np.bincount(first)).tolist():
             begun = np.flatnonzero(first == a)
             ends = trials.ends[begun]
@@ -275,12 +281,14 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
             last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
             last[ends < 0] = -1
             for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
-                if (path := path_without(a, b)) is not None:
+                with fitting:
+                    fit = fit_without(a, b)
+                if fit is not None:
                     of_pair = last == b
                     kept = of_pair.any(axis=1)
                     rows, there = begun[kept], of_pair[kept]
                     part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
-                    errors[rows] = np.where(there, trial_errors(recording, part, path), errors[rows])
+                    errors[rows] = np.where(there, model_errors(recording, part, *fit), errors[rows])
         return errors
 
     return errors_of

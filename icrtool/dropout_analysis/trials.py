@@ -279,15 +279,15 @@ def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Execu
 
 def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
-    states = ends.shape[1]
-    if isinstance(model, ConstantModel):
-        found = model.errors_of(Trials(np.arange(states), ends.T.astype(np.int64)))
-        return np.ascontiguousarray(found.T).T
-    errors, icrs = np.empty(ends.shape), model.icrs
+    states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
-        hi = min(lo + STARTS_A_CALL, states)
-        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+        some = slice(lo, min(lo + STARTS_A_CALL, states))
+        there = ends[:, some].T.astype(np.int64)
+        if isinstance(model, ConstantModel):
+            errors[:, some] = model.errors_of(Trials(np.arange(states)[some], there)).T
+        else:
+            errors[:, some] = open_loop_errors(drive, model.icrs, there, lo).T
 
     list(pool.map(fill, range(0, states, STARTS_A_CALL)))
     return errors.T

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import IcrToolError, LogError
@@ -21,6 +22,10 @@ from icrtool.records.run import Run
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
 
+MOST_POOLED = 12
+"""Logs of a robot and group that are calibrated together: evenly spaced over all by time. Time and memory grow faster
+than their number, and what is not known of the parameters shrinks with its root only."""
+
 
 @dataclass(frozen=True, slots=True)
 class PooledCalibration:
@@ -29,7 +34,7 @@ class PooledCalibration:
     Attributes
     ----------
     logs : that it is fitted to
-    left_out : logs that are not usable
+    left_out : logs that are not usable, copies, or more than `MOST_POOLED`
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
     recommended, multiplier, multiplier_std : of the calibration
     table : leave-one-log-out table as text
@@ -118,35 +123,33 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     from icrtool.output.tables.held_out import held_out_blocks
     from icrtool.output.text_blocks import Text
 
-    left_out, seen = [], set()
+    # A copy of a log would be tested on itself.
+    distinct = {tuple(sorted(file.sha256 for file in row.inputs)): row for row in reversed(members)}
+    ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
+    spaced = {
+        ordered[i].log for i in np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_POOLED)).round().astype(int)
+    }
+    used: list[str] = []
 
     def usable() -> Iterator[Run]:
         for row in members:
-            run = open_run(directory / row.run)
-            files = tuple(file["sha256"] for file in run.summary["inputs"])
-            # A copy of a log would be tested on itself.
-            if not run.usable or files in seen:
-                left_out.append(row.log)
-                continue
-            seen.add(files)
-            yield run
+            if row.log in spaced and (run := open_run(directory / row.run)).usable:
+                used.append(row.log)
+                yield run
 
     try:
         result = calibrate_runs(usable())
     except IcrToolError as err:
-        return _without(one, tuple(left_out), str(err))
+        left_out = tuple(log for log in one.logs if log not in used)
+        return replace(one, left_out=left_out, reason=str(err))
     (directory / CALIBRATIONS).mkdir(exist_ok=True)
     file = f"{CALIBRATIONS}/{name}.json"
     write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.wheels)))
-    used = tuple(log for log in one.logs if log not in left_out)
-    return PooledCalibration(one.robot, one.group, used, tuple(left_out), file, "", result.calibration.recommended,
+    left_out = tuple(log for log in one.logs if log not in used)
+    return PooledCalibration(one.robot, one.group, tuple(used), left_out, file, "", result.calibration.recommended,
                              float(numbers.multiplier), float(numbers.multiplier_std), table, one.key)  # fmt: skip
-
-
-def _without(one: PooledCalibration, left_out: tuple[str, ...], reason: str) -> PooledCalibration:
-    return PooledCalibration(one.robot, one.group, one.logs, left_out, reason=reason, key=one.key)
 
 
 def _stored(directory: Path) -> list[PooledCalibration]:

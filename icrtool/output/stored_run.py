@@ -78,7 +78,7 @@ def open_run(path: str | Path) -> Run:
             None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
         )  # fmt: skip
         _check_sum(directory, MEASUREMENTS_FILE, sums)
-        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
+        table, sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)

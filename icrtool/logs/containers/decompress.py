@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bytes
 from icrtool.logs.containers.channel import Block
 
 LARGEST_CHUNK_BYTES = 1 << 28
@@ -20,6 +21,19 @@ _BLOCK_BYTES = 1 << 24
 _UNKNOWN_SIZE_BYTES = 1 << 24
 
 
+class Space:
+    """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
+
+    def __init__(self) -> None:
+        self._bytes: Bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before as far as they reach."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size, np.uint8)
+        return self._bytes[:size]
+
+
 class Inflation:
     """Counts the bytes decompressed from a log, and limits them to a multiple of their size in the file.
 
@@ -29,19 +43,64 @@ class Inflation:
 
     def __init__(self) -> None:
         self._left = LARGEST_CHUNK_BYTES
+        self._space = Space()
 
-    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
-        """Decompress a chunk as `decompress` does.
+    def decompress(self, data: memoryview, compression: str, size: int, *, partial: bool = False) -> Bytes:
+        """Decompress a chunk.
+
+        Parameters
+        ----------
+        compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
+        size : decompressed size stated in the log [bytes]
+        partial : the data is cut off, or `size` is only a part of it; return what can be decompressed
+
+        Returns
+        -------
+        uint8, valid until the next call.
 
         Raises
         ------
         DecompressionError
-            Damaged data; or the chunks before this one inflated more than `LARGEST_RATIO` times and one chunk.
+            Damaged data, a size other than `size`, or an unknown compression; or the chunks before this one inflated
+            more than `LARGEST_RATIO` times and one chunk.
         """
         self.check()
-        out = decompress(data, compression, size, partial=partial)
+        if compression in ("", "none"):
+            size = len(data)
+        if size > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {size} bytes")
+        try:
+            match compression:
+                case "" | "none":
+                    out = np.frombuffer(data, np.uint8)
+                case "zstd":
+                    out = self._zstd(data, size, partial=partial)
+                case "lz4":
+                    import lz4.frame
+
+                    out = np.frombuffer(lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1), np.uint8)
+                case "bz2":
+                    out = np.frombuffer(bz2.BZ2Decompressor().decompress(data, size + 1), np.uint8)
+                case _:
+                    raise DecompressionError(f"compression {compression!r} is not known")
+        except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
+            raise DecompressionError(str(err) or "not enough memory") from err
+        if len(out) != size and not partial:
+            raise DecompressionError(f"{len(out)} bytes instead of {size}")
         self.add(len(data), len(out))
+        out.flags.writeable = False  # as that of a database: the kernels are compiled once
         return out
+
+    def _zstd(self, data: memoryview, size: int, *, partial: bool) -> Bytes:
+        import zstandard
+
+        out = self._space.of(size + 1)
+        try:
+            # Where the space holds all of a frame, zstd decompresses straight into it.
+            with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
+                return out[: reader.readinto(out if not partial else out[:size])]
+        except zstandard.ZstdError as err:
+            raise DecompressionError(str(err)) from err
 
     def check(self) -> None:
         """Refuse to decompress more, where what was decompressed is too much.
@@ -61,63 +120,6 @@ class Inflation:
 
 class DecompressionError(Exception):
     """A chunk that cannot be decompressed; `args[0]` is the reason."""
-
-
-def decompress(data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
-    """Decompress a chunk.
-
-    Parameters
-    ----------
-    compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : decompressed size stated in the log [bytes]
-    partial : the data is cut off; return the part that can be decompressed
-
-    Raises
-    ------
-    DecompressionError
-        Damaged data, a size other than `size`, or an unknown compression.
-    """
-    if compression in ("", "none"):
-        return bytes(data)
-    if size > LARGEST_CHUNK_BYTES:
-        raise DecompressionError(f"it claims {size} bytes")
-    decoder = _DECODERS.get(compression)
-    if decoder is None:
-        raise DecompressionError(f"compression {compression!r} is not known")
-    try:
-        out = decoder(data, size, partial)
-    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
-        raise DecompressionError(str(err) or "not enough memory") from err
-    if len(out) != size and not partial:
-        raise DecompressionError(f"{len(out)} bytes instead of {size}")
-    return out
-
-
-def _lz4(data: bytes | memoryview, size: int, _: bool) -> bytes:
-    import lz4.frame
-
-    decoder = lz4.frame.LZ4FrameDecompressor()
-    return bytes(decoder.decompress(data, max_length=size + 1))
-
-
-def _bz2(data: bytes | memoryview, size: int, _: bool) -> bytes:
-    return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
-
-
-def _zstd(data: bytes | memoryview, size: int, partial: bool) -> bytes:
-    import zstandard
-
-    decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
-    try:
-        if not partial and zstandard.frame_content_size(data) == size:
-            return decompressor.decompress(data)
-        with decompressor.stream_reader(data) as reader:
-            return bytes(reader.read(size + 1))
-    except zstandard.ZstdError as err:
-        raise DecompressionError(str(err)) from err
-
-
-_DECODERS = {"lz4": _lz4, "zstd": _zstd, "bz2": _bz2}
 
 
 def unpack_messages(

@@ -88,21 +88,17 @@ class SqliteBag:
         if self._made_beside is not None:
             self._made_beside.unlink(missing_ok=True)
 
-    def begin_ns(self) -> int | None:
-        """Return the time of the first message, None where it cannot be read."""
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return the times of the first and the last message, None where they cannot be read."""
         try:
-            begin = self._query("SELECT min(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
+            # one query each: SQLite takes both from its index of times then
+            first, last = (
+                self._query(f"SELECT {which}(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]  # noqa: S608
+                for which in ("min", "max")
+            )
         except _DAMAGE:
             return None
-        return begin if isinstance(begin, int) else None
-
-    def end_ns(self) -> int | None:
-        """Return the time of the last message, None where it cannot be read."""
-        try:
-            end = self._query("SELECT max(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
-        except _DAMAGE:
-            return None
-        return end if isinstance(end, int) else None
+        return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""

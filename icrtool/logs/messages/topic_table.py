@@ -282,13 +282,12 @@ class TopicCollector:
     def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
         """Learn the texts of a text field that are in some rows and were not seen before."""
         slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
-        counts = self.layout.counts(new, path)
-        for i in range(min(slot.repeat, int(counts.max(initial=0)))):
-            entries = new[counts > i, slot.column + i * slot.stride :]
-            codes, first = np.unique(entries[:, 2], return_index=True)
-            for code, row in zip(codes.tolist(), first.tolist(), strict=True):
-                if code not in texts:
-                    place, length = int(entries[row, 0]), int(entries[row, 1])
+        counts = self.layout.counts(new, path).tolist()
+        for i in range(min(slot.repeat, max(counts, default=0))):
+            column = slot.column + i * slot.stride
+            for row, code in enumerate(new[:, column + 2].tolist()):
+                if code not in texts and counts[row] > i:
+                    place, length = new[row, column : column + 2].tolist()
                     raw = block.data[place : place + length].tobytes()
                     texts[code] = LogText(raw.decode("utf-8", "replace"))
 

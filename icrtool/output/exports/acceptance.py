@@ -13,8 +13,8 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import write_file
-from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
-from icrtool.output.text_format import run_title, xml_text
+from icrtool.output.tables.dropout import budget_lines, percent_text, ratio_text, shown_horizons
+from icrtool.output.text_format import error_text, run_title, xml_text
 
 Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
@@ -97,7 +97,7 @@ def format_markdown(report: DropoutReport) -> str:
     for result in report.results:
         for label, column in (("95 %", result.summary.p95), ("expected", result.summary.expected)):
             cells = [
-                f"{metres_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
+                f"{error_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
                 for h in shown
             ]
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
@@ -122,7 +122,7 @@ def format_markdown(report: DropoutReport) -> str:
         ]
         lines += [
             f"| {one.kind} | {one.begin_s:.1f} s | {one.end_s - one.begin_s:.1f} s | {one.distance_m:.1f} m "
-            f"| {metres_text(one.end_error_m)} | {metres_text(one.max_error_m)} |"
+            f"| {error_text(one.end_error_m)} | {error_text(one.max_error_m)} |"
             for one in report.outages
         ]
     return "\n".join(lines) + "\n"
@@ -156,7 +156,7 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
                 half = difference_half_width(
                     sums, row.sums if row is not None else None, metric, 1.0, same_recording=same
                 )
-                interval = f" ± {metres_text(half)}" if math.isfinite(half) else ""
+                interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
                 cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows), *([""] if changes else []), *changes]

@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import calibrated_path, gyro_recording_of
+from icrtool.calibration.pooled import calibrated_model, gyro_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
 from icrtool.kernels.arrays import Bools, Ints
 from icrtool.motion.recording import Recording
+from icrtool.motion.trials import predicted_path
 from icrtool.output.figures.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import Run, drive_of
@@ -219,14 +220,15 @@ def _path(
     if with_gyro and recording.gyro_radps is None:
         return None
     try:
-        heading, place = calibrated_path(calibration, recording, with_gyro=with_gyro)(recording.t_s)
+        fitted, own = calibrated_model(calibration, recording, with_gyro=with_gyro)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None
     rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
+    heading, place = predicted_path(recording, fitted, own)(recording.t_s[rows])
     columns = {"forward": place.real, "right": place.imag, "turn": heading}
     return {"every": every, "first_turn": float(heading[0])} | {
-        name: packed_sums(column[rows]) for name, column in columns.items()
+        name: packed_sums(column) for name, column in columns.items()
     }
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from icrtool import __version__
 from icrtool.output import text_format
-from icrtool.output.tables.dropout import metres_text
+from icrtool.output.text_format import error_text
 from icrtool.records.plain_data import plain
 from icrtool.records.text import escaped
 
@@ -91,7 +91,7 @@ def script_json(data: Mapping[str, Any]) -> str:
 
 
 def _metres(value: float | None) -> str:
-    return "–" if value is None else metres_text(value)
+    return "–" if value is None else error_text(value)
 
 
 def _breakable(name: str) -> Markup:
