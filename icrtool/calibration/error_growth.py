@@ -36,9 +36,9 @@ FEWEST_WINDOWS = 20
 ANGLES = 48
 DESCENTS = 400
 
-SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 4.0
-"""Of the quantiles; of p95 never less than 1: a few windows do not show that the errors are smaller than normal."""
-
+NORMAL_STRETCHES = 10
+"""That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
+those of robots differ. A few windows never show that errors are smaller than normal."""
 
 Values = TypeVar("Values", Floats, Complexes)
 
@@ -192,7 +192,8 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     Notes
     -----
     Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
-    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent.
+    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
+    in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
     """
     stretches: Counter[float] = Counter()
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
@@ -227,12 +228,13 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
     variances = _fit_variances(length, sources, known, turned, missed)
     spread, far = sources.combined(variances).plus(known), length >= SCALED_FROM_M
-    error = np.abs(missed)
-    level = min(95.0 * (1.0 + 1.0 / stretches[CHOICE_HORIZON_M]), 100.0)
-    share = np.percentile(error[far] / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
-    mean = error[far].mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
-    factors = np.clip([share, mean], [1.0, SMALLEST_FACTOR], LARGEST_FACTOR).tolist()
-    return ErrorSources(*(*variances.tolist(), *factors, measured_to_m))
+    error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
+    level = min(95.0 * (1.0 + 1.0 / count), 100.0)
+    share = np.percentile(error / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
+    mean = error.mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
+    # measured over normal: the fewer stretches show it, the nearer to normal
+    factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
+    return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
 
 
 def _stacked(parts: Sequence[Spread], used: Bools) -> Spread:
