@@ -24,6 +24,7 @@ from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
+from icrtool.records.run_document import IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
 
@@ -48,7 +49,7 @@ def summarise(
     inputs: tuple[InputFile, ...],
     datum: Datum | None,
     rejected_fixes: dict[str, int],
-) -> dict[str, Any]:
+) -> RunDocument:
     """Return all numbers and warnings of a run as plain data, equal to what run.json gives back.
 
     Parameters
@@ -77,7 +78,7 @@ def summarise(
         *noise_warnings(name, config, filtered.noise),
         *(f"{name}: {sentence}" for sentence in excitation.sentences),
     ]
-    document: dict[str, Any] = plain(
+    document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,
             "tool_version": __version__,
@@ -161,15 +162,15 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     return covariance + np.diag([0.0, 0.0, (speed * clock_std_s) ** 2]), excitation
 
 
-def without_unlearned(document: dict[str, Any]) -> dict[str, Any]:
+def without_unlearned(document: RunDocument) -> RunDocument:
     """Return the summary with null in place of the ICRs that are not shown, and of a multiplier made of one."""
-    icr: dict[str, Any] = dict(document["icr"])
+    icr: Any = dict(document["icr"])
     hidden = [name for name, verdict in document["excitation"]["verdict"].items() if verdict == "not shown"]
     for key in ("final", "final_std", "mean", "std"):
         icr[key] = {name: None if name in hidden else value for name, value in icr[key].items()}
     if "y_icr_right_m" in hidden or "y_icr_left_m" in hidden:
         icr |= {"separation_multiplier": None, "separation_multiplier_std": None}
-    return document | {"icr": icr}
+    return {**document, "icr": icr}
 
 
 def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
@@ -212,7 +213,7 @@ def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementO
     }
 
 
-def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:
+def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
     """Find when each ICR estimate converged, up to a time where one is given.
 
     Returns
@@ -226,7 +227,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     -----
     Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
     """
-    spans: dict[str, tuple[float, float] | None] = {}
+    spans: dict[IcrColumn, tuple[float, float] | None] = {}
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
     settled_by = np.searchsorted(t_s, t_s + SETTLED_S)
@@ -294,7 +295,7 @@ def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
 
 
 def icr_summary(
-    table: States, convergence: dict[str, tuple[float, float] | None], covariance: Floats
+    table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats
 ) -> dict[str, Any]:
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
 

@@ -18,13 +18,9 @@ SHOWN = "icr_p95_10m_m"
 def suites_of(rows: Sequence[Row]) -> list[Suite]:
     """Return a suite per log."""
     # Not at import: it loads the analysis, which a batch that is finished does not need.
-    from icrtool.output.exports.acceptance import Case, Suite
+    from icrtool.output.exports.acceptance import Suite
 
-    return [
-        Suite(row.log, [Case(one.gate, one.passed, one.line, one.not_checked) for one in row.verdicts],
-              row.reason if row.status == "failed" else "")
-        for row in rows
-    ]  # fmt: skip
+    return [Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows]
 
 
 def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
@@ -52,7 +48,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
                 one.margin_high_m is not None) else "-"  # fmt: skip
             verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
             numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
-            cells = [escaped_markdown(row.log), escaped_markdown(one.gate), *numbers, interval, verdict]
+            cells = [escaped_markdown(row.log), escaped_markdown(one.gate.text), *numbers, interval, verdict]
             lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
     lines += ["| log | 95 % after 10 m, ICR | baseline | difference |", "| --- | ---: | ---: | ---: |"]

@@ -6,8 +6,9 @@ import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 
 from icrtool.config import Config, parse_config
@@ -23,11 +24,11 @@ from icrtool.output.run_directory import (
     STATES_FILES,
     is_run_directory,
 )
-from icrtool.output.run_schema import check_run_document
 from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
+from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
 from icrtool.records.text import LogText, escaped
 
@@ -35,6 +36,15 @@ FIT_AGAIN = "fit the log again"
 
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
+
+TOGETHER = (
+    ("icr", "separation_multiplier", "separation_multiplier_std"),
+    ("gnss", "mean_difference_m", "max_difference_m"),
+    ("gnss", "delay_s", "delay_std_s"),
+    ("heading", "delay_s", "delay_std_s"),
+    ("heading", "offset_deg", "offset_std_deg"),
+)
+"""Section, and two keys of it that are both known or both null."""
 
 
 def open_run(path: str | Path) -> Run:
@@ -92,7 +102,7 @@ def open_run(path: str | Path) -> Run:
             gnss=gnss,
             heading=heading,
             smoothed=smoothed,
-            summary=document,
+            summary=cast("RunDocument", document),
             directory=directory,
         )
     except (OSError, StatesFileError, ValueError, OverflowError) as err:
@@ -139,6 +149,29 @@ def newest_run(runs: Path) -> Path:
     if not found:
         raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
     return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
+
+
+def check_run_document(document: dict[str, Any]) -> None:
+    """Refuse plain data that is no run.
+
+    Raises
+    ------
+    ValueError
+        A key is missing, of another type, or null without its companion; its path is named.
+    """
+    try:
+        msgspec.convert(document, RunDocument)
+    except msgspec.ValidationError as err:
+        raise ValueError(str(err)) from err
+    for section, one, other in TOGETHER:
+        if (document[section][one] is None) != (document[section][other] is None):
+            raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")
+    icr = document["icr"]
+    for column in icr["final"]:
+        if len({icr[key][column] is None for key in ("final", "final_std", "mean", "std")}) > 1:
+            raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
+    if document["usable"] != (document["unusable_because"] is None):
+        raise ValueError("usable and unusable_because contradict each other - at `$`")
 
 
 def _config(document: Mapping[str, Any], directory: Path) -> Config:

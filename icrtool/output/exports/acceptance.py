@@ -15,25 +15,17 @@ from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import write_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
 from icrtool.output.text_format import run_title, xml_text
+from icrtool.records.dropout import Verdict
 
 Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
-
-
-class Case(NamedTuple):
-    """One acceptance limit of a log: its text, its verdict in one line, and why it was not checked, if it was not."""
-
-    gate: str
-    passed: bool
-    line: str
-    not_checked: str = ""
 
 
 class Suite(NamedTuple):
     """The acceptance limits of a log; `error`: why the log could not be used, empty if it could."""
 
     log: str
-    cases: Sequence[Case] = ()
+    verdicts: Sequence[Verdict] = ()
     error: str = ""
 
 
@@ -41,8 +33,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     """Return the acceptance limits of a report, or of a log that has none."""
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
-    cases = [Case(one.gate.text, one.passed, one.line(), one.not_checked) for one in outcome.verdicts]
-    return Suite(run_title(outcome.run_summary), cases)
+    return Suite(run_title(outcome.run_summary), outcome.verdicts)
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -165,21 +156,23 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
 def _suite(one: Suite, command: str) -> ET.Element:
     name = xml_text(one.log)
     counts = {
-        "tests": len(one.cases) + bool(one.error),
-        "failures": sum(not case.passed for case in one.cases),
+        "tests": len(one.verdicts) + bool(one.error),
+        "failures": sum(not verdict.passed for verdict in one.verdicts),
         "errors": int(bool(one.error)),
-        "skipped": sum(bool(case.not_checked) for case in one.cases),
+        "skipped": sum(bool(verdict.not_checked) for verdict in one.verdicts),
     }
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
-    for case in one.cases:
-        element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(case.gate))
-        if case.not_checked:
-            ET.SubElement(element, "skipped", message=xml_text(case.not_checked))
-        elif not case.passed:
-            failure = ET.SubElement(element, "failure", type="gate", message=xml_text(case.line))
-            failure.text = xml_text(case.line)
+    for verdict in one.verdicts:
+        element, line = (
+            ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate.text)),
+            verdict.line(),
+        )
+        if verdict.not_checked:
+            ET.SubElement(element, "skipped", message=xml_text(verdict.not_checked))
+        elif not verdict.passed:
+            ET.SubElement(element, "failure", type="gate", message=xml_text(line)).text = xml_text(line)
         else:
-            ET.SubElement(element, "system-out").text = xml_text(case.line)
+            ET.SubElement(element, "system-out").text = xml_text(line)
     if one.error:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
         ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
