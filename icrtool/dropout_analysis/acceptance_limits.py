@@ -111,8 +111,8 @@ def check_gate(
     passed = _RELATIONS[gate.relation](value, bound)
     if not strict and not passed and margin + half_width >= 0.0:
         passed = True
-    numbers = (value, margin, margin - half_width, margin + half_width, bound, before)
-    return Verdict(gate, passed, *plain(numbers), log=report.name)
+    low, high = margin - half_width, margin + half_width
+    return Verdict(gate, passed, *plain((value, margin, low, high, bound, before, report.name)))
 
 
 def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[BlockSums | None, ...]]:

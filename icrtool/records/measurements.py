@@ -100,17 +100,6 @@ class SensorData:
     heading_is_estimated: bool = False
     attitude: HeadingSamples | None = None
 
-    def earlier(self, delay_s: float) -> SensorData:
-        """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""
-        if delay_s == 0.0:
-            return self
-        shift = round(delay_s * 1e9)
-        headings = self.headings
-        if self.heading_from_position:
-            headings = replace(headings, stamp_ns=headings.stamp_ns - shift)
-        fixes = replace(self.fixes, stamp_ns=self.fixes.stamp_ns - shift)
-        return replace(self, fixes=fixes, headings=headings, losses_ns=self.losses_ns - shift)
-
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""
         wheels = self.wheels.cut(rows)
