@@ -232,6 +232,8 @@ class View:
 
 def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
+    from icrtool.fleet.row import SHOWN_ERROR
+
     parts = [f"{row.status:7}", shown(row.log)]
     if row.duration_s is not None and row.distance_m is not None:
         parts.append(f"{row.duration_s:.0f} s  {row.distance_m:.0f} m")
@@ -239,7 +241,7 @@ def line_of(row: Row) -> str:
     if right is not None and left is not None:
         std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
         parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
-    if (p95 := row.errors.get("icr_p95_10m_m")) is not None:
+    if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
 

@@ -23,7 +23,7 @@ from icrtool.kernels.measurement_codes import RECOVERED
 from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive
 from icrtool.records.run_document import IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
@@ -60,33 +60,20 @@ def summarise(
     inputs, datum, rejected_fixes : of the log
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
-    name = sensors.name
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
-    warnings = [
-        *measurements.warnings,
-        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
-        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
-        *(
-            f"{name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s"
-            for t in filtered.changes_s
-            if t not in changes_s
-        ),
-        *noise_warnings(name, config, filtered.noise),
-        *(f"{name}: {sentence}" for sentence in excitation.sentences),
-    ]
     document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,
             "tool_version": __version__,
-            "log": name,
+            "log": sensors.name,
             "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": warnings,
+            "warnings": _warnings(measurements, filtered, config, multiplier, excitation),
             "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
@@ -97,7 +84,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
+            "odometry": _end_errors(drive_odometry(table, filtered.in_gap, width)),
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
@@ -109,25 +96,50 @@ def summarise(
             "outages_ns": filtered.outages_ns,
             "rtk_losses_ns": sensors.losses_ns,
             "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
-            "filter": {
-                "preset": config.filter.preset,
-                "process_position_mps": filtered.noise.position_mps,
-                "process_heading_degps": filtered.noise.heading_degps,
-                "reference_delay_s": measurements.position_delay_s,
-                "heading_correlation_s": sensors.heading_correlation_s,
-                "heading_from_position": sensors.heading_from_position,
-                "heading_is_estimated": sensors.heading_is_estimated,
-                "antenna_m": sensors.antenna_m,
-                "antenna_is_known": measurements.antenna_is_known,
-                "states": len(table),
-                "warm_start": warm_start_summary(filtered.began_with),
-                "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
-            }
-            | nis_summary(filtered.gnss, filtered.heading),
+            "filter": filter_summary(measurements, filtered, config),
             "excitation": excitation.summary(),
         }
     )
     return document if config.filter.preset == "paper" else without_unlearned(document)
+
+
+def _warnings(
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation
+) -> list[str]:
+    """Return the warnings of alignment and filter, in the order they were found."""
+    name, table = filtered.sensors.name, filtered.table
+    end_s = float(table.t_s[-1])
+    return [
+        *measurements.warnings,
+        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
+        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
+        *(
+            f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
+            for t in filtered.changes_s
+            if not 0.0 < t < end_s
+        ),
+        *noise_warnings(name, config, filtered.noise),
+        *(f"{name}: {sentence}" for sentence in excitation.sentences),
+    ]
+
+
+def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> dict[str, Any]:
+    """Return what the filter was run with, and the statistics of its innovations."""
+    sensors, start = filtered.sensors, filtered.began_with
+    return {
+        "preset": config.filter.preset,
+        "process_position_mps": filtered.noise.position_mps,
+        "process_heading_degps": filtered.noise.heading_degps,
+        "reference_delay_s": measurements.position_delay_s,
+        "heading_correlation_s": sensors.heading_correlation_s,
+        "heading_from_position": sensors.heading_from_position,
+        "heading_is_estimated": sensors.heading_is_estimated,
+        "antenna_m": sensors.antenna_m,
+        "antenna_is_known": measurements.antenna_is_known,
+        "states": len(filtered.table),
+        "warm_start": None if start is None else {"icrs_m": start.icrs_m, "covariance_m2": start.covariance_m2},
+        "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
+    } | nis_summary(filtered.gnss, filtered.heading)
 
 
 def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation]:
@@ -182,17 +194,10 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
     return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
-def odometry_summary(found: Odometry) -> dict[str, Any]:
+def _end_errors(found: Odometry) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
     paths = {"icr": found.icr, "no_slip": found.no_slip}
     return {name: {"end_error_m": path.end_error_m} if path is not None else None for name, path in paths.items()}
-
-
-def warm_start_summary(warm_start: WarmStart | None) -> dict[str, Any] | None:
-    """Return what a run was warm-started with, None where it was not."""
-    if warm_start is None:
-        return None
-    return {"icrs_m": warm_start.icrs_m, "covariance_m2": warm_start.covariance_m2}
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:

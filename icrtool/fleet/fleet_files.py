@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from icrtool import __version__
-from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
-from icrtool.fleet.row import Row, columns_of
+from icrtool.fleet.roll_up import PooledCalibration
+from icrtool.fleet.row import SHOWN_ERROR, Row, columns_of
 from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
@@ -24,8 +25,6 @@ FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 PLOTS = "plots"
 
-SHOWN_ERROR = "icr_p95_10m_m"
-
 
 def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
     """Return what fleet.json holds: how many logs came to what, all of each, and the pooled calibrations."""
@@ -35,7 +34,7 @@ def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration
         "tool_version": __version__,
         "counts": {status: counts[status] for status in ("done", "failed", "skipped")},
         "gates_failed": sum(row.gates_failed for row in rows),
-        "calibrations": calibration_documents(calibrations),
+        "calibrations": [asdict(one) for one in calibrations],
         "logs": [msgspec.to_builtins(row) | {"verdicts": [_verdict(one) for one in row.verdicts]} for row in rows],
     }
 

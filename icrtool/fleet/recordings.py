@@ -176,7 +176,7 @@ def distinct_names(logs: Sequence[Path]) -> list[str]:
     taken = {name.casefold() for name in names if count[name.casefold()] == 1}
     for index, name in enumerate(names):
         if count[name.casefold()] > 1:
-            names[index] = _unique(longer[index], taken)
+            names[index] = unique_name(longer[index], taken)
     return names
 
 
@@ -256,11 +256,11 @@ def _named(paths: Sequence[Path], root: Path) -> list[Recording]:
         for name, log in zip(short, logs, strict=True)
     ]
     taken: set[str] = set()
-    names = [_unique(name, taken) for name in names]
+    names = [unique_name(name, taken) for name in names]
     return [Recording(path, as_text(name), as_text(log)) for path, name, log in zip(paths, names, logs, strict=True)]
 
 
-def _unique(name: str, taken: set[str]) -> str:
+def unique_name(name: str, taken: set[str]) -> str:
     """Return a name, with a number where it is taken; add it to those that are."""
     unique, number = name, 2
     while unique.casefold() in taken:

@@ -11,6 +11,9 @@ from icrtool.records.run import ICR_COLUMNS
 
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
+SHOWN_ERROR = "icr_p95_10m_m"
+"""The error of each log that is printed, drawn, and compared with the baseline."""
+
 Status = Literal["done", "failed", "skipped"]
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.events import SlipEvent
-from icrtool.records.samples import GyroSamples, HeadingSamples, StreamChoice, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
@@ -33,7 +33,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Fixes:
+class Fixes(Samples):
     """Positions of the antenna as the filter uses them.
 
     Attributes
@@ -54,10 +54,6 @@ class Fixes:
     fix_class: Bytes
     misreported: Bools
     down_weighted: Bools
-
-    def cut(self, rows: slice) -> Fixes:
-        """Return the fixes of some rows."""
-        return Fixes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 class IcrStart(NamedTuple):
@@ -106,8 +102,7 @@ class SensorData:
         span = wheels.stamp_ns[[0, -1]]
         fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
         samples = slice(*np.searchsorted(self.headings.stamp_ns, span))
-        headings = HeadingSamples(*(getattr(self.headings, field.name)[samples] for field in fields(self.headings)))
-        return replace(self, wheels=wheels, fixes=self.fixes.cut(fixes), headings=headings)
+        return replace(self, wheels=wheels, fixes=self.fixes.cut(fixes), headings=self.headings.cut(samples))
 
 
 @dataclass(frozen=True, slots=True)
