@@ -93,7 +93,7 @@ def plot_formats(text: str) -> tuple[str, ...]:
         return ()
     unknown = [part for part in formats if part not in PLOT_FORMATS]
     if unknown or not formats:
-        raise click.BadParameter(f"{', '.join(unknown) or repr(text)} is not one of {', '.join(PLOT_FORMATS)}, none")
+        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(PLOT_FORMATS)}, none")
     return formats
 
 
