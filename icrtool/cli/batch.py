@@ -64,7 +64,7 @@ def command(
     from icrtool.fleet.fleet_files import PLOTS, write_fleet
     from icrtool.fleet.roll_up import pooled_calibrations
 
-    compared = options.open_baseline(baseline, asked.gates)
+    compared = options.baseline_of(baseline, asked.gates)
     batch = BatchOptions(config_file, robot, sets, asked, redo, timeout_s, overwrite, baseline)
     requests = plan(places, output, batch)
     output.mkdir(parents=True, exist_ok=True)

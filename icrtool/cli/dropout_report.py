@@ -106,7 +106,7 @@ def command(
         "starts": starts, "without_events": without_events, "reference": reference,
     } | ({"seed": seed} if seed is not None else {})  # fmt: skip
     request = Request(
-        config=config, asked=asked, baseline=options.open_baseline(baseline, asked.gates), further=further,
+        config=config, asked=asked, baseline=options.baseline_of(baseline, asked.gates), further=further,
         horizons_m=lengths, outage_s=outages, trials=trials, overwrite=overwrite, quiet=quiet,
         prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip

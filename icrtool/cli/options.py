@@ -151,7 +151,7 @@ def report(command: Command) -> Command:
     )  # fmt: skip
 
 
-def open_baseline(place: Path | None, gates: Sequence[str]) -> Baseline | None:
+def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
     from icrtool.errors import ConfigError

@@ -13,7 +13,7 @@ from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import Odometry, drive_odometry
+from icrtool.estimation.odometry import WheelPaths, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -194,7 +194,7 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
     return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
-def _end_errors(found: Odometry) -> dict[str, Any]:
+def _end_errors(found: WheelPaths) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
     paths = {"icr": found.icr, "no_slip": found.no_slip}
     return {name: {"end_error_m": path.end_error_m} if path is not None else None for name, path in paths.items()}

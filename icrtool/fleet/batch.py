@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import Request, files_of, path_of
-from icrtool.fleet.recordings import Recording, find_recordings
+from icrtool.fleet.recordings import FoundRecording, find_recordings
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
@@ -182,7 +182,7 @@ def _stage(watch: Watch, log: str) -> Callable[[str], None]:
     return lambda stage: watch(log, stage)
 
 
-def _request(one: Recording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
+def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
     config = _config(one, known, options)
     report = options.report
     document = {"config": config.effective(), "version": __version__, "plots": report.plots, "gates": report.gates,
@@ -201,7 +201,7 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions, 
     )  # fmt: skip
 
 
-def _config(one: Recording, known: About, options: BatchOptions) -> Config:
+def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
     """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
     builtin = known.robot in builtin_robots()
     if known.robot and not builtin and known.config is None and options.config_file is None:

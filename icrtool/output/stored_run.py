@@ -13,9 +13,8 @@ import numpy as np
 
 from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, RunError
-from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.split_files import numbered_file, split_path
-from icrtool.output.measurements_file import MEASUREMENTS_FILE, FilterInputs, read_measurements
+from icrtool.output.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
 from icrtool.output.run_directory import (
     CHECKSUM_FILE,
     RUN_FILE,
@@ -25,8 +24,6 @@ from icrtool.output.run_directory import (
     is_run_directory,
 )
 from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
-from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
@@ -68,7 +65,7 @@ def open_run(path: str | Path) -> Run:
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
-        check_run_document(document)
+        run_document = check_run_document(document)
         config = _config(document["config"], directory)
         # Keys that somebody removed have their defaults.
         document["config"] = config.effective()
@@ -77,18 +74,8 @@ def open_run(path: str | Path) -> Run:
             raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
-        losses = _spans(document["rtk_losses_ns"])
-        facts = document["filter"]
-        forward, right = facts["antenna_m"]
-        start = facts["icr_start"]
-        inputs = FilterInputs(
-            document["log"], facts["heading_from_position"], facts["heading_is_estimated"],
-            facts["heading_correlation_s"], (forward, right), losses,
-            tuple(SlipEvent(**{name: event[name] for name in SlipEvent._fields}) for event in document["events"]),
-            None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
-        )  # fmt: skip
         _check_sum(directory, MEASUREMENTS_FILE, sums)
-        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
+        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, run_document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
@@ -96,13 +83,13 @@ def open_run(path: str | Path) -> Run:
             name=document["log"],
             config=config,
             table=table,
-            in_gap=np.isin(table.stamp_ns, _spans(document["wheel_gaps_ns"])[:, 0]),
-            outages_ns=_spans(document["outages_ns"]),
+            in_gap=np.isin(table.stamp_ns, spans_of(run_document["wheel_gaps_ns"])[:, 0]),
+            outages_ns=spans_of(run_document["outages_ns"]),
             sensors=sensors,
             gnss=gnss,
             heading=heading,
             smoothed=smoothed,
-            summary=cast("RunDocument", document),
+            summary=run_document,
             directory=directory,
         )
     except (OSError, StatesFileError, ValueError, OverflowError) as err:
@@ -151,8 +138,8 @@ def newest_run(runs: Path) -> Path:
     return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
 
 
-def check_run_document(document: dict[str, Any]) -> None:
-    """Refuse plain data that is no run.
+def check_run_document(document: dict[str, Any]) -> RunDocument:
+    """Return plain data, which must be that of a run.
 
     Raises
     ------
@@ -172,6 +159,7 @@ def check_run_document(document: dict[str, Any]) -> None:
             raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
     if document["usable"] != (document["unusable_because"] is None):
         raise ValueError("usable and unusable_because contradict each other - at `$`")
+    return cast("RunDocument", document)
 
 
 def _config(document: Mapping[str, Any], directory: Path) -> Config:
@@ -241,7 +229,3 @@ def _check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
         raise RunError(directory, f"{name} is missing or unreadable", FIT_AGAIN) from err
     if found != sums.get(name):
         raise RunError(directory, f"{name} was edited or cut short since the run", FIT_AGAIN)
-
-
-def _spans(pairs: object) -> Ints:
-    return np.array(pairs, np.int64).reshape(-1, 2)

@@ -12,7 +12,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
-from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_errors, trace
+from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_p95, trace
 from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
 
 HIDDEN = frozenset({"trace", "zoom"})
@@ -171,7 +171,7 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
     width = cast(float, request.config.robot.track_width_m)
 
     def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_errors(chunk, width)}
+        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_p95(chunk, width)}
 
     levels = levels_of(request, request.values, lambda base, value: with_sensors(base, gnss_std_m=value))
     columns, records, found = run_levels(levels, request, measure, progress)
