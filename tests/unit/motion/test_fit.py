@@ -11,7 +11,7 @@ from icrtool.calibration.held_out import hold_out
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.fit import Fold, Pool, PooledFit, WindowResiduals, own_constants
-from icrtool.motion.models import MODELS, FittedModel, MotionModel, find_model, twist, wheel_motion
+from icrtool.motion.models import MODELS, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_windows
 from icrtool.motion.trials import cut_trials, predicted_path
 from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors
@@ -69,16 +69,41 @@ def test_window_ends_equal_the_direct_integration() -> None:
         assert errors[start, 1] == pytest.approx(miss, abs=ROUNDING_M)
 
 
-def test_parameters_drawn_from_the_prior_come_back_within_two_standard_deviations() -> None:
-    """Slip that wanders makes the errors of neighbouring windows alike; 200 seeds of each model give 93 to 98 %."""
+def count_within(model: MotionModel, seeds: range, *, gyro: bool = False) -> tuple[int, int]:
+    """Return how many parameters drawn from the prior come back within two standard deviations, and of how many."""
     inside = total = 0
-    for model in FREE:
-        for seed in SEEDS:
-            parameters = draw_parameters(model, np.random.default_rng([seed, 1]))
-            found = fit_to(model, make_recording(model, parameters, seed))
-            miss = np.abs(found.parameters - parameters) / np.sqrt(np.diag(found.covariance))
-            inside, total = inside + int(np.count_nonzero(miss < 2.0)), total + len(miss)
+    for seed in seeds:
+        rng = np.random.default_rng([seed, 1])
+        parameters = draw_parameters(model, rng)
+        made = make_recording(model, parameters, seed, gyro=gyro)
+        found, truth = fit_to(model, made), dict(zip(model.terms, parameters, strict=True))
+        if made.gyro_radps is not None:
+            truth["gyro_scale"] = rng.normal(0.0, TERMS["gyro_scale"].std)
+            scaled = replace(made, gyro_radps=made.gyro_radps / (1.0 + truth["gyro_scale"]))
+            pool = Pool([cut_windows(scaled)], [WIDTH_M])
+            found = pool.fit(model.with_gyro(), pool.fit(model))
+        # the weight of the wheels is no property of the robot
+        rows = [k for k, name in enumerate(found.model.terms) if name in truth]
+        off = found.parameters[rows] - [truth[found.model.terms[k]] for k in rows]
+        inside, total = inside + int(np.count_nonzero(np.abs(off) < 2.0 * found.std[rows])), total + len(rows)
+    return inside, total
+
+
+@pytest.mark.parametrize("gyro", [False, True])
+def test_parameters_drawn_from_the_prior_come_back_within_two_standard_deviations(gyro: bool) -> None:
+    """Slip that wanders makes the errors of neighbouring windows alike."""
+    models, seeds = (FREE[-4:-2], range(6)) if gyro else (FREE, SEEDS)
+    inside, total = np.sum([count_within(model, seeds, gyro=gyro) for model in models], axis=0)
     assert 0.90 <= inside / total <= 0.995
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("gyro", [False, True])
+@pytest.mark.parametrize("model", FREE, ids=lambda model: model.name)
+def test_two_hundred_robots_of_each_model_come_back(model: MotionModel, gyro: bool) -> None:
+    inside, total = count_within(model, range(200), gyro=gyro)
+    print(f"{model.name}, gyro {gyro}: {inside} of {total} within two standard deviations, {inside / total:.3f}")
+    assert 0.90 <= inside / total <= 0.985
 
 
 def test_pooled_recordings_have_constants_of_their_own() -> None:
