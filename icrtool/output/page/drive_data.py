@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import calibrated_model, gyro_recording_of
+from icrtool.calibration.pooled import calibrated, gyro_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
+from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
 from icrtool.kernels.arrays import Bools, Ints
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import predicted_path
@@ -168,7 +168,7 @@ def _headings_data(run: Run) -> dict[str, Any]:
     }
 
 
-def _odometry_data(found: Odometry, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     table = run.table
     extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
 
@@ -220,12 +220,12 @@ def _path(
     if with_gyro and recording.gyro_radps is None:
         return None
     try:
-        fitted, own = calibrated_model(calibration, recording, with_gyro=with_gyro)
+        found = calibrated(calibration, recording, with_gyro=with_gyro)
     except DataError:
         # Too short a drive to find the delay of its wheels.
         return None
     rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
-    heading, place = predicted_path(recording, fitted, own)(recording.t_s[rows])
+    heading, place = predicted_path(recording, *found)(recording.t_s[rows])
     columns = {"forward": place.real, "right": place.imag, "turn": heading}
     return {"every": every, "first_turn": float(heading[0])} | {
         name: packed_sums(column) for name, column in columns.items()

@@ -19,8 +19,8 @@ from icrtool.output.atomic_file import check_place
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
 from icrtool.output.tables.dropout import (
     budget_lines,
-    format_dropout,
     error_text,
+    format_dropout,
     p95_at,
     shown_horizons,
     why_no_trial,
