@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +89,10 @@ def read_measurements(
         The file cannot be read.
     """
     try:
-        with np.load(path) as stored:
-            columns = {name: stored[name] for name in stored.files}
+        with ZipFile(path) as stored:
+            if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
+                raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
+            columns = dict(np.load(path))
         before = _columns(columns, "wheels", WHEEL_COLUMNS)
         stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
@@ -116,7 +118,7 @@ def read_measurements(
             _outcome(columns, group, stamps_ns, table)
             for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
         ]
-    except (BadZipFile, KeyError, EOFError) as err:
+    except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     return sensors, outcomes[0], outcomes[1]
 

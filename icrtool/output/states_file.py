@@ -35,6 +35,9 @@ CHUNKS_A_PIECE = 16
 PARQUET_ROWS = 1 << 17
 """Rows of a row group: a group is held in memory until it is written."""
 
+LARGEST_RATIO, FREE_BYTES = 20, 1 << 26
+"""States may take so many times the size of their file, and so many bytes more: measured numbers shrink to a half."""
+
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
 
@@ -109,6 +112,9 @@ def read_states(path: Path, states: StatesFormat) -> States:
         if states == "parquet":
             import pyarrow.parquet as pq
 
+            numbers = pq.read_metadata(path).num_rows * len(COLUMNS)
+            if 8 * numbers > FREE_BYTES + LARGEST_RATIO * path.stat().st_size:
+                raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
             stored = pq.read_table(path, columns=list(COLUMNS))
         else:
             import pyarrow.csv as pc
@@ -121,7 +127,7 @@ def read_states(path: Path, states: StatesFormat) -> States:
         del stored
         # Each column's memory goes back before the next is copied.
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as err:
+    except pa.ArrowException as err:
         raise StatesFileError(" ".join(str(err).split())) from err
 
 

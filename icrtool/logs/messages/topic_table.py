@@ -331,7 +331,8 @@ class TopicCollector:
         self._settle()
         times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
         self._times, self._columns, self._unreadable = _Column(0), {}, 0
-        order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
+        back = set_back(times)
+        order = np.argsort(times, kind="stable") if back.step_ns > 0 else None
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path in [*gathered]:
@@ -347,13 +348,16 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
-            NOT_SET_BACK if order is None else _set_back(times, order),
+            back,
         )
 
 
-def _set_back(times: Ints, order: Ints) -> SetBack:
-    """Return how stored log times (n,) go back, and what sorting by `order` (n,) does to the stretches between."""
+def set_back(times: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting them does to the stretches between."""
     steps = np.diff(times)
+    if not (steps < 0).any():
+        return NOT_SET_BACK
+    order = np.argsort(times, kind="stable")
     stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
     return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))

@@ -62,6 +62,27 @@ def test_a_definition_without_end_is_refused_and_costs_only_its_topic(definition
     assert time.process_time() - begin < LONGEST_S
 
 
+IDL = "module sensor_msgs {{ module msg {{ {} struct Imu {{ {} x; }}; }}; }};"
+SLOW_IDL = {
+    "parentheses": IDL.format("const long A = " + "(" * 6 + "1" + ")" * 6 + ";", "double"),
+    "parentheses of a bound": IDL.format("", "sequence<double, " + "(" * 6 + "1" + ")" * 6 + ">"),
+    "sequences": IDL.format("", "sequence<" * 40 + "double" + ">" * 40),
+    "strings": IDL.format("const string A = " + '"a" ' * 60_000 + ";", "double"),
+    "annotations": IDL.format('@verbatim (text="' * 3000, "double"),
+    "comments": IDL.format("/*" * 100_000, "double"),
+    "arrays": IDL.format("", "double a[1];" * 20_000 + "double"),
+}
+
+
+@pytest.mark.parametrize("definition", SLOW_IDL.values(), ids=SLOW_IDL)
+def test_a_definition_in_idl_is_parsed_in_time_or_refused(definition: str) -> None:
+    channel = Channel(0, LogText("/imu"), LogText(IMU), LogText("cdr"), definition, "idl")
+    begin = time.process_time()
+    with suppress(DefinitionError):
+        collector_for(channel, ("x",))
+    assert time.process_time() - begin < LONGEST_S
+
+
 @pytest.mark.parametrize("kind", [SEQUENCE, ARRAY])
 def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     inner = {"x/msg/E": ([], [])}
@@ -72,7 +93,7 @@ def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     fields = [("l", (NAME, "x/msg/L5")), ("v", (BASE, ("float64", 0)))]
     layout = compile_layout({**inner, "x/msg/Top": ([], fields)}, "x/Top", ("v",), "ros1")
     data = np.tile(np.array([200, 0, 0, 0], np.uint8), 250)
-    decode_messages(layout, data[:0], np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
+    decode_messages(layout, data, np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
     begin = time.process_time()
     _, readable = decode_messages(layout, data, np.array([0]), np.array([len(data)]))
     assert not readable.any()
@@ -363,7 +384,8 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"\d[\d,]*(?= |;)", row)]
     assert stated == [
-        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, schema.DEEPEST, schema.MOST_FIELDS,
+        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
+        sqlite_bag._LARGEST_MESSAGE_BYTES, schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
