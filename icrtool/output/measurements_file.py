@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, NamedTuple
-from zipfile import ZIP_STORED, BadZipFile, ZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ def read_measurements(
         with ZipFile(path) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
                 raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
-            columns = dict(np.load(path))
+            columns = {member.filename.removesuffix(".npy"): _array(stored, member) for member in stored.infolist()}
         before = _columns(columns, "wheels", WHEEL_COLUMNS)
         stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
@@ -118,9 +119,14 @@ def read_measurements(
             _outcome(columns, group, stamps_ns, table)
             for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
         ]
-    except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError) as err:
+    except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     return sensors, outcomes[0], outcomes[1]
+
+
+def _array(stored: ZipFile, member: ZipInfo) -> NDArray[Any]:
+    with stored.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _names(record: type) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ import orjson
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.logs.containers.decompress import LARGEST_RATIO
 from icrtool.records.tables import States
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ CHUNKS_A_PIECE = 16
 PARQUET_ROWS = 1 << 17
 """Rows of a row group: a group is held in memory until it is written."""
 
-LARGEST_RATIO, FREE_BYTES = 20, 1 << 26
-"""States may take so many times the size of their file, and so many bytes more: measured numbers shrink to a half."""
+FREE_BYTES = 1 << 29
+"""States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
 
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""

@@ -15,8 +15,8 @@ from icrtool.records.text import LONGEST_NAME, shortened
 _SEPARATOR = "=" * 80 + "\n"
 LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
 """Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
-LONGEST_IDL = 1 << 14
-"""The same in IDL, without comments; the longest known one has 4,000."""
+LONGEST_IDL, MOST_NUMBERS = 1 << 16, 512
+"""Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
 
 _COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
@@ -91,8 +91,11 @@ def _parse(text: str, written: Literal["msg", "idl"], message_type: str) -> Defi
             return get_types_from_msg(text, full_name(message_type))
         parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
         plain = [_plain_idl(part.split("\n", 1)[1]) for part in parts]
-        if sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
-            why = f"the definition in the log has an expression, or is longer than {LONGEST_IDL} characters"
+        numbers = sum(part.count(sign) for part in plain for sign in "[<=")
+        if numbers > MOST_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
+            why = (
+                f"its definition has expressions, {MOST_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
+            )
             raise DefinitionError(message_type, why, "this type is not read")
         types: dict[str, Any] = {}
         for part in plain:

@@ -29,6 +29,9 @@ _FIRST_ROWS = 64
 _MOST_EXPECTED = 1 << 22
 """Numbers of a column that memory is set aside for on the log's word alone."""
 
+MOST_TEXTS = 1 << 16
+"""Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
+
 _LARGEST_TABLE = 1 << 22
 _MOST_BYTES_AT_ONCE = 1 << 24
 """Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
@@ -82,8 +85,13 @@ class TopicTable:
         return len(self.log_time_ns)
 
     def find(self, *paths: str) -> NDArray[Any] | None:
-        """Return the first of these columns that the type has: drivers spell a field ``hAcc`` or ``h_acc``."""
-        return next((self.columns[path] for path in paths if path in self.columns), None)
+        """Return the first of these columns of numbers that the type has: drivers spell ``hAcc`` or ``h_acc``."""
+        return next((self.columns[path] for path in paths if path in self.columns and path not in self.texts), None)
+
+    def integers(self, *paths: str) -> Ints | None:
+        """Return what `find` does; None where the log's own definition has no whole numbers there."""
+        values = self.find(*paths)
+        return values if values is not None and values.dtype.kind == "i" else None
 
     def column(self, *paths: str) -> NDArray[Any]:
         """Return the first of these columns of numbers that the type has.
@@ -93,7 +101,7 @@ class TopicTable:
         DefinitionError
             The type, as the log defines it, has none of them.
         """
-        values = self.find(*(path for path in paths if path not in self.texts))
+        values = self.find(*paths)
         if values is None:
             raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
         return values
@@ -243,7 +251,13 @@ class TopicCollector:
         return self._layout
 
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
-        """Add the chosen messages of a block."""
+        """Add the chosen messages of a block.
+
+        Raises
+        ------
+        DefinitionError
+            They take too many columns, or have too many different texts.
+        """
         start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
         for rows in _pieces(end - start, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1)):
             self._feed(block, start[rows], end[rows], times[rows])
@@ -291,6 +305,8 @@ class TopicCollector:
                     place, length = int(entries[row, 0]), int(entries[row, 1])
                     raw = block.data[place : place + length].tobytes()
                     texts[code] = LogText(raw.decode("utf-8", "replace"))
+        if len(texts) > MOST_TEXTS:
+            raise DefinitionError(self.channel.topic, f"its {path} has over {MOST_TEXTS} different texts", "not read")
 
     def _settle(self) -> None:
         """Turn the filled rows into columns, and free the rows."""

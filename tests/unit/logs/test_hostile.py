@@ -377,7 +377,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.fleet import manifest
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, sqlite_bag
-    from icrtool.logs.messages import schema
+    from icrtool.logs.messages import schema, topic_table
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
@@ -386,6 +386,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     assert stated == [
         decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
         sqlite_bag._LARGEST_MESSAGE_BYTES, schema.DEEPEST, schema.MOST_FIELDS,
-        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
+        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, topic_table.MOST_TEXTS,
+        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip

@@ -6,10 +6,13 @@ import copy
 import hashlib
 import json
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
+import numpy as np
 import pytest
 
 import icrtool
@@ -17,12 +20,14 @@ from icrtool.errors import IcrToolError
 from icrtool.output.calibration_file import open_calibration
 from icrtool.output.json_file import json_bytes
 from icrtool.output.run_directory import events_csv
+from icrtool.output.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.stored_run import log_of
 from icrtool.output.tables.run import format_run
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "tracked_curved.bag"
 WRONG: list[Any] = [None, -1, 1e300, float("nan"), 10**30, "\x1b[2J", [], {"a": 1}, [[None]]]
 LONGEST_LINE = 1000
+LONGEST_S = 5.0
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +159,66 @@ def test_a_page_of_an_edited_run_is_refused_in_one_line(
     with pytest.raises(IcrToolError, match="is not as this version of icrtool writes it"):
         command.main(["report", str(place), "-o", str(tmp_path / "x.html")], standalone_mode=False)
     assert not (tmp_path / "x.html").exists()
+
+
+def as_npy(file: Path, columns: dict[str, np.ndarray]) -> None:
+    with file.open("wb") as stream:
+        np.save(stream, columns["fixes_stamp_ns"])
+
+
+def compressed(file: Path, columns: dict[str, np.ndarray]) -> None:
+    np.savez_compressed(file, **{**columns, "fixes_stamp_ns": np.zeros(1_000_000, np.int64)})
+
+
+def with_header(file: Path, columns: dict[str, np.ndarray], header: bytes) -> None:
+    """Write the columns, one of which states another shape or type."""
+    np.savez(file, **columns)
+    with ZipFile(file) as stored:
+        members = {name: stored.read(name) for name in stored.namelist()}
+    members["fixes_stamp_ns.npy"] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with ZipFile(file, "w") as stored:
+        for name, content in members.items():
+            stored.writestr(name, content)
+
+
+MEASUREMENTS = {
+    "an array": as_npy,
+    "text": lambda file, _: file.write_text("PK"),
+    "compressed": compressed,
+    "a shape": lambda file, columns: with_header(
+        file, columns, b"{'descr': '<i8', 'fortran_order': False, 'shape': (10000000000000,)}\n"
+    ),
+    "nested": lambda file, columns: with_header(file, columns, b"[" * 5000 + b"\n"),
+    "pickled": lambda file, columns: np.savez(file, **{**columns, "fixes_stamp_ns": np.array([{}], object)}),
+    "two axes": lambda file, columns: np.savez(file, **{**columns, "fixes_north_m": np.zeros((3, 3))}),
+}
+
+
+@pytest.mark.parametrize("write", MEASUREMENTS.values(), ids=MEASUREMENTS)
+def test_measurements_that_were_replaced_are_refused(run_place: Path, tmp_path: Path, write: Any) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    write(place / "measurements.npz", dict(np.load(place / "measurements.npz")))
+    write_run(place, (place / "run.json").read_bytes())
+    begin = time.process_time()
+    with pytest.raises(IcrToolError) as err:
+        icrtool.open_run(place)
+    assert str(err.value).isprintable()
+    assert time.process_time() - begin < LONGEST_S
+
+
+@pytest.mark.parametrize("rows", [0, 5_000_000])
+def test_states_of_no_row_or_far_too_many_are_refused(run_place: Path, tmp_path: Path, rows: int) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    (place / "states.csv").unlink()
+    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
+    part = pa.table({name: pa.repeat(pa.scalar(0, kind), rows // 5) for name, kind in types.items()})
+    with pq.ParquetWriter(place / "states.parquet", part.schema) as writer:
+        for _ in range(5 if rows else 0):
+            writer.write_table(part)
+    (place / "B2SUMS").write_text((place / "B2SUMS").read_text().replace("states.csv", "states.parquet"))
+    write_run(place, (place / "run.json").read_bytes())
+    with pytest.raises(IcrToolError, match="too many for its size" if rows else "cannot be read"):
+        icrtool.open_run(place)
