@@ -150,7 +150,7 @@ class SqliteBag:
         Raises
         ------
         sqlite3.DatabaseError
-            A table of a recorder is a view, a virtual table, or has computed columns.
+            A table of a recorder is a view, a virtual table, or has computed columns; or texts are not UTF-8.
         """
         query = "SELECT name, type FROM pragma_table_list WHERE schema = 'main' AND NOT wr"
         kinds = {name: kind for name, kind in self._database.execute(query).fetchmany(_MOST_TOPICS) if name in _TABLES}
@@ -158,6 +158,8 @@ class SqliteBag:
             columns = self._database.execute(f"PRAGMA table_xinfo({name})").fetchall()
             if kind != "table" or any(column[-1] for column in columns):
                 raise sqlite3.DatabaseError(f"{name} is not a plain table")
+        if (encoding := self._database.execute("PRAGMA encoding").fetchone()[0]) != "UTF-8":
+            raise sqlite3.DatabaseError(f"its texts are {encoding}")  # messages are joined as texts
         self._tables = frozenset(kinds)
         self._database.set_authorizer(_allow)
         self._database.set_progress_handler(self._look_up, _STEPS)
@@ -313,14 +315,16 @@ class SqliteBag:
             f"FROM messages WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) {within} AND rowid > ? "
             "ORDER BY rowid LIMIT ?"
         )
-        one = f"SELECT topic, time, length(sound), sound, number, sound IS NOT NULL FROM ({rows})"  # noqa: S608
         joined = (
             "SELECT group_concat(topic), group_concat(time), group_concat(length(sound)), "  # noqa: S608
             f"CAST(group_concat(sound, '') AS BLOB), max(number), count(sound) FROM ({rows})"
         )
 
         def batch(after: int, count: int) -> tuple[Block | None, int | None]:
-            row = self._query(joined if count > 1 else one, (after, count)).fetchone()
+            row = self._query(joined if count > 1 else rows, (after, count)).fetchone()
+            if row is not None and count == 1:
+                topic, time, data, number = row
+                row = (topic, time, len(data or b""), data, number, 1)
             return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
 
         return batch

@@ -146,6 +146,8 @@ SCHEMAS = {
     "SELECT 1 AS topic_id, i AS timestamp, x'00' AS data FROM r",
     "computed columns": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, "
     "data BLOB AS (zeroblob(250000000)))",
+    "texts in UTF-16": "PRAGMA encoding = 'UTF-16le'; CREATE TABLE messages(id INTEGER PRIMARY KEY, "
+    "topic_id, timestamp, data)",
     "no row numbers": "CREATE TABLE messages(id TEXT PRIMARY KEY, topic_id, timestamp, data) WITHOUT ROWID",
 }
 
@@ -155,8 +157,8 @@ def test_only_plain_tables_are_read(tmp_path: Path, schema: str) -> None:
     path = tmp_path / "log.db3"
     database = sqlite3.connect(path)
     database.executescript(
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
-        f"INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr'); {schema};"
+        f"{schema}; CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr');"
     )
     if "rowid TEXT" in schema:
         database.execute("INSERT INTO messages VALUES ('x', 1, 2, x'00')")
