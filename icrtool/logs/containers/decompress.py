@@ -12,11 +12,11 @@ from icrtool.logs.containers.channel import Block
 
 Buffer = bytes | bytearray
 
-LARGEST_CHUNK_BYTES = 1 << 28
-"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; a chunk that states more is damaged."""
+LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; two are in memory at a time."""
 
-LARGEST_RATIO, FREE_BYTES = 100, 1 << 27
-"""A log may take this many times its size when decompressed, and so many bytes more.
+LARGEST_RATIO = 100
+"""A log may take this many times its size when decompressed, and `FREE_BYTES` more.
 
 Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
 """
@@ -77,7 +77,9 @@ class Inflation:
             raise DecompressionError(f"it claims {unpacked} bytes")
         left = self._left + LARGEST_RATIO * packed - unpacked
         if left < 0:
-            raise DecompressionError(f"{packed} bytes would inflate to {unpacked}, {LARGEST_RATIO} times are allowed")
+            raise DecompressionError(
+                f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
+            )
         self._left = left
 
 
