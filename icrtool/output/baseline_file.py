@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -153,7 +154,7 @@ def _fleet_baseline(path: Path) -> Baseline:
     """Return the baseline of a batch: its fleet.json names logs, content and runs."""
     reports = {one.log: path / one.run / DROPOUT_DIRECTORY / REPORT_FILE for one in logs_of_fleet(path)}
     files = {one.log: tuple(file.sha256 for file in one.inputs) for one in logs_of_fleet(path)}
-    present = {log: file for log, file in reports.items() if file.is_file()}
+    present = {log: file for log, file in reports.items() if os.path.isfile(file)}  # noqa: PTH113 - any text may be a path here
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
     digest = sha256((path / FLEET_FILE).read_bytes()).hexdigest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 
@@ -27,7 +27,7 @@ class FleetLog(msgspec.Struct, frozen=True):
     """What fleet.json holds of a log, as others need it; `run`: its directory below that of the batch."""
 
     log: str
-    run: Annotated[str, msgspec.Meta(pattern="^[^\\x00]*$", max_length=4000)]
+    run: str
     status: str
     robot: str
     group: str

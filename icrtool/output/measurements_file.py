@@ -25,6 +25,9 @@ MEASUREMENTS_FILE = "measurements.npz"
 
 OUTCOME_COLUMNS = ("nis", "code", "difference")
 
+LARGEST = 1e30
+"""Of a measurement: squares of larger numbers overflow."""
+
 KINDS = {
     "stamp_ns": np.int64,
     "fix_class": np.uint8,
@@ -145,6 +148,8 @@ def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[A
     column, kind = columns[key], KINDS.get(name, np.float64)
     if column.ndim != 1 or column.dtype != kind:
         raise ValueError(f"{key} is no column of {np.dtype(kind)}")
+    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST).any():
+        raise ValueError(f"{key} holds a number beyond {LARGEST:g}")
     return column
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -23,9 +21,9 @@ from icrtool.output.run_directory import events_csv
 from icrtool.output.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.stored_run import log_of
 from icrtool.output.tables.run import format_run
+from support.edits import edited
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "tracked_curved.bag"
-WRONG: list[Any] = [None, -1, 1e300, float("nan"), 10**30, "\x1b[2J", [], {"a": 1}, [[None]]]
 LONGEST_LINE = 1000
 LONGEST_S = 5.0
 
@@ -36,30 +34,6 @@ def run_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("edited") / "run"
     icrtool.fit(icrtool.read_log(LOG, config), config).write(place, plots=())
     return place
-
-
-def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Every place in plain data; of a list its first element."""
-    if here:
-        yield here
-    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
-    for key, item in items:
-        yield from places(item, (*here, key))
-
-
-def edited(document: dict[str, Any], every: int = 1) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The document with one place removed or replaced; which of both, and by what, differs from place to place."""
-    for number, place in list(enumerate(places(document)))[::every]:
-        for wrong in (WRONG[number % len(WRONG)], ("removed", WRONG[(7 * number + 3) % len(WRONG)])[number % 2]):
-            changed = copy.deepcopy(document)
-            outer: Any = changed
-            for key in place[:-1]:
-                outer = outer[key]
-            if wrong == "removed":
-                del outer[place[-1]]
-            else:
-                outer[place[-1]] = copy.deepcopy(wrong)
-            yield f"{place}: {wrong!r}", changed
 
 
 def write_run(place: Path, document: object) -> None:
@@ -190,6 +164,9 @@ MEASUREMENTS = {
     ),
     "nested": lambda file, columns: with_header(file, columns, b"[" * 5000 + b"\n"),
     "pickled": lambda file, columns: np.savez(file, **{**columns, "fixes_stamp_ns": np.array([{}], object)}),
+    "a huge number": lambda file, columns: np.savez(
+        file, **{**columns, "headings_heading_rad": columns["headings_heading_rad"] + 1e300}
+    ),
     "two axes": lambda file, columns: np.savez(file, **{**columns, "fixes_north_m": np.zeros((3, 3))}),
 }
 
