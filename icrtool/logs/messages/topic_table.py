@@ -23,8 +23,8 @@ _LARGEST_CAPACITY = 256
 _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
-_FIRST_ROWS = 64
-"""Rows of a topic's first table; the next ones have twice as many: a log may hold thousands of topics."""
+_FIRST_ROWS, _FIRST_NUMBERS = 64, 4096
+"""Of a topic's first table, at most; the next ones have twice as many rows: a log may hold thousands of topics."""
 
 _MOST_EXPECTED = 1 << 22
 """Numbers of a column that memory is set aside for on the log's word alone."""
@@ -290,21 +290,23 @@ class TopicCollector:
 
     def _more_rows(self) -> int:
         """Return the rows of the next table: twice those of the present one, within bounds."""
-        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1))
-        return min(max(2 * len(self._rows.table), _FIRST_ROWS), most)
+        columns = max(self.layout.columns, 1)
+        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // columns, 1))
+        return min(max(2 * len(self._rows.table), min(_FIRST_ROWS, _FIRST_NUMBERS // columns), 1), most)
 
     def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
         """Learn the texts of a text field that are in some rows and were not seen before."""
         slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
         counts = self.layout.counts(new, path)
-        for i in range(min(slot.repeat, int(counts.max(initial=0)))):
-            entries = new[counts > i, slot.column + i * slot.stride :]
-            codes, first = np.unique(entries[:, 2], return_index=True)
-            for code, row in zip(codes.tolist(), first.tolist(), strict=True):
-                if code not in texts:
-                    place, length = int(entries[row, 0]), int(entries[row, 1])
-                    raw = block.data[place : place + length].tobytes()
-                    texts[code] = LogText(raw.decode("utf-8", "replace"))
+        repeat = min(slot.repeat, int(counts.max(initial=0)))
+        held = np.arange(repeat)[:, None] < counts
+        fields = new[:, slot.column : slot.column + (repeat - 1) * slot.stride + 3].T
+        places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
+        _, first = np.unique(codes, return_index=True)
+        for i in np.sort(first).tolist():
+            if (code := int(codes[i])) not in texts:
+                raw = block.data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
+                texts[code] = LogText(raw.decode("utf-8", "replace"))
         if len(texts) > MOST_TEXTS:
             raise DefinitionError(self.channel.topic, f"its {path} has over {MOST_TEXTS} different texts", "not read")
 
