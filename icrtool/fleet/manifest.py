@@ -47,7 +47,7 @@ class About:
         )
 
 
-class _Line(msgspec.Struct):
+class _Line(msgspec.Struct, forbid_unknown_fields=True):
     """A line as it is written."""
 
     log: Annotated[str, msgspec.Meta(min_length=1)]
@@ -131,12 +131,11 @@ def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
 
 
 def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
-    if unknown := set(row) - set(COLUMNS):
-        raise ConfigError(f"{path}: {min(unknown)}", "unknown column", f"a manifest has {', '.join(COLUMNS)}")
     try:
         line = msgspec.convert(row, _Line)
     except msgspec.ValidationError as err:
-        raise ConfigError(f"{path}: log", "each line needs a log or a pattern, and texts", str(err)) from err
+        what = f"each line has a log or a pattern, and texts; of {', '.join(COLUMNS)}"
+        raise ConfigError(f"{path}: log", what, str(err)) from err
     config = path.parent / line.config.strip() if line.config.strip() else None
     return Entry(_matching(path, line.log), About(line.robot.strip(), config, line.group.strip(), tuple(line.tags)))
 

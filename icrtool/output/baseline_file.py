@@ -152,13 +152,13 @@ def _number(value: float | None) -> float:
 
 def _fleet_baseline(path: Path) -> Baseline:
     """Return the baseline of a batch: its fleet.json names logs, content and runs."""
-    reports = {one.log: path / one.run / DROPOUT_DIRECTORY / REPORT_FILE for one in logs_of_fleet(path)}
-    files = {one.log: tuple(file.sha256 for file in one.inputs) for one in logs_of_fleet(path)}
-    present = {log: file for log, file in reports.items() if os.path.isfile(file)}  # noqa: PTH113 - any text may be a path here
+    logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
+    present = {log: found for log, found in logs.items() if os.path.isfile(found[0])}  # noqa: PTH113 - any text may be a path here
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
+    files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
     digest = sha256((path / FLEET_FILE).read_bytes()).hexdigest()
-    return Baseline(path, present, {log: files[log] for log in present}, digest)
+    return Baseline(path, {log: file for log, (file, _) in present.items()}, files, digest)
 
 
 def _report_files(path: Path) -> list[Path]:

@@ -20,14 +20,11 @@ from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
-from icrtool.records.tables import States
+from icrtool.records.tables import LARGEST, States
 
 MEASUREMENTS_FILE = "measurements.npz"
 
 OUTCOME_COLUMNS = ("nis", "code", "difference")
-
-LARGEST = 1e30
-"""Of a measurement: squares of larger numbers overflow."""
 
 KINDS = {
     "stamp_ns": np.int64,

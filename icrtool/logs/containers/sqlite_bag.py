@@ -92,19 +92,18 @@ class SqliteBag:
 
     def begin_ns(self) -> int | None:
         """Return the time of the first message, None where it cannot be read."""
-        try:
-            begin = self._query("SELECT min(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
-        except _DAMAGE:
-            return None
-        return begin if isinstance(begin, int) else None
+        return self._time("min")
 
     def end_ns(self) -> int | None:
         """Return the time of the last message, None where it cannot be read."""
+        return self._time("max")
+
+    def _time(self, which: str) -> int | None:
         try:
-            end = self._query("SELECT max(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
+            time = self._query(f"SELECT {which}(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]  # noqa: S608
         except _DAMAGE:
             return None
-        return end if isinstance(end, int) else None
+        return time if isinstance(time, int) else None
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""

@@ -27,6 +27,9 @@ MOST_JOINTS = 100
 MOST_INTERFACES = 32
 """A message with more joints is treated as damaged; of more interfaces per joint only the first ones are read."""
 
+MOST_LAYOUTS = 16
+"""Different numbers of joints in the messages of a topic; each takes about 0.1 s. Messages with others are not read."""
+
 _LISTS = "interface_values"
 _JOINTS = "number of joints"
 _NAMES = "joint_names[*]"
@@ -85,7 +88,10 @@ class DynamicJointCollector:
         joints = self._counter.numbers(table, _JOINTS)
         readable &= joints <= MOST_JOINTS
         self._unreadable += len(readable) - int(np.count_nonzero(readable))
-        for number in np.unique(joints[readable]):
+        for number, count in zip(*np.unique(joints[readable], return_counts=True), strict=True):
+            if int(number) not in self._collectors and len(self._collectors) > MOST_LAYOUTS:
+                self._unreadable += int(count)
+                continue
             alike = np.zeros(len(chosen), np.bool_)
             alike[places[readable & (joints == number)]] = True
             collector = self._collector(int(number))

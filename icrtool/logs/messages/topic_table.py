@@ -14,6 +14,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_into, empty_table
 from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
@@ -25,9 +26,6 @@ _ROWS_AT_ONCE = 16_384 + 8
 
 _FIRST_ROWS, _FIRST_NUMBERS = 64, 4096
 """Of a topic's first table, at most; the next ones have twice as many rows: a log may hold thousands of topics."""
-
-_MOST_EXPECTED = 1 << 22
-"""Numbers of a column that memory is set aside for on the log's word alone."""
 
 MOST_TEXTS = 1 << 16
 """Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
@@ -158,55 +156,6 @@ class _Rows:
         )
 
 
-class _Column:
-    """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
-
-    Parameters
-    ----------
-    lacking : what integers are where a row has fewer elements than others; floats are NaN there
-    """
-
-    def __init__(self, lacking: int) -> None:
-        self._lacking = lacking
-        self._rows = 0
-        self._values: NDArray[Any] = np.empty(0, np.int64)
-
-    def add(self, part: NDArray[Any], expected: int) -> None:
-        """Add rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
-        before, held = self._rows, self._values
-        self._rows += len(part)
-        one = _single_row(part)
-        if before == 0:
-            self._values = part if one is None else one
-        elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
-            width = max(part.shape[1:], held.shape[1:])
-            if len(held) < self._rows or width > held.shape[1:]:
-                likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
-                self._values = np.empty((*width, max(2 * before, self._rows, likely)), held.dtype).T
-                self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
-            self._put(before, part)
-
-    def _put(self, begin: int, part: NDArray[Any]) -> None:
-        rows = self._values[begin : begin + len(part)]
-        if part.ndim == 2 and part.shape[1] < rows.shape[1]:
-            rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
-            rows = rows[:, : part.shape[1]]
-        rows[...] = part
-
-    def taken(self) -> NDArray[Any]:
-        """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
-        values = self._values
-        return values[: self._rows] if len(values) > 1 else np.broadcast_to(values, (self._rows, *values.shape[1:]))
-
-
-def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
-    """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
-    bits = rows.view(np.int64)
-    if len(rows) == 0 or np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]):
-        return None
-    return rows[:1].copy()
-
-
 @dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
@@ -225,8 +174,8 @@ class TopicCollector:
     _layout: Layout | None = None
     _source: str = ""
     _rows: _Rows = field(default_factory=_Rows)
-    _times: _Column = field(default_factory=lambda: _Column(0))
-    _columns: dict[str, _Column] = field(default_factory=dict)
+    _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
+    _columns: dict[str, GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
@@ -324,7 +273,7 @@ class TopicCollector:
         for path, slot in self.layout.slots.items():
             is_text = slot.kind == "string"
             values = (self._text_numbers if is_text else self.layout.numbers)(table, path)
-            self._columns.setdefault(path, _Column(-1 if is_text else 0)).add(values, expected)
+            self._columns.setdefault(path, GrowingColumn(-1 if is_text else 0)).add(values, expected)
         rows.filled = 0
 
     def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
@@ -348,7 +297,7 @@ class TopicCollector:
         """Return what was gathered since the last call, sorted by log time."""
         self._settle()
         times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
-        self._times, self._columns, self._unreadable = _Column(0), {}, 0
+        self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
         back = set_back(times)
         order = np.argsort(times, kind="stable") if back.step_ns > 0 else None
         columns: dict[str, NDArray[Any]] = {}
