@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes
 from icrtool.logs.containers.channel import Block
 
-LARGEST_CHUNK_BYTES = 1 << 28
-"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; a chunk that states more is damaged."""
+LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; two are in memory at a time."""
 
 LARGEST_RATIO = 100
-"""A log may take this many times its size when decompressed, and one chunk of the largest size more."""
+"""A log may take this many times its size when decompressed, and `FREE_BYTES` more.
+
+Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
+"""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_BLOCK_BYTES = 1 << 24
-_UNKNOWN_SIZE_BYTES = 1 << 24
+_PIECE_BYTES = 1 << 24
+"""Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
+
+
+class DecompressionError(Exception):
+    """A chunk that cannot be decompressed; `args[0]` is the reason."""
 
 
 class Space:
@@ -35,17 +43,13 @@ class Space:
 
 
 class Inflation:
-    """Counts the bytes decompressed from a log, and limits them to a multiple of their size in the file.
-
-    Recorded chunks shrink by a factor of 2 to 20. A crafted chunk can grow by 1,000 times; a thousand such chunks would
-    take minutes.
-    """
+    """Decompresses the chunks of a log, and limits them all to a multiple of their size in the file."""
 
     def __init__(self) -> None:
-        self._left = LARGEST_CHUNK_BYTES
+        self._left = FREE_BYTES
         self._space = Space()
 
-    def decompress(self, data: memoryview, compression: str, size: int, *, partial: bool = False) -> Bytes:
+    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> Bytes:
         """Decompress a chunk.
 
         Parameters
@@ -61,14 +65,10 @@ class Inflation:
         Raises
         ------
         DecompressionError
-            Damaged data, a size other than `size`, or an unknown compression; or the chunks before this one inflated
-            more than `LARGEST_RATIO` times and one chunk.
+            Damaged data, a size other than `size`, an unknown compression, or more than the log may take.
         """
-        self.check()
-        if compression in ("", "none"):
-            size = len(data)
-        if size > LARGEST_CHUNK_BYTES:
-            raise DecompressionError(f"it claims {size} bytes")
+        stored = compression in ("", "none")
+        self.count(len(data), len(data) if stored else size)
         try:
             match compression:
                 case "" | "none":
@@ -78,20 +78,19 @@ class Inflation:
                 case "lz4":
                     import lz4.frame
 
-                    out = np.frombuffer(lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1), np.uint8)
+                    out = _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
                 case "bz2":
-                    out = np.frombuffer(bz2.BZ2Decompressor().decompress(data, size + 1), np.uint8)
+                    out = _in_pieces(bz2.BZ2Decompressor(), data, size)
                 case _:
                     raise DecompressionError(f"compression {compression!r} is not known")
         except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
             raise DecompressionError(str(err) or "not enough memory") from err
-        if len(out) != size and not partial:
+        if len(out) != size and not partial and not stored:
             raise DecompressionError(f"{len(out)} bytes instead of {size}")
-        self.add(len(data), len(out))
         out.flags.writeable = False  # as that of a database: the kernels are compiled once
         return out
 
-    def _zstd(self, data: memoryview, size: int, *, partial: bool) -> Bytes:
+    def _zstd(self, data: bytes | memoryview, size: int, *, partial: bool) -> Bytes:
         import zstandard
 
         out = self._space.of(size + 1)
@@ -102,24 +101,34 @@ class Inflation:
         except zstandard.ZstdError as err:
             raise DecompressionError(str(err)) from err
 
-    def check(self) -> None:
-        """Refuse to decompress more, where what was decompressed is too much.
+    def count(self, packed: int, unpacked: int) -> None:
+        """Count what is decompressed [bytes].
 
         Raises
         ------
         DecompressionError
-            As `decompress`.
+            It is more than one chunk, or the log, may take.
         """
-        if self._left < 0:
-            raise DecompressionError(f"the log inflates more than {LARGEST_RATIO} times")
+        if unpacked > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {unpacked} bytes")
+        left = self._left + LARGEST_RATIO * packed - unpacked
+        if left < 0:
+            raise DecompressionError(
+                f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
+            )
+        self._left = left
 
-    def add(self, packed: int, unpacked: int) -> None:
-        """Count what was decompressed [bytes]."""
-        self._left += LARGEST_RATIO * packed - unpacked
 
-
-class DecompressionError(Exception):
-    """A chunk that cannot be decompressed; `args[0]` is the reason."""
+def _in_pieces(decoder: Any, data: bytes | memoryview, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
+    """Decompress up to `size` bytes and one more, a piece at a time."""
+    out = bytearray(decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES)))
+    while (
+        len(out) >= _PIECE_BYTES
+        and not decoder.eof
+        and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES)))
+    ):
+        out += piece
+    return np.frombuffer(out, np.uint8)
 
 
 def unpack_messages(
@@ -147,7 +156,7 @@ def unpack_messages(
             rows.append(row)
             messages.append(message)
             held += len(message)
-            if held > _BLOCK_BYTES:
+            if held > _PIECE_BYTES:
                 yield _repacked(block, rows, messages)
                 rows, messages, held = [], [], 0
         yield _repacked(block, rows, messages)
@@ -169,13 +178,13 @@ def _unpack(data: bytes, compression: str, inflation: Inflation) -> bytes:
 
     if compression != "zstd":
         raise DecompressionError(f"compression {compression!r} is not known")
-    inflation.check()
     try:
         size = zstandard.frame_content_size(data)
-        if size > LARGEST_CHUNK_BYTES:
-            raise DecompressionError(f"one claims {size} bytes")
-        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=_UNKNOWN_SIZE_BYTES if size < 0 else 0)
+        if size >= 0:
+            inflation.count(len(data), size)
+        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=_PIECE_BYTES)
+        if size < 0:
+            inflation.count(len(data), len(out))
     except (zstandard.ZstdError, MemoryError) as err:
         raise DecompressionError(str(err)) from err
-    inflation.add(len(data), len(out))
     return out
