@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.cli.compare import _groups
-from icrtool.errors import LogError
+from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
 from icrtool.fleet.row import File, Row
@@ -76,7 +76,7 @@ def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
     write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice")], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
-    with pytest.raises(LogError):
+    with pytest.raises(RunError):
         runs_of_fleet(place / "runs")
 
 
