@@ -45,7 +45,6 @@ def align(log: RobotLog, config: Config) -> Measurements:
     wheels, heading, delays = found.wheels, found.heading, found.delays
     quality = grade_fixes(found.log, config, found.fix_steps)
     aligned = sensors_as_sent(quality.log, config)
-    sense, offset = heading.remaining
     sensors = replace(
         aligned,
         fixes=replace(
@@ -56,7 +55,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         ),
         headings=replace(
             aligned.headings,
-            heading_rad=sense * aligned.headings.heading_rad - offset,
+            heading_rad=aligned.headings.heading_rad - heading.remaining_offset_rad,
             var_rad2=quality.log.heading.var_rad2
             if heading.is_estimated
             else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
@@ -88,7 +87,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         clock_std_s=delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
         warnings=(
-            *(warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings),
+            *(warning for part in (quality.log, found, quality) for warning in part.warnings),
             *notes,
         ),
     )
@@ -103,14 +102,13 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
         Streams that cannot be used together.
     """
     check_streams(log)
-    topics = {stream.role: stream.topic for stream in log.streams}
     return SensorData(
         name=log.name,
         wheels=log.wheels,
         fixes=_fixes(log.gnss, config),
         headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
         gyro=log.gyro,
-        heading_from_position="heading" in topics and topics["heading"] == topics.get("gnss"),
+        heading_from_position=log.heading_is_of_position,
         heading_correlation_s=config.filter.heading_correlation_s,
         antenna_m=_antenna_m(log, config),
         losses_ns=np.empty((0, 2), np.int64),

@@ -15,12 +15,13 @@ forward count as one each.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
 from icrtool.records.tables import RobotLog
@@ -42,8 +43,8 @@ ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
-CHORD_S, LEAST_CHORD_M, CHORD_IN_POSITION_STD = 2.0, 0.3, 4.0
-"""Without a heading, distances are compared over this time, where the robot moves clearly."""
+LEAST_CHORD_M, CHORD_IN_POSITION_STD = 0.3, 4.0
+"""Without a heading, distances are compared where the robot moves clearly."""
 
 
 class Convention(NamedTuple):
@@ -151,10 +152,8 @@ def senses_by_distance(drive: DriveArrays) -> Convention:
 
     Of two such sides, that one is reversed with which the robot drives forward.
     """
-    t = drive.fix_t
-    rows = np.unique(np.floor(t / CHORD_S), return_index=True)[1]
-    chord = np.abs(np.diff(drive.fix[rows]))
-    left, right = (np.diff(drive.until_fixes(speed)[rows]) for speed in (drive.v_left, drive.v_right))
+    _, step, left, right = cut_chords(drive)
+    chord = np.abs(step)
     moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
     if np.count_nonzero(moved) < FEWEST_WINDOWS:
         return AS_NAMED
@@ -282,12 +281,16 @@ def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
     return int(np.sign(correlation)) if abs(correlation) > 0.5 else 0
 
 
-def apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
-    """Return the drive with sides, heading and position as the convention has them."""
-    left, right = convention.sign_left * drive.v_left, convention.sign_right * drive.v_right
-    return drive._replace(
-        v_left=right if convention.swapped else left,
-        v_right=left if convention.swapped else right,
-        heading=convention.heading * drive.heading,
-        fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
-    )
+def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:
+    """Return the log with sides, heading and position as the convention has them; the same log as named."""
+    if convention == AS_NAMED:
+        return log
+    wheels, heading, gnss = log.wheels, log.heading, log.gnss
+    left, right = convention.sign_left * wheels.v_left_mps, convention.sign_right * wheels.v_right_mps
+    if convention.swapped:
+        left, right = right, left
+    if convention.heading < 0:
+        heading = replace(heading, heading_rad=-heading.heading_rad)
+    if convention.position < 0:
+        gnss = replace(gnss, east_m=-gnss.east_m, cov_north_east_m2=-gnss.cov_north_east_m2)
+    return replace(log, wheels=replace(wheels, left=left, right=right), heading=heading, gnss=gnss)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.conventions import Convention
 from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.gnss_steps import unbroken
@@ -130,11 +131,9 @@ class HeadingAlignment:
         return math.isfinite(self.std_rad)
 
     @property
-    def remaining(self) -> tuple[float, float]:
-        """Sense (+1 or -1) and offset [rad] of the log's heading that are still to be corrected."""
-        if self.is_estimated:
-            return 1.0, 0.0
-        return -1.0 if self.applied_mirror else 1.0, self.applied_offset_rad
+    def remaining_offset_rad(self) -> float:
+        """Offset of the log's heading that is still to be corrected."""
+        return 0.0 if self.is_estimated else self.applied_offset_rad
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers for run.json, angles in degrees, None for what is not known."""
@@ -160,8 +159,7 @@ class HeadingAlignment:
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str,
-    *, mirrored: bool, pose_mirrored: bool = False,
+    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str, convention: Convention
 ) -> HeadingAlignment:  # fmt: skip
     """Return offset and noise of a stated heading, and what is applied.
 
@@ -169,8 +167,9 @@ def align_heading(
     ----------
     fit : of this heading; None where the drive is too short
     source : kind of sensor
-    mirrored : its handedness is the other one; pose_mirrored : it is of the position's poses, and so is theirs
+    convention : that the streams were found to have
     """
+    mirrored = convention.heading < 0
     given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
     fixed = -math.radians(given) if given != "auto" and corrects else 0.0
     nothing = HeadingAlignment(
@@ -181,6 +180,7 @@ def align_heading(
     )  # fmt: skip
     if fit is None:
         return nothing
+    pose_mirrored = mirrored and convention.position < 0 and fit.drive.same_clock
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
     scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
@@ -308,9 +308,8 @@ def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
-    topic = next((f" {stream.topic}" for stream in log.streams if stream.role == "heading"), "")
     advice = "choose another with topics.heading, or go on with --set frames.heading_offset_deg=0"
-    return DataError(log.name, f"the heading{topic} {why}", f"{found}; {advice}")
+    return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
 
 
 def _near_share(angle: Floats) -> float:
