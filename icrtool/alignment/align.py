@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.gnss_quality import CLASSES, GnssQuality, grade_fixes
+from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
-from icrtool.records.measurements import Fixes, FixStatistics, Measurements, SensorData
+from icrtool.records.measurements import Fixes, Measurements, SensorData
 from icrtool.records.run import half_width_m
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
@@ -82,7 +81,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
             "gnss": delays.gnss_summary(),
         },
         streams=found.log.streams,
-        fix_statistics=_fix_statistics(quality),
+        fix_statistics=quality.statistics,
         position_delay_s=delays.applied_gnss_s,
         clock_std_s=delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
@@ -138,12 +137,3 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
         forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
         right if given.antenna_right_m == "auto" else given.antenna_right_m,
     )
-
-
-def _fix_statistics(quality: GnssQuality) -> FixStatistics:
-    gnss, std_m = quality.log.gnss, {}
-    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    for code, name in CLASSES.items():
-        given = std[(quality.fix_class == code) & np.isfinite(std)]
-        std_m[name] = float(np.median(given)) if len(given) else math.nan
-    return FixStatistics(std_m, quality.step_std_m, quality.jump_stamp_ns, quality.jump_m)

@@ -88,12 +88,10 @@ class Decision(NamedTuple):
 
     Attributes
     ----------
-    margin : by how much twice its log-likelihood exceeds that of everything being as named
     as_likely : another convention with the same likelihood and no more than half a fault more, None without one
     """
 
     convention: Convention
-    margin: float
     as_likely: Convention | None
 
 
@@ -122,12 +120,12 @@ def decide_conventions(
     mirror_allowed : whether the heading's handedness is free
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     try:
         shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
     except np.linalg.LinAlgError:
         # Exact data on one circle: nothing separates the hypotheses.
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     losses = _losses(shown, 0.5 * drive.fix_std_m / windows.length_m)
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
@@ -139,12 +137,12 @@ def decide_conventions(
     named = costs[AS_NAMED][0]
     best = min(cost for cost, _ in costs.values())
     if named - best < DECISIVE:
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     likely = {one: one.faults(offset, drive, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
     ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
-    return Decision(chosen, named - costs[chosen][0], ranked[1] if close else None)
+    return Decision(chosen, ranked[1] if close else None)
 
 
 def senses_by_distance(drive: DriveArrays) -> Convention:

@@ -168,10 +168,12 @@ def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStream
         # wheels whose sides are exchanged turned it the wrong way, or drove backwards
         derived = _derived_heading(named, width_m)
         named = derived.apply(named)
-    drive = drive_arrays(named, None if derived is None else derived.smoothed)
+    if named is not log:
+        drive = drive_arrays(named, None if derived is None else derived.smoothed)
+        windows = cut_windows(drive)
     notes = [
         *faults,
-        *convention_notes(Decision(senses, 0.0, None), corrects=True),
+        *convention_notes(Decision(senses, None), corrects=True),
         *convention_notes(decision, corrects=corrects),
     ]
     if derived is None and config.frames.heading != "auto":

@@ -150,20 +150,20 @@ class AlignmentFit(NamedTuple):
     @property
     def heading_scatter(self) -> float:
         """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
-        noise = math.sqrt(2.0) * self.drive.fix_std_m / self.windows.length_m
-        across = math.sqrt(max(self.across_std**2 - noise**2, 0.0))
-        return max(across, float(self.fit.scale[-1]) / math.sqrt(2.0))
+        return max(self.across_scatter, float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
-    def across_std(self) -> float:
-        """Robust scatter of the displacements across the heading, over the window's length [rad]."""
-        return float(self.fit.scale[len(self.windows.begin)]) / self.windows.length_m
+    def across_scatter(self) -> float:
+        """Robust scatter of the displacements across the heading beyond the fixes' noise, over the length [rad]."""
+        return self._beyond_noise(float(self.fit.scale[len(self.windows.begin)]))
 
     @property
     def slip_std(self) -> float:
         """Robust scatter of the displacements along the path beyond the fixes' noise, over the window's length."""
-        noise = math.sqrt(2.0) * self.drive.fix_std_m
-        return math.sqrt(max(float(self.fit.scale[0]) ** 2 - noise**2, 0.0)) / self.windows.length_m
+        return self._beyond_noise(float(self.fit.scale[0]))
+
+    def _beyond_noise(self, scatter_m: float) -> float:
+        return math.sqrt(max(scatter_m**2 - 2.0 * self.drive.fix_std_m**2, 0.0)) / self.windows.length_m
 
     @property
     def turn_slip(self) -> float:

@@ -48,14 +48,12 @@ class CourseAngles(NamedTuple):
     angle : (w,) heading minus course over ground [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading of the other handedness
     scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
-    noise_rad : standard deviation of `angle` by the noise of the fixes
     duration_s : median duration of a window
     """
 
     angle: Floats
     mirrored: Floats
     scattered: int
-    noise_rad: float
     duration_s: float
 
     @property
@@ -87,7 +85,6 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
         int(np.count_nonzero(went & ~led)),
-        drive.fix_std_m * math.sqrt(2.0) / windows.length_m,
         float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
     )
 
@@ -110,20 +107,20 @@ class HeadingAlignment:
     """
 
     source: str
-    parts: str
-    windows: int
-    offset_rad: float
-    offset_std_rad: float
-    scatter_rad: float
-    agreement: float
-    mirrored_agreement: float
-    applied_mirror: bool
-    applied_offset_rad: float
-    applied_std_rad: float
-    applied_correlation_s: float
-    std_rad: float
-    name: OffsetName
-    warnings: tuple[str, ...]
+    parts: str = ""
+    windows: int = 0
+    offset_rad: float = math.nan
+    offset_std_rad: float = math.nan
+    scatter_rad: float = math.nan
+    agreement: float = math.nan
+    mirrored_agreement: float = math.nan
+    applied_mirror: bool = False
+    applied_offset_rad: float = 0.0
+    applied_std_rad: float = 0.0
+    applied_correlation_s: float = 0.0
+    std_rad: float = math.nan
+    name: OffsetName = NO_NAME
+    warnings: tuple[str, ...] = ()
 
     @property
     def is_estimated(self) -> bool:
@@ -173,17 +170,15 @@ def align_heading(
     given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
     fixed = -math.radians(given) if given != "auto" and corrects else 0.0
     nothing = HeadingAlignment(
-        source=source, parts="", windows=len(course.angle), offset_rad=math.nan, offset_std_rad=math.nan,
-        scatter_rad=math.nan, agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
-        applied_mirror=mirrored and corrects, applied_offset_rad=fixed, applied_std_rad=0.0, applied_correlation_s=0.0,
-        std_rad=math.nan, name=NO_NAME, warnings=(),
+        source, windows=len(course.angle), agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
+        applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
     )  # fmt: skip
     if fit is None:
         return nothing
     pose_mirrored = mirrored and convention.position < 0 and fit.drive.same_clock
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
-    scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
+    scatter = fit.across_scatter
     text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
     significant = _significant(offset - fixed, std)
     applied, notes = fixed, []
@@ -221,13 +216,8 @@ def align_estimated_heading(
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
     std = derived.estimate.median_std
-    own = HeadingAlignment(
-        source=derived.source, parts=derived.why, windows=0, offset_rad=math.nan, offset_std_rad=math.nan,
-        scatter_rad=math.nan,
-        agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
-        applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std, name=NO_NAME,
-        warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
-    )  # fmt: skip
+    estimated = f"{log.name}: the heading is estimated: {derived.why}"
+    own = HeadingAlignment(derived.source, derived.why, std_rad=std, warnings=(estimated,))
     if stated is None or derived.attitude_offset is None:
         return own
     offset, offset_std = derived.attitude_offset

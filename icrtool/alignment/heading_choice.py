@@ -152,14 +152,6 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
     return best
 
 
-def _offset(estimate: HeadingEstimate) -> float:
-    return math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
-
-
-def _offset_std(estimate: HeadingEstimate) -> float:
-    return float(estimate.constants_std[OFFSET])
-
-
 def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
     """Return the bearing of the longest baseline between two antennas, and its length [m]."""
     found = [one for one in (antenna_heading(log, other.fixes, turn) for other in log.other_receivers) if one]
@@ -185,7 +177,8 @@ def _derived(
         source = "fused"
         parts.insert(0, f"orientation (errs by {math.degrees(attitude_error(estimate)):.1f}°)")
         names.insert(0, log.topic("heading", "orientation"))
-        attitude_offset = _offset(estimate), _offset_std(estimate)
+        offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
+        attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = replace(stated, stamp_ns=stated.stamp_ns - lag, heading_rad=stated.heading_rad - attitude_offset[0])
     std = math.degrees(estimate.median_std)

@@ -23,6 +23,11 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers for run.json."""
+        known = math.isfinite(self.value_s)
+        return {"delay_s": self.value_s if known else None, "delay_std_s": self.std_s if known else None}
+
     @property
     def is_significant(self) -> bool:
         """Whether it is known well, and is not zero."""
@@ -83,20 +88,11 @@ class StreamDelays:
 
     def heading_summary(self) -> dict[str, Any]:
         """Return the heading's numbers for run.json."""
-        known = math.isfinite(self.heading.value_s)
-        return {
-            "delay_s": self.heading.value_s if known else None,
-            "delay_std_s": self.heading.std_s if known else None,
-            "applied_delay_s": self.applied_heading_s,
-        }
+        return self.heading.summary() | {"applied_delay_s": self.applied_heading_s}
 
     def gnss_summary(self) -> dict[str, Any]:
         """Return the fixes' numbers for run.json; what was applied stands with the filter, as reference_delay_s."""
-        known = math.isfinite(self.gnss.value_s)
-        return {
-            "delay_s": self.gnss.value_s if known else None,
-            "delay_std_s": self.gnss.std_s if known else None,
-        }
+        return self.gnss.summary()
 
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
@@ -158,15 +154,14 @@ def _delay_notes(
     """Return a line for each stream that was moved."""
     notes = []
     keys = {"heading": "frames.heading_delay_s", "position": "frames.reference_delay_s"}
+    alike = not together and applied["heading"] == applied["position"] and given["heading"] == "auto"
+    also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
     for what, key in keys.items():
         value = applied[what]
-        if value == 0.0 or given[what] != "auto" or (together and what == "heading"):
+        if value == 0.0 or given[what] != "auto" or (together and what == "heading") or (alike and what == "position"):
             continue
-        if not together and what == "position" and value == applied["heading"]:
-            notes.append(f"{name}: the position is corrected alike: nothing shows that its delay differs")
-            continue
-        subject = "the position and its heading" if together else f"the {what}"
-        lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
+        subject, lags = ("the position and its heading", "lag") if together else (f"the {what}", "lags")
         std = (found[what] if found[what].is_significant else found["apart"]).std_s
-        notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
+        fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
+        notes.append(f"{name}: {fact} by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it{also}")
     return notes
