@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_growth import SOURCES, Ends, PathErrors, Spread, mean_error, path_errors, radius
+from icrtool.calibration.error_growth import SOURCES, PathErrors, Spread, mean_error, path_errors, radius
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
-from icrtool.motion.trials import Trials
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""
@@ -94,21 +93,6 @@ def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro:
     return _along(calibration, steps, recording.t_s, place, drive.distance, heading, with_gyro=with_gyro)
 
 
-def forecast_trials(
-    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
-) -> tuple[Floats, Floats]:
-    """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
-    steps = joined_steps(recording, samples_a_step(recording))
-    some = trials.ends >= 0
-    start, end = np.broadcast_to(trials.starts[:, None], trials.ends.shape)[some], trials.ends[some]
-    rows, places = np.unique(np.concatenate([start, end]), return_inverse=True)
-    ends = Ends(recording.t_s[rows], places[: len(start)], places[len(start) :])
-    _, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
-    found = np.full((2, *trials.ends.shape), np.nan)
-    found[0][some], found[1][some] = expected, p95
-    return found[0], found[1]
-
-
 def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
     """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
 
@@ -159,8 +143,7 @@ def _along(
     if not len(metres):
         raise DataError("path", f"{length[-1]:.2f} m long", "a forecast needs a metre at least")
     rows = np.searchsorted(length, metres)
-    ends = Ends(np.concatenate([t[:1], t[rows]]), np.zeros(len(rows), np.int64), np.arange(1, len(rows) + 1))
-    spread, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
+    spread, expected, p95 = _errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
     c, s = np.cos(heading), np.sin(heading)
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
@@ -171,14 +154,16 @@ def _along(
     )  # fmt: skip
 
 
-def _errors(calibration: Calibration, steps: Steps, ends: Ends, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
-    """Return moments, expected and 95 % error of windows."""
+def _errors(
+    calibration: Calibration, steps: Steps, begin_s: Floats, end_s: Floats, *, with_gyro: bool
+) -> tuple[Spread, Floats, Floats]:
+    """Return moments, expected and 95 % error of windows from and to times (w,)."""
     fitted, sources = calibration.fitted, calibration.sources
     if with_gyro and calibration.gyro is not None:
         fitted, sources = calibration.gyro, calibration.gyro_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    found: PathErrors = path_errors(steps, ends, fitted, calibration.width_m)
+    found: PathErrors = path_errors(steps, begin_s, end_s, fitted, calibration.width_m)
     spread = found.of_sources.combined(np.array(sources[:SOURCES])).plus(found.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

@@ -20,21 +20,11 @@ if TYPE_CHECKING:
 
 @click.command("calibrate")
 @click.argument("sources", metavar="LOG|RUN...", nargs=-1, required=True, type=options.LOG)
-@click.option(
-    "-o", "--output", metavar="FILE|DIR", type=click.Path(path_type=Path), help="Write the calibration file here."
-)
-@click.option(
-    "--x-icr",
-    metavar="METRES",
-    type=float,
-    help="Known forward position of the ICRs; gives the antenna's position. One log.",
-)
-@click.option(
-    "--plot",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Draw the residuals before and after the calibration: png, svg, pdf. One log.",
-)
+@click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
+@click.option("--x-icr", metavar="METRES", type=float,
+              help="Known forward position of the ICRs; gives the antenna's position. One log.")  # fmt: skip
+@click.option("--plot", metavar="FILE", type=options.FILE,
+              help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
 @json_option
 @options.configuration
 @options.verbosity
@@ -44,9 +34,9 @@ def command(
 ) -> None:  # fmt: skip
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
 
-    Several logs are pooled; each is left out in turn to test the models and to choose one. Of one log, blocks are left
-    out, and antenna place, heading offset, delays and wheel scales are estimated, too. A RUN is used as it was fitted,
-    with its configuration.
+    Several logs are pooled; each is left out in turn to test the models and to choose one. Of one log, the distance of
+    each trial is left out, and antenna place, heading offset, delays and wheel scales are estimated, too. A RUN is used
+    as it was fitted, with its configuration.
 
     \b
     Example:

@@ -58,11 +58,10 @@ def draw_gnss_difference(run: Run) -> Figure:
     t, difference = run.gnss.t_s / time.seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
-    if used.any():
+    if (mean := facts["mean_difference_m"]) is not None and (most := facts["max_difference_m"]) is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
-        mean, most = (metres_text(facts[name]) for name in ("mean_difference_m", "max_difference_m"))
-        _draw_used(axes, t[trusted], difference[trusted], f"used, max {most}")
-        axes.axhline(facts["mean_difference_m"], label=f"mean {mean}", **MEAN.keywords())
+        _draw_used(axes, t[trusted], difference[trusted], f"used, max {metres_text(most)}")
+        axes.axhline(mean, label=f"mean {metres_text(mean)}", **MEAN.keywords())
     if gated.any():
         _draw_rejected(axes, t[gated], difference[gated], top)
     _mark_down_weighted(axes, t, difference, run.sensors.fixes.down_weighted & used, top)

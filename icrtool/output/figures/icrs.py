@@ -27,6 +27,7 @@ from icrtool.output.figures.style import (
 )
 from icrtool.output.text_format import run_title, signed
 from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run_document import IcrColumn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,7 +95,7 @@ def draw_icr_clusters(run: Run) -> Figure:
     panels = figure.subplots(1, 3, sharey=True)
     figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
-    columns = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
+    columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
     spans = [float(np.ptp(percentiles(value, CLUSTER_RANGE_PERCENT))) for value in values]
     span = max(*spans, 2 * LEAST_HALF_RANGE_M)
@@ -123,7 +124,7 @@ def _spans_s(run: Run) -> list[tuple[float, float]]:
     return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
 
 
-def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float], *, first: bool) -> None:
+def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
     """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
     table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
@@ -151,7 +152,7 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     _mark_clipped(axes, t, value)
 
 
-def _draw_segments(axes: Axes, run: Run, column: str, unit_s: float) -> None:
+def _draw_segments(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> None:
     """Draw the mean of each stretch between the given terrain changes."""
     for segment in run.summary["segments"]:
         if (mean := segment["mean"][column]) is not None:
@@ -170,7 +171,7 @@ def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
             )  # fmt: skip
 
 
-def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
+def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> list[float]:
     """Draw b/2 and the begin and end of the convergence; return where they are [m]."""
     heights: list[float] = []
     if (width := run.track_width_m) is not None:
@@ -188,13 +189,13 @@ def _mark() -> dict[str, Any]:
     return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
-def _convergence_text(run: Run, column: str) -> str:
+def _convergence_text(run: Run, column: IcrColumn) -> str:
     span = run.convergence_s[column]
     return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "hardly moved from its start"
 
 
-def _final_text(run: Run, column: str) -> str:
-    final, std = (run.summary["icr"][key][column] for key in ("final", "final_std"))
+def _final_text(run: Run, column: IcrColumn) -> str:
+    final, std = run.summary["icr"]["final"][column], run.summary["icr"]["final_std"][column]
     return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
 
 
@@ -216,7 +217,7 @@ def _estimate_keys(run: Run) -> list[Line2D | Patch]:
     return keys
 
 
-def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Floats, span_m: float) -> bool:
+def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weight: Floats, span_m: float) -> bool:
     """Draw percent of time over value, and show `span_m` of it; return whether the place of no slip is in view."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from icrtool.estimation.odometry import Odometry, OdometryPath
+    from icrtool.estimation.odometry import OdometryPath, WheelPaths
 
 WIDTH_IN = 7.2
 MARGINS_IN = {"left": 0.75, "right": 0.2, "top": 0.6, "bottom": 1.3}
@@ -71,7 +71,7 @@ REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewi
 """Markers by class: shape and luminance distinguish them."""
 
 
-def draw_trajectory(run: Run, odometry: Odometry) -> Figure:
+def draw_trajectory(run: Run, odometry: WheelPaths) -> Figure:
     """Draw fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north.
 
     Parameters
