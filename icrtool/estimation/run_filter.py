@@ -34,8 +34,9 @@ OUTAGE_IN_INTERVALS = 5.0
 """... and at least this many times the usual interval between fixes."""
 
 
-LONGEST_CARRY_S = 1.0
-"""An estimated heading is carried on by the wheels for less than this; then the filter's own is as good."""
+LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
+"""An estimated heading is carried on by the wheels for less than this, and where it is so many times as certain as the
+filter's own: among noisy fixes it is not."""
 
 LEAST_WHEEL_TRAVEL_M = 0.1
 """Wheels that travel less than this to and fro have not turned."""
@@ -191,10 +192,11 @@ def carry_headings(table: States, headings: HeadingSamples, used: Bools) -> Stat
     recent = (last >= 0) & (age < LONGEST_CARRY_S)
     off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
     std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
+    clear = recent & (CLEARLY * std < table.std_heading_rad)
     return replace(
         table,
-        heading_rad=psi + np.where(recent, off[last], 0.0),
-        std_heading_rad=np.where(recent, std, table.std_heading_rad),
+        heading_rad=psi + np.where(clear, off[last], 0.0),
+        std_heading_rad=np.where(clear, std, table.std_heading_rad),
     )
 
 
