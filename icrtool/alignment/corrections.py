@@ -165,7 +165,7 @@ def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStream
     )
     named = apply_convention(log, decision.convention)
     if derived is not None and named is not log:
-        # wheels whose sides are exchanged turned it the wrong way, or drove backwards
+        # it was made with wheels whose sides are exchanged, or run backwards
         derived = _derived_heading(named, width_m)
         named = derived.apply(named)
     if named is not log:
