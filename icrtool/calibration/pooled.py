@@ -22,6 +22,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Pool
+from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
 from icrtool.records.dropout import MeasuredHeading
@@ -91,7 +92,12 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 
 def gyro_recording_of(run: Run) -> Recording:
     """Return a run as `recording_of`, with its gyro where it has one."""
-    return recording_of(run, next((one for one in measured_headings(run) if one.kind == "gyro"), None))
+    return heading_recording_of(run, "gyro")
+
+
+def heading_recording_of(run: Run, kind: str, *, width_m: float | None = None) -> Recording:
+    """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
+    return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
 
 
 def scaled_gyro(recording: Recording) -> Floats:
@@ -233,6 +239,17 @@ def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
+    return fitted_path(fitted, recording)
+
+
+def fitted_path(fitted: FittedModel, recording: Recording) -> PathAt:
+    """Return the path that a fitted model makes of a recording, whose own constants are found; see `calibrated_path`.
+
+    Raises
+    ------
+    DataError
+        The drive is too short to find them.
+    """
     pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
     return predicted_path(recording, fitted, pool.own_constants(0, fitted.parameters))
 

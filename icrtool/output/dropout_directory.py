@@ -19,7 +19,6 @@ from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.csv_file import csv_bytes
-from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
@@ -84,12 +83,9 @@ class ReportWriter:
     def finish(self, report: DropoutReport) -> None:
         """Draw the figures and write the tables."""
         if self._plots:
-            directory = self._directory / "plots"
-            directory.mkdir()
-            with quiet_matplotlib():
-                from icrtool.output.figures.dropout_figures import draw_figures
+            from icrtool.output.figures.catalogue import draw_figures
 
-                draw_figures(report, directory, self._plots)
+            draw_figures("report", report, self._directory / "plots", self._plots)
         write_tables(report, self._directory)
 
 

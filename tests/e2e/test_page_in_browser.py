@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.pooled import gyro_recording_of, predictor, recording_of
+from icrtool.calibration.model_comparison import _errors_along, _icrs_of
+from icrtool.calibration.pooled import fitted_path, gyro_recording_of, predictor, recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
-from icrtool.motion.trials import Trials
+from icrtool.motion.trials import Trials, trial_errors
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.json_file import json_bytes
 from icrtool.output.page import drive_data
@@ -219,18 +220,31 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     names = {"calibration": False, "calibration_gyro": True}
     assert {one.name: one.with_gyro for one in report.calibrations} == names
     # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
-    monkeypatch.setattr(drive_data, "MOST_STEPS", 4000)
+    monkeypatch.setattr(drive_data, "MOST_STEPS", 10_000)
     document = json.loads(json_bytes(report_document(report)))
     file = tmp_path / "calibrations.html"
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
-    assert page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)") == [3] * 4
+    assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {3}
+    table, recording = report.comparison, gyro_recording_of(run)
+    assert table is not None
+    drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))
+    # What the comparison chose by block is, of the whole drive, the recommended model.
+    assert {score.name.replace("extended", "recommended") for score in table.scores} <= drawn
     ends = trial_ends(drive_of(run), np.array(LENGTHS_M))
     starts = np.flatnonzero((ends >= 0).all(axis=1))[::300]
-    for name, with_gyro in names.items():
-        expected = predictor(calibration, gyro_recording_of(run), with_gyro=with_gyro)(Trials(starts, ends[starts]))
-        for start, errors in zip(starts.tolist(), expected.tolist(), strict=True):
+    trials = Trials(starts, ends[starts])
+    expected = {
+        name: predictor(calibration, recording, with_gyro=with_gyro)(trials) for name, with_gyro in names.items()
+    }
+    rows = {"multiplier": "multiplier", "window": "icr", "window_gyro": "icr_gyro", "no_slip_gyro": "no_slip_gyro"}
+    for row, of in rows.items():
+        expected[row] = trial_errors(recording, trials, fitted_path(table.fits[of], recording))
+    for name in ("icr", "icr_final"):
+        expected[f"{name}_gyro"] = _errors_along(run, recording, trials, _icrs_of(run, name))
+    for name, of_model in expected.items():
+        for start, errors in zip(starts.tolist(), of_model.tolist(), strict=True):
             found = page.evaluate(f"icrtoolPage.openLoop({start}).models.find((one) => one.name === '{name}').errors")
             # Between its points a path is straight, and its heading at a start is known to some 0.0002 rad.
             assert found == pytest.approx(errors, abs=0.01), (name, start)

@@ -1,92 +1,163 @@
-"""Every figure as one function that takes a run or a report and returns a matplotlib Figure: ``icrtool.figures``."""
+"""Every figure of a directory or a page, once: name, title, caption, the function that draws it, and when it does."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.errors import DataError
-from icrtool.estimation.odometry import odometry
-from icrtool.output.figures.dropout_errors import draw_histogram, draw_summary
-from icrtool.output.figures.dropout_paths import draw_examples, draw_outages, draw_worst
-from icrtool.output.figures.gnss_difference import draw_gnss_difference
-from icrtool.output.figures.icrs import draw_icr_clusters, draw_icr_estimates
-from icrtool.output.figures.model_comparison import draw_comparison
-from icrtool.output.figures.style import style
-from icrtool.output.figures.trajectory import draw_trajectory
-from icrtool.output.text_format import run_title
-from icrtool.records.run import Run
+from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
+from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
+from icrtool.output.figures.fleet import fleet_errors, fleet_failures, fleet_icrs
+from icrtool.output.figures.gnss_difference import gnss_difference
+from icrtool.output.figures.icrs import icr_clusters, icr_estimates
+from icrtool.output.figures.model_comparison import model_comparison
+from icrtool.output.figures.style import save
+from icrtool.output.figures.trajectory import trajectory
+from icrtool.output.figures.transfer import transfer
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Subject = Literal["run", "report", "fleet", "comparison"]
+Parts = Mapping[str, tuple[float, ...]]
 
-def trajectory(run: Run) -> Figure:
-    """Return fixes, filter and wheels-only odometry over east and north."""
-    return _drawn(lambda: draw_trajectory(run, odometry(run)))
-
-
-def icr_estimates(run: Run) -> Figure:
-    """Return the three ICR estimates over time with ±2σ."""
-    return _drawn(lambda: draw_icr_estimates(run))
+HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
-def icr_clusters(run: Run) -> Figure:
-    """Return how much of the time each ICR estimate had which value, after convergence."""
-    return _drawn(lambda: draw_icr_clusters(run))
+def _always(_: object) -> Parts:
+    return {"": ()}
 
 
-def gnss_difference(run: Run) -> Figure:
-    """Return the distance between filter and fixes over percent of the mission."""
-    return _drawn(lambda: draw_gnss_difference(run))
+def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
+    """Return the parts of a figure that is drawn once, where there is such content."""
+    return lambda subject: {"": ()} if content(subject) else {}
 
 
-def dropout_summary(report: DropoutReport) -> Figure:
-    """Return 95 % and expected error over distance without GNSS, by model."""
-    return _drawn(lambda: draw_summary(run_title(report.run_summary), report))
+def _histograms(report: DropoutReport) -> Parts:
+    trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
+    return {f"_{metres:02.0f}m": (metres,) for metres in HISTOGRAM_HORIZONS_M if trials.get(metres)}
 
 
-def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
-    """Return the share of trials by error at one of the report's horizons [m]."""
-    if horizon_m not in report.horizons_m:
-        raise ValueError(f"horizon_m: {horizon_m:g} m is not among the report's horizons")
-    return _drawn(lambda: draw_histogram(run_title(report.run_summary), report, horizon_m))
+class Entry(NamedTuple):
+    """A figure of the catalogue.
+
+    Attributes
+    ----------
+    of : what it is drawn of
+    title, caption : one line each: what it shows, what to see; ``{}`` is the distance in the name of the file
+    draw : the function
+    parts : what follows the name in the names of its files, with further arguments of `draw`; empty: nothing to draw
+    with_place : its axes may be coordinates of a map grid
+    """
+
+    of: Subject
+    title: str
+    caption: str
+    draw: Callable[..., Figure]
+    parts: Callable[[Any], Parts] = _always
+    with_place: bool = False
 
 
-def dropout_examples(report: DropoutReport) -> Figure:
-    """Return a cornering and a straight trial; `report` is of `icrtool.dropout_report`."""
-    _check(report, report.examples, "example trials")
-    return _drawn(lambda: draw_examples(run_title(report.run_summary), report.examples))
+FIGURES = {
+    "trajectory": Entry(
+        "run", "The drive from above",
+        "Filter and position reference should coincide. Odometry leaves them by what wheel speeds alone lose.",
+        trajectory, with_place=True,
+    ),
+    "icr_estimates": Entry(
+        "run", "ICR estimates over time", "Good: the lines settle soon and stay within their bands.", icr_estimates
+    ),
+    "icr_clusters": Entry(
+        "run", "Where the ICRs lay",
+        "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
+        icr_clusters,
+    ),
+    "gnss_difference": Entry(
+        "run", "Filter and position reference",
+        "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
+        gnss_difference,
+    ),
+    "examples": Entry(
+        "report", "Two trials of {} m",
+        "One of half a turn, and the straightest. The closer a coloured end is to the black one, the better its model.",
+        dropout_examples, lambda report: {f"_{one.horizon_m:02.0f}m": () for one in report.examples[:1]},
+        with_place=True,
+    ),
+    "worst": Entry(
+        "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
+        dropout_worst, _where(lambda report: report.worst), with_place=True,
+    ),
+    "outages": Entry(
+        "report", "Outages",
+        "The path without GNSS, forced or real, and where the estimate was when fixes returned.",
+        dropout_outages, _where(lambda report: report.outages), with_place=True,
+    ),
+    "histogram": Entry(
+        "report", "Errors after {} m",
+        "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
+        dropout_histogram, _histograms,
+    ),
+    "summary": Entry(
+        "report", "Error over distance",
+        "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
+        dropout_summary, _where(lambda report: report.counts.trials.any()),
+    ),
+    "ladder": Entry(
+        "report", "Model comparison",
+        "Each model on distance it was not fitted to. Take the simplest of those that are about as good as the best.",
+        model_comparison, _where(lambda report: report.comparison),
+    ),
+    "icrs": Entry(
+        "fleet", "Final ICRs of every log",
+        "One robot on one ground should lie on one level; a step is other ground or wear.",
+        fleet_icrs, _where(lambda fleet: fleet.points),
+    ),
+    "errors": Entry(
+        "fleet", "Errors by robot and group", "Each point is a log: how much the logs of a group differ.",
+        fleet_errors, _where(lambda fleet: fleet.errors_m),
+    ),
+    "failures": Entry(
+        "fleet", "Why logs failed", "The commonest reason first.",
+        fleet_failures, _where(lambda fleet: fleet.reasons),
+    ),
+    "transfer": Entry(
+        "comparison", "The cost of a foreign calibration",
+        "Left: the darker, the larger the error. Right: an interval (95 %) that crosses zero may be chance.", transfer,
+    ),
+}  # fmt: skip
+"""By the first words of the file's name."""
 
 
-def dropout_worst(report: DropoutReport) -> Figure:
-    """Return the worst trials; `report` is of `icrtool.dropout_report`."""
-    _check(report, report.worst, "worst trials")
-    path = report.reference_north_m, report.reference_east_m
-    return _drawn(lambda: draw_worst(run_title(report.run_summary), report.worst, *path))
+def figures_of(of: Subject, subject: object) -> Iterator[tuple[str, Figure]]:
+    """Draw each figure for which a subject has numbers; yield it with the name of its file."""
+    for name, entry in FIGURES.items():
+        if entry.of == of:
+            for part, more in entry.parts(subject).items():
+                yield f"{name}{part}", entry.draw(subject, *more)
 
 
-def dropout_outages(report: DropoutReport) -> Figure:
-    """Return the path with forced and real outages; `report` is of `icrtool.dropout_report`."""
-    _check(report, report.outages, "outages")
-    path = report.reference_north_m, report.reference_east_m
-    return _drawn(lambda: draw_outages(run_title(report.run_summary), *path, report.outages))
+def draw_figures(of: Subject, subject: object, directory: Path, formats: tuple[str, ...]) -> None:
+    """Write every figure of a run or a report into a directory.
+
+    Parameters
+    ----------
+    directory : made where it is not there
+    formats : of ``png``, ``svg`` and ``pdf``
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
+    directory.mkdir(exist_ok=True)
+    for name, figure in figures_of(of, subject):
+        save(figure, directory / name, formats)
 
 
-def model_comparison(report: DropoutReport) -> Figure:
-    """Return the errors of all models on distance they were not fitted to; `report` is of `icrtool.dropout_report`."""
-    table = report.comparison
-    if table is None:
-        raise DataError(report.name, "the report holds no model comparison", report.no_comparison)
-    return _drawn(lambda: draw_comparison(run_title(report.run_summary), table.scores, table.horizons_m, table.blocks))
-
-
-def _check(report: DropoutReport, content: tuple[object, ...], what: str) -> None:
-    if not content:
-        raise DataError(report.name, f"the report holds no {what}", "icrtool.dropout_report finds what there is")
-
-
-def _drawn(draw: Callable[[], Figure]) -> Figure:
-    with style():
-        return draw()
+def entry_of(file: str) -> tuple[Entry, str] | None:
+    """Return the entry of a picture by the name of its file, and the distance in that name; None for any other file."""
+    word, _, rest = file.rpartition("_") if file not in FIGURES else (file, "", "")
+    entry = FIGURES.get(word)
+    return None if entry is None else (entry, rest.removesuffix("m").lstrip("0"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.output.figures.decimate import extremes, percentiles
+from icrtool.output.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     BAND_COLOR,
@@ -17,9 +17,9 @@ from icrtool.output.figures.style import (
     ICR,
     MEAN,
     TimeAxis,
-    inches,
     new_figure,
     shade_spans,
+    styled,
 )
 from icrtool.output.text_format import metres_text, position_word, run_title
 from icrtool.records.run import Run
@@ -27,8 +27,6 @@ from icrtool.records.run import Run
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-WIDTH_IN, HEIGHT_IN = 7.2, 3.9
 
 TYPICAL_PERCENT = 99.5
 HEADROOM = 1.6
@@ -44,16 +42,16 @@ MARKS = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
-def draw_gnss_difference(run: Run) -> Figure:
-    """Draw the distance between filter and fixes over time, rejected fixes apart.
+@styled
+def gnss_difference(run: Run) -> Figure:
+    """Return the distance between filter and fixes [m] over time, rejected fixes apart.
 
     Of many fixes, the range and the median in each of `BINS` equal times are drawn.
     """
     facts = run.summary["gnss"]
     subtitle = f"Distance between filter and {position_word(run.summary)}"
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
+    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9)
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
     time = TimeAxis.for_span(float(run.table.t_s[-1]))
     t, difference = run.gnss.t_s / time.seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
@@ -72,14 +70,12 @@ def draw_gnss_difference(run: Run) -> Figure:
         (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / time.seconds,
         label="no usable GNSS, or RTK lost" if lost else "no usable GNSS",
     )
-    axes.set_xlim(0, max(float(run.table.t_s[-1]) / time.seconds, 1e-3))
-    axes.set_ylim(0, top)
-    axes.set_xlabel(f"Time [{time.unit}]")
-    axes.set_ylabel("Difference [m]")
+    axes.set(xlim=(0, max(float(run.table.t_s[-1]) / time.seconds, 1e-3)), ylim=(0, top))
+    axes.set(xlabel=f"Time [{time.unit}]", ylabel="Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
     ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
     if axes.get_legend_handles_labels()[0]:
-        figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
+        figure.legend(ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.decimate import extremes, percentiles
+from icrtool.output.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     BAND_COLOR,
@@ -21,9 +21,10 @@ from icrtool.output.figures.style import (
     Pen,
     TimeAxis,
     fill_bins,
-    inches,
     new_figure,
     shade_spans,
+    spot,
+    styled,
 )
 from icrtool.output.text_format import run_title, signed
 from icrtool.records.run import ICR_COLUMNS, Run
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2
-
-LINE_COLOR = "black"
 SEGMENT = Pen("#e08214", width=1.6)
 # Plain text: mathtext costs more than the rest of a figure.
 NAMES = {
@@ -59,19 +57,20 @@ LEAST_MARGIN_S = 10.0
 BINS = 30
 
 
-def draw_icr_estimates(run: Run) -> Figure:
-    """Draw the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
+@styled
+def icr_estimates(run: Run) -> Figure:
+    """Return the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
     subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=5.8)
+    figure = new_figure(
+        run_title(run.summary), subtitle, height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3
+    )  # fmt: skip
     panels = figure.subplots(
         3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
     )
-    margins = inches(figure, left=0.75, right=0.2, top=0.8, bottom=0.9)
-    figure.subplots_adjust(**margins, wspace=0.22, hspace=0.3)
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
         for axes, span in zip(row, spans, strict=True):
             _draw_estimate(axes, run, column, span, first=axes is row[0])
@@ -81,18 +80,18 @@ def draw_icr_estimates(run: Run) -> Figure:
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
         axes.set_xlabel(f"Time [{TimeAxis.for_span(end - begin).unit}]")
     keys = _estimate_keys(run)
-    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.4, handlelength=2.0)
+    figure.legend(handles=keys, ncols=len(keys), columnspacing=1.4, handlelength=2.0)
     return figure
 
 
-def draw_icr_clusters(run: Run) -> Figure:
-    """Draw how much of the time each ICR estimate had which value, after convergence."""
+@styled
+def icr_clusters(run: Run) -> Figure:
+    """Return the percent of the time that each ICR estimate had which value [m], after convergence."""
     settled = run.settled_s
     after = run.table.t_s >= settled
     subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=3.9)
+    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9, margins_in=(0.65, 0.2, 1.0, 0.9))
     panels = figure.subplots(1, 3, sharey=True)
-    figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
     columns = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
@@ -109,7 +108,7 @@ def draw_icr_clusters(run: Run) -> Figure:
     ]
     if any(no_slip_shown):
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
-    figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
+    figure.legend(handles=keys, ncols=3, columnspacing=3.0)
     return figure
 
 
@@ -136,7 +135,7 @@ def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float
     shown = extremes(low, high)
     axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
     shown = extremes(value)
-    axes.plot(t[shown], value[shown], color=LINE_COLOR, linewidth=1.0)
+    axes.plot(t[shown], value[shown], color="black", linewidth=1.0)
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
@@ -179,13 +178,9 @@ def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[
     if (span := run.convergence_s[column]) is not None:
         for second, fill in zip(span, ("white", "black"), strict=True):
             height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
-            axes.plot([second / unit_s], [height], markerfacecolor=fill, **_mark())
+            axes.plot([second / unit_s], [height], zorder=4, clip_on=False, **spot(fill))
             heights.append(height)
     return heights
-
-
-def _mark() -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
 def _convergence_text(run: Run, column: str) -> str:
@@ -200,12 +195,12 @@ def _final_text(run: Run, column: str) -> str:
 
 def _estimate_keys(run: Run) -> list[Line2D | Patch]:
     keys: list[Line2D | Patch] = [
-        Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
+        Line2D([], [], color="black", linewidth=1.0, label="estimate"),
         Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
     ]
     if any(span is not None for span in run.convergence_s.values()):
-        keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
-        keys.append(Line2D([], [], label="90 % of the change", **_mark()))
+        keys.append(Line2D([], [], label="10 %", **spot("white")))
+        keys.append(Line2D([], [], label="90 % of the change", **spot("black")))
     if run.track_width_m is not None:
         keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
     if run.changes_s:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -21,7 +22,12 @@ from icrtool.records.text import escaped
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+P = ParamSpec("P")
+
 PNG_DPI = 130
+
+WIDTH_IN = 7.2
+"""Of most figures: the text width of a page."""
 
 TITLE_CHARACTERS_PER_INCH = 9.5
 
@@ -49,7 +55,9 @@ RC: dict[str, Any] = {
     "lines.solid_joinstyle": "round",
     "legend.fontsize": 8.5,
     "legend.frameon": False,
-    "legend.handlelength": 2.8,
+    "legend.handlelength": 2.4,
+    "legend.columnspacing": 1.8,
+    "legend.loc": "lower center",
     "xtick.labelsize": 8.5,
     "ytick.labelsize": 8.5,
     "path.simplify": True,
@@ -91,6 +99,20 @@ NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
 CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)
 MEAN = Pen("black", (0, (5, 2)), 1.1)
+FORCED = Pen(BAD_FIX_COLOR, width=1.8)
+REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
+
+ICR_LOOKS: dict[str, dict[str, Any]] = {
+    "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
+    "y_icr_left": {"label": "y left", "color": "#b2182b", "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
+    "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
+}
+"""Of the three ICRs where they share a panel, by `icrtool.simulation.study_measures.ICR_NAMES`."""
+
+MODEL_WORDS = {"icr": "ICR", "no_slip": "no slip"}
+
+LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
+"""Behind text that lies on lines."""
 
 
 @contextmanager
@@ -104,17 +126,50 @@ def style() -> Iterator[None]:
         yield
 
 
-def new_figure(title: str, subtitle: str, *, width_in: float, height_in: float) -> Figure:
-    """Return an empty figure with two lines of title at its upper left."""
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Return a function that draws in our style."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **keywords: P.kwargs) -> Figure:
+        with style():
+            return draw(*args, **keywords)
+
+    return drawn
+
+
+def new_figure(
+    title: str, subtitle: str, *, height_in: float, width_in: float = WIDTH_IN,
+    margins_in: tuple[float, float, float, float] = (0.75, 0.2, 0.65, 1.0), wspace: float = 0.2, hspace: float = 0.2,
+) -> Figure:  # fmt: skip
+    """Return an empty figure with two lines of title at its upper left.
+
+    Parameters
+    ----------
+    margins_in : left, right, top and bottom of its axes [in]
+    wspace, hspace : between axes, as a share of their width and height
+    """
     figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI)
     FigureCanvasAgg(figure)
-    left = 0.09 / width_in
-    if len(title) > (most := int(TITLE_CHARACTERS_PER_INCH * width_in)):
-        title = f"{title[: most // 2]}…{title[-most // 2 :]}"
+    left, right, top, bottom = margins_in
+    figure.subplots_adjust(
+        left / width_in, bottom / height_in, 1 - right / width_in, 1 - top / height_in, wspace, hspace
+    )
+    edge = 0.09 / width_in
+    most = int(TITLE_CHARACTERS_PER_INCH * width_in)
     at: dict[str, Any] = {"va": "top", "ha": "left", "parse_math": False}
-    figure.text(left, 1 - 0.09 / height_in, drawable(title), fontsize=10.5, fontweight="bold", **at)
-    figure.text(left, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
+    figure.text(edge, 1 - 0.09 / height_in, drawable(shortened(title, most)), fontsize=10.5, fontweight="bold", **at)
+    figure.text(edge, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
     return figure
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text of so many characters at most, its middle left out: names differ at their ends."""
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
+
+
+def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
+    """Return the look of a place: white where something begins, black where it ends."""
+    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": size}
 
 
 def drawable(text: str) -> str:
@@ -129,18 +184,13 @@ def drawable(text: str) -> str:
     )
 
 
-def inches(figure: Figure, *, left: float, right: float, top: float, bottom: float) -> dict[str, float]:
-    """Return margins [in] as the fractions that `Figure.subplots_adjust` takes."""
-    width, height = figure.get_size_inches()
-    return {"left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height}
-
-
 def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
     """Write a figure as ``stem.format`` in each of `formats`; the bytes depend on the figure alone."""
-    for form in formats:
-        memory = BytesIO()
-        figure.savefig(memory, format=form, **SAVE[form])
-        stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
+    with style():
+        for form in formats:
+            memory = BytesIO()
+            figure.savefig(memory, format=form, **SAVE[form])
+            stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
-from icrtool.output.page.pictures import WITH_PLACE, Picture, drawn_pictures, pictures_in
+from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
@@ -121,15 +120,15 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
 
 def draw_pictures(run: Run) -> dict[str, Picture]:
     """Draw the pictures of a run anew, into memory."""
-    from icrtool.output.figures.run_figures import FIGURES
+    from icrtool.output.figures.catalogue import figures_of
 
-    return drawn_pictures({name: partial(draw, run) for name, draw in FIGURES.items()})
+    return drawn_pictures(figures_of("run", run))
 
 
 def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Picture]:
     """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
     metric = run.summary["gnss"]["datum"] is None
-    return {name: one for name, one in pictures.items() if not (metric and name.partition("_")[0] in WITH_PLACE)}
+    return {name: one for name, one in pictures.items() if not (metric and one.with_place)}
 
 
 def _utc(stamp_ns: int) -> str:

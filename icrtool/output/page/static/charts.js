@@ -264,15 +264,17 @@ const icrtoolCharts = (() => {
   const LOOKS = {
     recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
     no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
-    recommended_gyro: { color: "recommended", dash: "dashed", width: 2 },
+    multiplier: { color: "other", dash: "dashdot", width: 2 }, window: { color: "other", dash: "dashed", width: 2 },
+    extended: { color: "recommended", width: 2.6 },
   };
   const OTHERS = [["other", "solid"], ["icr", "dotted"], ["no-slip", "solid"], ["final", "dashdot"], ["other", "dashed"],
     ["icr", "dashdot"], ["no-slip", "dotted"], ["recommended", "dotted"]].map(([color, dash]) => ({ color, dash, width: 2 }));
   const met = new Map();
 
-  /** Return how a model is drawn: the same in every chart; models without a look of their own take turns. */
+  /** Return how a model is drawn: the same in every chart, thin with a measured turn rate; others take turns. */
   function lookOf(name) {
-    if (LOOKS[name]) return LOOKS[name];
+    const wheels = name.replace(/_(gyro|heading)$/, "");
+    if (LOOKS[wheels]) return wheels === name ? LOOKS[name] : { ...LOOKS[wheels], width: 1.2 };
     if (!met.has(name)) met.set(name, met.size);
     return OTHERS[met.get(name) % OTHERS.length];
   }

@@ -154,7 +154,7 @@ const icrtoolMap = (() => {
         lines.push({ d: line(north, east, x, y, start, end), color: color("filter"), width: 3.5, dash: null, end: [east[end], north[end]] });
         for (const model of loop.models) {
           const look = lookOf(model.name), norths = model.path.north.map((v) => v + north[start]), easts = model.path.east.map((v) => v + east[start]);
-          lines.push({ d: line(norths, easts, x, y), color: color(look.color), width: 2.6, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[look.dash] || null,
+          lines.push({ d: line(norths, easts, x, y), color: color(look.color), width: 1.3 * look.width, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[look.dash] || null,
             end: [easts[easts.length - 1], norths[norths.length - 1]] });
         }
       }
