@@ -99,7 +99,7 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
         if right is not None and left is not None and row.start_utc:
             points.append(IcrPoint(row.robot, row.start_utc, right, left, *std))
         if (error := row.errors.get(SHOWN_ERROR)) is not None:
-            name = ", ".join(part for part in (row.robot, row.group) if part) or "all logs"
+            name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, []).append(error)
         if row.status == "failed":
             reasons[reason_of(row)] += 1

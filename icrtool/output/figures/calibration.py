@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.style import ICR, new_figure, styled
+from icrtool.output.figures.style import ICR, add_legend, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,13 +18,14 @@ SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
 BEFORE: dict[str, Any] = {
+    "label": "as configured, with the W found",
     "marker": "s",
     "color": "0.62",
     "markersize": 3.2,
     "linestyle": "none",
     "markeredgewidth": 0.0,
 }
-AFTER: dict[str, Any] = BEFORE | {"marker": "o", "color": ICR.color, "markersize": 2.8}
+AFTER: dict[str, Any] = BEFORE | {"label": "calibrated", "marker": "o", "color": ICR.color, "markersize": 2.8}
 
 
 @styled
@@ -48,11 +48,7 @@ def residuals_figure(name: str, residuals: WindowResiduals) -> Figure:
     turn.set_ylim(-_reach(turned), _reach(turned))
     _label(place, residuals.before, residuals.after, 1.0, "m")
     _label(turn, residuals.turn_before[None], residuals.turn_after[None], float(np.degrees(1.0)), "°")
-    keys = [
-        Line2D([], [], label="as configured, with the W found", **BEFORE | {"markersize": 6}),
-        Line2D([], [], label="calibrated", **AFTER | {"markersize": 6}),
-    ]
-    figure.legend(handles=keys, ncols=2)
+    add_legend(figure, markerscale=2.0)
     return figure
 
 

@@ -5,11 +5,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.figures.style import ICR, LABEL_BOX, MEAN, MODEL_WORDS, NO_SLIP, Pen, fill_bins, new_figure, styled
+from icrtool.output.figures.style import (
+    ICR,
+    LABEL_BOX,
+    MEAN,
+    MODEL_WORDS,
+    NO_SLIP,
+    Pen,
+    add_legend,
+    fill_bins,
+    new_figure,
+    styled,
+)
 from icrtool.output.text_format import metres_text, run_title
 from icrtool.records.dropout import ModelResult
 
@@ -98,9 +108,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     for axes, result in zip(panels, results, strict=True):
         _draw_bins(axes, result, h, _look(report, result.name)[0], end)
     panels[-1].set_xlabel("Error [m]")
-    keys = [Line2D([], [], label="95 % of the trials", **P95.keywords())]
-    keys.append(Line2D([], [], label="expected value", **MEAN.keywords()))
-    figure.legend(handles=keys, ncols=2, columnspacing=3.0)
+    add_legend(figure, columnspacing=3.0)
     return figure
 
 
@@ -160,8 +168,8 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     width = float(bins.right[0] - bins.left[0])
     edges = np.append(bins.left, bins.right[-1])
     fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
-    axes.axvline(p95, **P95.keywords())
-    axes.axvline(expected, **MEAN.keywords())
+    axes.axvline(p95, label="95 % of the trials", **P95.keywords())
+    axes.axvline(expected, label="expected value", **MEAN.keywords())
     label = MODEL_WORDS.get(result.name, result.label)
     axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
     facts = f"expected {metres_text(expected)},  95 % within {metres_text(p95)},  max {metres_text(largest)}"

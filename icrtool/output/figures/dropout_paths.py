@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox, BboxBase
 
 from icrtool.dropout_analysis.report import DropoutReport
@@ -26,6 +25,7 @@ from icrtool.output.figures.style import (
     REAL,
     WIDTH_IN,
     Pen,
+    add_legend,
     new_figure,
     spot,
     styled,
@@ -83,7 +83,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
-    _add_keys(figure, examples)
+    add_legend(figure)
     return figure
 
 
@@ -117,7 +117,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
         axes.tick_params(labelsize=7.5)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
-    _add_keys(figure, worst)
+    add_legend(figure)
     return figure
 
 
@@ -157,18 +157,14 @@ def dropout_outages(report: DropoutReport) -> Figure:
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
-    for kind, pen in OUTAGES.items():
-        label = f"{kind} outage"
-        for one in outages:
-            if one.kind == kind:
-                draw_path(axes, one.north_m, one.east_m, cell, pen, zorder=3, label=label)
-                label = ""
+    for one in outages:
+        draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[one.kind], zorder=3, label=f"{one.kind} outage")
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(one.east_m[row], one.north_m[row]) for one in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **spot(fill))
     _write_errors(axes, outages)
     name_directions(axes)
-    figure.legend(ncols=5)
+    add_legend(figure)
     return figure
 
 
@@ -183,30 +179,23 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
 
 def _draw_drive(axes: Axes, drive: ExampleTrial, shape: float) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
-    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, 2.0)]
-    lines += [(path.north, path.east, PENS[name], 3.0) for name, path in drive.paths.items()]
-    lines = [(north - drive.north_m, east - drive.east_m, pen, order) for north, east, pen, order in lines]
+    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, "filter")]
+    lines += [(path.north, path.east, PENS[name], MODEL_WORDS[name]) for name, path in drive.paths.items()]
+    lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape)
-    for north, east, pen, order in lines:
-        draw_path(axes, north, east, cell, pen, zorder=order)
-        axes.plot(east[-1:], north[-1:], zorder=order + 2, **_end(pen))
-    axes.plot([0.0], [0.0], zorder=6, **spot("white"))
-
-
-def _add_keys(figure: Figure, drives: Sequence[ExampleTrial]) -> None:
-    keys = [Line2D([], [], label="start", **spot("white")), Line2D([], [], label="filter", **FILTER.keywords())]
-    keys += [Line2D([], [], label=MODEL_WORDS[name], **PENS[name].keywords()) for name in drives[0].paths]
-    keys.append(Line2D([], [], label="where each ends", **_end(Pen("0.45"))))
-    figure.legend(handles=keys, ncols=len(keys))
+    axes.plot([0.0], [0.0], zorder=6, label="start", **spot("white"))
+    for order, (north, east, pen, label) in enumerate(lines):
+        draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
+    for north, east, pen, _ in lines:
+        axes.plot(
+            east[-1:], north[-1:], linestyle="none", marker="D", color=pen.color, markersize=4.5, zorder=5,
+            label="where each ends",
+        )  # fmt: skip
 
 
 def _turn_text(drive: ExampleTrial) -> str:
     return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
-
-
-def _end(pen: Pen) -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "D", "color": pen.color, "markersize": 4.5}
 
 
 def _outages_text(outages: Sequence[Outage]) -> str:

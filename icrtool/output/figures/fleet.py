@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.output.figures.style import drawable, new_figure, shortened, styled
+from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, shortened, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,14 +61,14 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
             axes.errorbar(
                 when, [point[2 + side] for point in mine], [point[4 + side] for point in mine],
                 linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
-                markersize=4.5, capsize=2.0, linewidth=1.0, label=drawable(robot or "robot"),
+                markersize=4.5, capsize=2.0, linewidth=1.0, label=drawable(robot or "robot not named"),
             )  # fmt: skip
         axes.set_ylabel(label)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
     panels[-1].set_xlabel("Date (UTC) [-]")
-    figure.legend(*panels[0].get_legend_handles_labels(), ncols=4)
+    add_legend(figure, ncols=4)
     return figure
 
 
@@ -81,7 +81,7 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
     for row, values in enumerate(fleet.errors_m.values()):
         axes.plot(values, [row] * len(values), linestyle="none", marker="o", markersize=4.5, color=COLORS[0], alpha=0.6)
         axes.plot([float(np.median(values))] * 2, [row - 0.3, row + 0.3], color="black", linewidth=2.0)
-    axes.set(xlim=(0, None), xlabel="Error [m]")
+    logarithmic_errors(axes)
     return figure
 
 

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
-from icrtool.output.figures.style import ICR, new_figure, styled
+from icrtool.output.figures.style import ICR, logarithmic_errors, new_figure, styled
 from icrtool.output.text_format import FITTED, run_title
 from icrtool.records.dropout import CHOICE_HORIZON_M, ModelScore
 
@@ -42,11 +41,7 @@ def model_comparison(report: DropoutReport) -> Figure:
     )  # fmt: skip
     axes = figure.subplots()
     _draw_rows(axes, scores, h)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("Error [m], logarithmic")
+    logarithmic_errors(axes)
     axes.grid(visible=False, axis="y")
     keys = [
         Line2D([], [], label="95 %", linestyle="none", marker="D", color="0.25", markersize=5),

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.kernels.arrays import Floats
 from icrtool.records.text import escaped
@@ -167,6 +168,14 @@ def shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
 
 
+def add_legend(figure: Figure, **layout: Any) -> None:
+    """Add a legend below all axes with each label once; in one row where `layout` has no number of columns."""
+    entries = (zip(*axes.get_legend_handles_labels()[::-1], strict=True) for axes in figure.axes)
+    found = {label: handle for axes_entries in reversed([*entries]) for label, handle in axes_entries}
+    if found:
+        figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+
+
 def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
     """Return the look of a place: white where something begins, black where it ends."""
     return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": size}
@@ -193,25 +202,23 @@ def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
             stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
 
 
-@dataclass(frozen=True, slots=True)
-class TimeAxis:
-    """A unit of time that suits a span: seconds, minutes or hours."""
-
-    unit: str
-    seconds: float
-
-    @classmethod
-    def for_span(cls, span_s: float) -> TimeAxis:
-        """Choose the unit for a span [s]."""
-        if span_s <= 600:
-            return cls("s", 1.0)
-        return cls("min", 60.0) if span_s <= 4 * 3600 else cls("h", 3600.0)
+def time_unit(span_s: float) -> tuple[str, float]:
+    """Return the unit of time that suits a span [s], and its seconds."""
+    return ("s", 1.0) if span_s <= 600 else ("min", 60.0) if span_s <= 4 * 3600 else ("h", 3600.0)
 
 
 def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
     """Fill the bins of a histogram from zero up; `Axes.stairs` measures every step of its outline and takes longer."""
     filled = axes.fill_between(edges, np.append(heights, heights[-1:]), step="post", linewidth=0, **look)
     filled.sticky_edges.y.append(0.0)
+
+
+def logarithmic_errors(axes: Axes) -> None:
+    """Give the x axis errors [m] on a logarithmic scale with plain numbers."""
+    axes.set(xscale="log", xlabel="Error [m], logarithmic")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def shade_spans(axes: Axes, spans: Floats, label: str = "") -> None:

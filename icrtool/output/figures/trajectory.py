@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryPath, odometry
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
 from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
 from icrtool.output.figures.style import (
@@ -20,14 +20,15 @@ from icrtool.output.figures.style import (
     LABEL_BOX,
     NO_SLIP,
     WIDTH_IN,
+    add_legend,
     new_figure,
     spot,
     styled,
 )
 from icrtool.output.text_format import distance_text, duration_text, metres_text, position_word, run_title
-from icrtool.records.measurements import Fixes
 from icrtool.records.run import Run
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
+from icrtool.records.tables import States
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,63 +97,55 @@ def trajectory(run: Run) -> Figure:
     axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **spot("white", 8.0))
     axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **spot("black", 6.0))
     name_directions(axes)
-    figure.legend(ncols=2, columnspacing=3.0)
+    add_legend(figure, ncols=2, columnspacing=3.0)
     return figure
 
 
 def _extent(run: Run, *paths: OdometryPath | None) -> tuple[Floats, Floats]:
     """Return the least and the greatest (north, east) to show [m]."""
-    table = run.table
-    lowest = np.array([table.north_m.min(), table.east_m.min()])
-    highest = np.array([table.north_m.max(), table.east_m.max()])
+    lowest, highest = _corners(run.table)
     detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
-    low, high = lowest.copy(), highest.copy()
-    for path in paths:
-        if path is not None:
-            low = np.minimum(low, [path.north_m.min(), path.east_m.min()])
-            high = np.maximum(high, [path.north_m.max(), path.east_m.max()])
-    return np.maximum(low, lowest - detour), np.minimum(high, highest + detour)
+    lows, highs = zip(*(_corners(path) for path in (run.table, *paths) if path is not None), strict=True)
+    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
+
+
+def _corners(path: States | OdometryPath) -> tuple[Floats, Floats]:
+    """Return the least and the greatest (north, east) of a path [m]."""
+    place = np.array([path.north_m, path.east_m])
+    return place.min(axis=1), place.max(axis=1)
 
 
 def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
-    low = path.north_m.min() < lowest[0] or path.east_m.min() < lowest[1]
-    high = path.north_m.max() > highest[0] or path.east_m.max() > highest[1]
-    return " (out of view)" if low or high else ""
+    low, high = _corners(path)
+    return " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    fixes, kind = run.sensors.fixes, run.sensors.fixes.fix_class
-    word, used = position_word(run.summary), run.gnss.used
-    several = len(np.unique(kind)) > 1
-    for value, look in FIX_LOOKS.items():
-        label = f"{word}, {CLASSES[value]}" if several else word
-        _draw_places(axes, fixes, used & (kind == value), (lowest, highest, cell_m), {**look, "label": label})
-    rejected = {**REJECTED_LOOK, "label": f"{word}, rejected"}
-    _draw_places(axes, fixes, run.gnss.rejected, (lowest, highest, cell_m), rejected)
-
-
-def _draw_places(
-    axes: Axes, fixes: Fixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
-) -> None:
-    if not chosen.any():
-        return
-    lowest, highest, cell_m = view
-    north, east = fixes.north_m[chosen], fixes.east_m[chosen]
-    seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
-    shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
-    axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
+    """Draw the fixes in view: those used, by class, and those rejected."""
+    fixes, word, gnss = run.sensors.fixes, position_word(run.summary), run.gnss
+    several = len(np.unique(fixes.fix_class)) > 1
+    groups = [
+        (gnss.used & (fixes.fix_class == value), look, f"{word}, {CLASSES[value]}" if several else word)
+        for value, look in FIX_LOOKS.items()
+    ]
+    place = np.column_stack([fixes.north_m, fixes.east_m])
+    seen = ((place >= lowest) & (place <= highest)).all(axis=1)
+    for chosen, look, label in (*groups, (gnss.rejected, REJECTED_LOOK, f"{word}, rejected")):
+        if chosen.any():
+            north, east = place[chosen & seen].T
+            shown = places(north, east, cell_m)
+            axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
 
 
 def _draw_events(axes: Axes, run: Run) -> None:
     """Mark where the slip events were: the filter's path through each, and a ring at its begin."""
-    table, label = run.table, "slip event"
+    table = run.table
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():
             east, north = table.east_m[rows], table.north_m[rows]
             axes.plot(east, north, color=FLOAT_COLOR, linewidth=3.0, zorder=4.5)
-            axes.plot(east[:1], north[:1], label=label, **SLIP_LOOK)
-            label = "_"
+            axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:

@@ -213,7 +213,7 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
     rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
     for one in paths:
         columns = {"forward": one.place.real, "right": one.place.imag, "turn": one.heading}
-        path = {"every": every, "first_turn": float(one.heading[0])}
+        path: dict[str, Any] = {"every": every, "first_turn": float(one.heading[0])}
         path |= {name: packed_sums(column[rows]) for name, column in columns.items()}
         found = {"name": one.name, "label": one.label, "path": path}
         models.insert(

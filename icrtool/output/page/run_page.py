@@ -23,7 +23,7 @@ from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
 from icrtool.output.text_format import duration_text, length_text, position_word
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run import ICR_WORDS, Run
 from icrtool.records.samples import ROLE_WORDS
 
 SCRIPTS = (
@@ -82,7 +82,7 @@ def run_page(
     return render(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
         title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
-        pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
+        pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
         warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]], streams=_streams(summary),
         begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
