@@ -86,7 +86,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
 
 def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:
     """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed."""
-    from icrtool.output.figures.catalogue import figures_of
+    from icrtool.output.figure_catalogue import FIGURES, figures_of
     from icrtool.output.figures.fleet import FleetNumbers, IcrPoint
     from icrtool.output.picture_file import save_picture
 
@@ -108,7 +108,7 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
     drawn = {directory / f"{name}.{form}": figure for name, figure in figures_of("fleet", numbers) for form in formats}
     for file, figure in drawn.items():
         save_picture(figure, file)
-    for name in ("icrs", "errors", "failures"):
+    for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
         for old in set(directory.glob(f"{name}.*")) - set(drawn):
             old.unlink()
 

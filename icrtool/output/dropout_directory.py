@@ -83,7 +83,7 @@ class ReportWriter:
     def finish(self, report: DropoutReport) -> None:
         """Draw the figures and write the tables."""
         if self._plots:
-            from icrtool.output.figures.catalogue import draw_figures
+            from icrtool.output.figure_catalogue import draw_figures
 
             draw_figures("report", report, self._directory / "plots", self._plots)
         write_tables(report, self._directory)

@@ -121,7 +121,7 @@ def write_run(
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
         if plots:
-            from icrtool.output.figures.catalogue import draw_figures
+            from icrtool.output.figure_catalogue import draw_figures
 
             draw_figures("run", run, partial / "plots", plots)
         sums: dict[str, str] = {}

@@ -18,14 +18,14 @@ SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
 BEFORE: dict[str, Any] = {
-    "label": "as configured, with the W found",
+    "label": "before: as configured, W estimated",
     "marker": "s",
     "color": "0.62",
     "markersize": 3.2,
     "linestyle": "none",
     "markeredgewidth": 0.0,
 }
-AFTER: dict[str, Any] = BEFORE | {"label": "calibrated", "marker": "o", "color": ICR.color, "markersize": 2.8}
+AFTER: dict[str, Any] = BEFORE | {"label": "after: calibrated", "marker": "o", "color": ICR.color, "markersize": 2.8}
 
 
 @styled

@@ -21,6 +21,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 P = ParamSpec("P")
@@ -170,8 +171,10 @@ def shortened(text: str, most: int) -> str:
 
 def add_legend(figure: Figure, **layout: Any) -> None:
     """Add a legend below all axes with each label once; in one row where `layout` has no number of columns."""
-    entries = (zip(*axes.get_legend_handles_labels()[::-1], strict=True) for axes in figure.axes)
-    found = {label: handle for axes_entries in reversed([*entries]) for label, handle in axes_entries}
+    found: dict[str, Artist] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(str(label), handle)
     if found:
         figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
 

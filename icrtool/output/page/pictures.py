@@ -46,7 +46,7 @@ def pictures_in(directory: Path) -> dict[str, Picture]:
 
 def pictures_of(found: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
     """Return pictures given as name and PNG file."""
-    from icrtool.output.figures.catalogue import entry_of
+    from icrtool.output.figure_catalogue import entry_of
 
     pictures = {}
     for name, content in found:

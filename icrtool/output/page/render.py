@@ -31,6 +31,8 @@ BEGIN = "document.documentElement.classList.replace('no-js', 'js');"
 
 UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|mm|km|s|min|h|Hz|m/s|%|°|±)(?![\w]))|(?<=±) (?=[\d.])")
 """The space between a value and its unit, and those about ±."""
+RANGE = re.compile(r"(?<=\d)-(?=\d+(\.\d+)?\xa0)")
+"""The hyphen of a range of values."""
 
 IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
 """Escapes in JSON, so that no text in it can end the element it stands in."""
@@ -99,7 +101,7 @@ def _with_units(text: str) -> Markup:
     """Return a text whose values stay on one line with their units and standard deviations."""
     from markupsafe import Markup, escape
 
-    return Markup(UNIT.sub("\xa0", str(escape(escaped(text)))))  # noqa: S704 - escaped
+    return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", str(escape(escaped(text))))))  # noqa: S704 - escaped
 
 
 def _breakable(name: str) -> Markup:

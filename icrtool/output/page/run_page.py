@@ -120,7 +120,7 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
 
 def draw_pictures(run: Run) -> dict[str, Picture]:
     """Draw the pictures of a run anew, into memory."""
-    from icrtool.output.figures.catalogue import figures_of
+    from icrtool.output.figure_catalogue import figures_of
 
     return drawn_pictures(figures_of("run", run))
 

@@ -17,7 +17,7 @@ from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.output.figures.catalogue import draw_figures
+from icrtool.output.figure_catalogue import draw_figures
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.style import style

@@ -19,7 +19,7 @@ from icrtool.errors import RunError
 from icrtool.estimation.fit import fit
 from icrtool.output import run_directory
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.figures.catalogue import FIGURES
+from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import SAVE, style
 from icrtool.output.json_file import json_bytes
 from icrtool.output.run_directory import write_run

@@ -53,6 +53,20 @@ const icrtoolCharts = (() => {
     return svg;
   }
 
+  /** Return a label with a sample of a line and its name; with a box that shows or hides it where `change` is given. */
+  function toggle(one, shown, change) {
+    const label = document.createElement("label");
+    if (change) {
+      const box = document.createElement("input");
+      box.type = "checkbox";
+      box.checked = shown;
+      box.addEventListener("change", () => change(box.checked));
+      label.append(box, " ");
+    }
+    label.append(sample(one), one.label);
+    return label;
+  }
+
   function line(one) {
     return { label: one.label, stroke: color(one.color), width: one.width || 1.3, dash: DASHES[one.dash || "solid"],
       points: { show: false } };
@@ -325,16 +339,8 @@ const icrtoolCharts = (() => {
       ...(reference.p95.length ? [{ color: "reference", dash: "dotted", label: "position reference alone" }] : []),
       ...data.budgets_m.map((budget) => ({ color: "budget", dash: "dashed", label: `budget ${budget} m` }))];
     list.replaceChildren(...entries.map((one) => {
-      const item = document.createElement("li"), label = document.createElement("label");
-      if (one.name) {
-        const box = document.createElement("input");
-        box.type = "checkbox";
-        box.checked = !hidden.has(one.name);
-        box.addEventListener("change", () => { hidden[box.checked ? "delete" : "add"](one.name); draw(); });
-        label.append(box, " ");
-      }
-      label.append(sample(one), one.label);
-      item.append(label);
+      const item = document.createElement("li");
+      item.append(toggle(one, true, one.name && ((shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); })));
       return item;
     }));
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
@@ -349,5 +355,5 @@ const icrtoolCharts = (() => {
     };
   }
 
-  return { timeCharts, errorChart, color, clock, lookOf, sample };
+  return { timeCharts, errorChart, color, clock, lookOf, toggle };
 })();

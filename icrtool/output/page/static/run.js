@@ -57,7 +57,8 @@ const icrtoolPage = (() => {
     const body = table.createTBody();
     for (const model of result.models) {
       const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
-      name.append(icrtoolCharts.sample({ ...icrtoolCharts.lookOf(model.name) }), ` ${model.label}`);
+      const look = { ...icrtoolCharts.lookOf(model.name), label: model.label };
+      name.append(icrtoolCharts.toggle(look, !map.hidesModel(model.name), (shown) => map.hideModel(model.name, !shown)));
       for (const error of model.errors) text("td", error === null ? "–" : error < 1 ? `${error.toFixed(3)} m` : `${error.toFixed(2)} m`, line);
     }
     box.replaceChildren(table);
