@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.collections import EllipseCollection
+from matplotlib.patches import Circle
 
 from icrtool.calibration.forecast import Forecast
 from icrtool.output.figures.style import FILTER, HALF_WIDTH, ICR, LABEL_BOX, MEAN, new_figure, styled
@@ -44,17 +44,11 @@ def forecast_figure(
     # Where the forecast is extrapolated its circles would bury the path.
     measured = np.flatnonzero(forecast.distance_m <= measured_m)
     rows = measured[:: max(len(measured) // CIRCLES, 1)]
-    size = 2.0 * forecast.p95_m[rows]
-    circles = EllipseCollection(
-        size, size, np.zeros(len(rows)), units="xy", offset_transform=path.transData, edgecolors=ICR.color,
-        facecolors="none", linewidths=0.8, offsets=np.column_stack([forecast.east_m[rows], forecast.north_m[rows]]),
-    )  # fmt: skip
+    for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
+        path.add_patch(
+            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=ICR.color, linewidth=0.8)
+        )
     path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=ICR.color, linewidth=0.8)
-    path.add_collection(circles)
-    path.update_datalim(
-        [(e + a * r, n + a * r) for e, n, r in zip(forecast.east_m[rows], forecast.north_m[rows], size / 2, strict=True)
-         for a in (-1, 1)]
-    )  # fmt: skip
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     path.set(xlabel="East [m]", ylabel="North [m]")

@@ -62,10 +62,8 @@ def _draw_rows(axes: Axes, scores: list[ModelScore], h: int) -> None:
         color, marker = (ICR.color, "o") if held_out else ("0.6", "s")
         p95, expected = float(score.summary.p95[h]), float(score.summary.expected[h])
         axes.plot([expected, p95], [y, y], color=color, linewidth=1.2)
-        axes.plot([p95], [y], marker=marker, color=color, markersize=6.5, linestyle="none")
-        axes.plot(
-            [expected], [y], marker=marker, color=color, markerfacecolor="white", markersize=6.5, linestyle="none"
-        )
+        for place, fill in ((p95, color), (expected, "white")):
+            axes.plot([place], [y], marker, color=color, markerfacecolor=fill, markersize=6.5)
         axes.annotate(
             f"{p95:.2f} / {expected:.2f} m", (p95, y), xytext=(7, 0), textcoords="offset points", va="center",
             fontsize=8, color="0.2", annotation_clip=False,

@@ -90,6 +90,6 @@ def draw_consistency(result: StudyResult) -> Figure:
     bottom.set_ylim(min(80.0, *(float(curves[f"coverage {name}"].min()) - 2 for name in cases)), 101)
     bottom.set_xticks(np.arange(len(states)), [state.replace("_", " ") for state in states])
     bottom.set_ylabel("Within 2 sigma [%]")
-    bottom.legend(loc="lower right", ncols=len(cases), frameon=True, framealpha=0.9)
+    bottom.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(cases), borderaxespad=0.0)
     figure.legend(*top.get_legend_handles_labels(), ncols=4)
     return figure

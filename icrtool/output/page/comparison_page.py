@@ -14,9 +14,6 @@ from icrtool.records.dropout import CHOICE_HORIZON_M
 
 SCRIPTS = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js", "columns.js", "charts.js", "comparison.js")
 
-CELL_KEYS = {**ERROR_KEYS, "expected": "expected_m", "expected_low": "expected_low_m",
-             "expected_high": "expected_high_m"}  # fmt: skip
-
 COMPARISON_FAMILY = "icrtool/compare/"
 
 
@@ -48,7 +45,7 @@ def _errors(cells: Sequence[Mapping[str, Any]], names: Sequence[str], tested_on:
         "horizons_m": horizons,
         "models": [
             {"name": f"of {name}", "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}"}
-            | {key: [rows.get((name, h), {}).get(column) for h in horizons] for key, column in CELL_KEYS.items()}
+            | {key: [rows.get((name, h), {}).get(f"{key}_m") for h in horizons] for key in ERROR_KEYS}
             for name in names
         ],
         "reference": {"p95": [], "expected": []},

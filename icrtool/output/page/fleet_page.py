@@ -119,10 +119,8 @@ def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the 
 
 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
-    if value is None:
-        return Cell("", None)
-    text = f"{value:{sign}.3f}".replace("-", "−")
-    return Cell(text + (f" ± {std:.3f}" if std is not None else ""), value)
+    spread = f" ± {std:.3f}" if std is not None else ""
+    return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
 
 
 def _link(run: str, folder: Path) -> str:

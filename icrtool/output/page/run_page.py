@@ -15,6 +15,7 @@ from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
+from icrtool.output.json_file import schema_of
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
@@ -99,16 +100,11 @@ def read_report(directory: Path) -> dict[str, Any] | None:
         It is not a report of this version.
     """
     file = directory / DROPOUT_DIRECTORY / REPORT_FILE
-    try:
-        document = json.loads(file.read_bytes())
-        schema = document["schema"]
-    except FileNotFoundError:
+    if not file.exists():
         return None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as err:
-        raise RunError(file, "cannot be read", "make it again with icrtool dropout-report") from err
-    if schema != DROPOUT_SCHEMA:
-        raise RunError(file, f"its schema is {schema}, this icrtool reads {DROPOUT_SCHEMA}", "make it again")
-    return dict(document)
+    if schema_of(file) != DROPOUT_SCHEMA:
+        raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
+    return dict(json.loads(file.read_bytes()))
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
