@@ -20,8 +20,8 @@ from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.motion.models import TrackGeometry, TypicalDrive
-from icrtool.output.run_schema import DriveDocument, IcrDocument, InputDocument, RunDocument
 from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
+from icrtool.records.run_document import DriveDocument, IcrDocument, InputDocument, RunDocument
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference" / "schemas"
 
@@ -156,14 +156,19 @@ ForecastDocument = plain("ForecastDocument", {
     "not_shown": list[str], "warnings": list[str], "along": Along,
 })  # fmt: skip
 
+FleetVerdict = plain("FleetVerdict", {
+    "gate": str, "passed": bool, "line": str, "relative": bool, "not_checked": str, **dict.fromkeys(
+        ("value_m", "margin_m", "bound_m", "baseline_m", "margin_low_m", "margin_high_m"), Number
+    ),
+})  # fmt: skip
 Counts = plain("Counts", {"done": int, "failed": int, "skipped": int})
 FleetDocument = plain("FleetDocument", {
     "schema": Literal["icrtool/fleet/1"], "tool_version": str, "counts": Counts, "gates_failed": int,
-    "calibrations": list[PooledCalibration], "logs": list[Row],
+    "calibrations": list[PooledCalibration], "logs": list[record(Row, verdicts=list[FleetVerdict])],
 })  # fmt: skip
 
 DOCUMENTS: dict[str, type] = {
-    "run": plain("Run", get_type_hints(RunDocument, include_extras=True) | {"schema": Literal["icrtool/run/1"]}),
+    "run": RunDocument,
     "dropout": DropoutDocument, "calibration": CalibrationDocument, "compare": CompareDocument,
     "forecast": ForecastDocument, "fleet": FleetDocument,
 }  # fmt: skip

@@ -17,15 +17,17 @@ from icrtool.calibration.forecast import forecast_drive
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.pooled import recording_of
 from icrtool.calibration.transfer import compare_groups
+from icrtool.dropout_analysis.acceptance_limits import parse_gate
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import PooledCalibration
-from icrtool.fleet.row import File, GateVerdict, Row
+from icrtool.fleet.row import File, Row
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.json_file import json_bytes
 from icrtool.output.tables.forecast import forecast_document
 from icrtool.output.tables.transfer import transfer_document
+from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
 
@@ -54,7 +56,7 @@ def documents() -> dict[str, Any]:
         run, horizons_m=(1.0, 5.0), outage_s=(4.0,), gates=("icr.p95@5m <= 0.001",), calibrations=[calibration],
         without_events=True,
     )  # fmt: skip
-    verdicts = (GateVerdict("icr.p95@5m <= 1", 0.5, 0.5, passed=True),)
+    verdicts = (Verdict(parse_gate("icr.p95@5m <= 1"), passed=True, value_m=0.5, margin_m=0.5),)
     row = Row("a.bag", "runs/a", "done", verdicts=verdicts, inputs=(File("a.bag", 1, 2, "ab"),), icr={"x_icr_m": None})
     pooled = PooledCalibration("jackal", "grass", ("a.bag",), ())
     found = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,60 +25,6 @@ LARGEST_SHARE = 0.5
 """A calibration whose 95 % error is more than this share of the distance is not fit for use."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExportNumbers:
-    """Numbers of a calibration for a robot's configuration. Covariances are of x forward, y left, yaw.
-
-    Attributes
-    ----------
-    log : what it was fitted to; begin_ns : stamp of the first state; distance_m : driven
-    model, created : what is recommended, and when it was fitted
-    separation_multiplier : (y_r - y_l) / b of the recommended model
-    twist_width_m : separation with which the log's odometry was made, its multiplier included; None where it is not
-        known
-    left_radius_multiplier, right_radius_multiplier : radius over the configured one, configured scales included
-    icrs_m, icr_std_m : y_icr_right, y_icr_left, x_icr
-    pose_variance : (3,) after `POSE_AFTER_M` [m^2, m^2, rad^2], held out
-    twist_variance : (3,) of velocities averaged over `TWIST_OVER_M` [m^2/s^2, m^2/s^2, rad^2/s^2], held out
-    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
-    p95_m, full_p95_m : 95th percentile of the error after `POSE_AFTER_M`, held out, of what a controller can express
-        and of the recommended model
-    warnings : sentences
-    """
-
-    log: str
-    begin_ns: int
-    distance_m: float
-    robot: str | None
-    track_width_m: float
-    wheel_radius_m: float | None
-    model: str
-    created: str
-    separation_multiplier: float
-    separation_multiplier_std: float
-    left_radius_multiplier: float
-    left_radius_multiplier_std: float
-    right_radius_multiplier: float
-    right_radius_multiplier_std: float
-    icrs_m: tuple[float, ...]
-    icr_std_m: tuple[float, ...]
-    pose_variance: tuple[float, float, float]
-    twist_variance: tuple[float, float, float]
-    turn_noise: tuple[float, float]
-    way_noise: tuple[float, float]
-    p95_m: float
-    full_p95_m: float
-    warnings: tuple[str, ...]
-    twist_width_m: float | None = None
-
-    @property
-    def factor_to_old(self) -> float | None:
-        """The multiplier over the one that the log's odometry was made with, None where that is not known."""
-        if self.twist_width_m is None:
-            return None
-        return self.separation_multiplier * self.track_width_m / self.twist_width_m
-
-
 def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
     """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
     reasons = [one for one in calibration.warnings if one.startswith("not usable")]
@@ -94,50 +39,25 @@ def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
     return tuple(reasons)
 
 
-def export_numbers(calibration: Calibration) -> ExportNumbers:
-    """Return what a controller can use of a calibration.
-
-    Raises
-    ------
-    DataError
-        The drives were too short to measure covariances.
-    """
-    errors, logs = calibration.controller, calibration.logs
-    names = ", ".join(log.name for log in logs)
-    if errors is None:
-        advice = "covariances need a longer drive"
-        raise DataError(calibration.name or names, "too short to measure the error growth", advice)
-    numbers = calibration.controller_numbers()
-    geometry, covariance = calibration.geometry()
+def export_warnings(calibration: Calibration) -> tuple[str, ...]:
+    """Return what to know before a controller uses a calibration, a sentence each."""
     warnings = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
     warnings += [
         f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
         for name in calibration.fitted.not_shown
     ]
-    if numbers.multiplier < 1.0:
+    if (multiplier := calibration.controller_numbers().multiplier) < 1.0:
         why = "a skid-steer robot turns less than its wheels, not more"
-        warnings.append(f"a multiplier of {numbers.multiplier:.2f} is below 1: {why}")
-    return ExportNumbers(
-        names if len(logs) == 1 else f"{len(logs)} logs ({names})",
-        min(log.begin_ns for log in logs),
-        sum(log.distance_m for log in logs),
-        calibration.robot["name"],
-        calibration.width_m,
-        calibration.robot["wheel_radius_m"],
-        calibration.recommended,
-        calibration.created,
-        *numbers,
-        icrs_m=tuple(geometry[:3]),
-        icr_std_m=tuple(np.sqrt(np.diag(covariance)[:3]).tolist()),
-        pose_variance=errors.pose_variance,
-        twist_variance=errors.twist_variance,
-        turn_noise=errors.turn_noise,
-        way_noise=errors.way_noise,
-        p95_m=errors.p95_m,
-        full_p95_m=errors.full_p95_m,
-        warnings=(*calibration.warnings, *warnings),
-        twist_width_m=calibration.robot.get("twist_width_m"),
-    )
+        warnings.append(f"a multiplier of {multiplier:.2f} is below 1: {why}")
+    return (*calibration.warnings, *warnings)
+
+
+def factor_to_old(calibration: Calibration) -> float | None:
+    """Return the multiplier over the one that the log's odometry was made with, None where that is not known."""
+    old_width_m = calibration.robot.get("twist_width_m")
+    if old_width_m is None:
+        return None
+    return calibration.controller_numbers().multiplier * calibration.width_m / float(old_width_m)
 
 
 def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> ControllerErrors | None:

@@ -90,23 +90,13 @@ class ComparedModels(NamedTuple):
     recommended: ErrorsOf
 
 
-def comparison_table(
-    run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
-) -> ModelComparison:
-    """Return the table of `compare_models`."""
-    return compare_models(run, headings, horizons_m=horizons_m).table
-
-
-def compare_models(
-    run: Run, headings: Sequence[MeasuredHeading] = (), *, horizons_m: Sequence[float] = HORIZONS_M
-) -> ComparedModels:
+def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> ComparedModels:
     """Test every model on distance it was not fitted to.
 
     Parameters
     ----------
     run : a finished run, or one read back
     headings : measured headings, best first, for the models that need not turn by wheels alone
-    horizons_m : ascending
 
     Raises
     ------
@@ -119,13 +109,13 @@ def compare_models(
     filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
     recording, heading, notes = _with_heading(run, headings)
-    wheels, turned = hold_out([recording], horizons_m=horizons_m)
-    trials = block_trials(recording, plan_folds([recording]), horizons_m)
+    wheels, turned = hold_out([recording], horizons_m=HORIZONS_M)
+    trials = block_trials(recording, plan_folds([recording]), HORIZONS_M)
     scores = list(_wheels_scores(run, recording, trials, wheels))
     if turned is not None:
         scores += _turned_scores(run, recording, trials, turned, heading)
     table = ModelComparison(
-        horizons_m=tuple(horizons_m),
+        horizons_m=HORIZONS_M,
         blocks=len(wheels.folds),
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         scores=tuple(scores),

@@ -187,7 +187,7 @@ def _drive_facts(run: Run) -> DriveFacts:
     )
     moving = np.abs(left) + np.abs(right) > MOVING_MPS
     speed = (left + right)[moving] / 2
-    rate = np.abs(left - right)[moving] / max(run.summary["alignment"][SEPARATION.finding]["value"], 1e-3)
+    rate = np.abs(left - right)[moving] / max(_finding(run, SEPARATION.finding)[0], 1e-3)
     turning = rate[rate > math.radians(2.0)]
     return DriveFacts(
         math.radians(excitation["turned_right_deg"]),
@@ -199,10 +199,16 @@ def _drive_facts(run: Run) -> DriveFacts:
     )
 
 
+def _finding(run: Run, name: str) -> tuple[float, float]:
+    """Return value and standard deviation of an estimate of the alignment, NaN where the drive does not show it."""
+    found = run.summary["alignment"][name]
+    value, std = found["value"], found["std"]
+    return math.nan if value is None else value, math.nan if std is None else std
+
+
 def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
     """Return one estimate with a verdict by its standard deviation, and the reason if it is not "shown"."""
-    found = run.summary["alignment"][kind.finding]
-    value, std = (math.nan if found[key] is None else float(found[key]) for key in ("value", "std"))
+    value, std = _finding(run, kind.finding)
     verdict: Verdict = "not shown"
     if std <= kind.useful:
         verdict = "shown"
@@ -246,8 +252,7 @@ def _derive(run: Run, direct: tuple[Parameter, ...], x_icr_m: float | None) -> t
     if right is not None:
         found.append(Parameter("antenna_right_m", "antenna right", right, 0.0, "given", ""))
         middle, note = right - aside.value, "with the antenna as given"
-        icrs = [run.summary["alignment"][name] for name in ("y_icr_right_m", "y_icr_left_m")]
-        stds = [one["std"] for one in icrs]
+        stds = [_finding(run, name)[1] for name in ("y_icr_right_m", "y_icr_left_m")]
         verdict = max((separation.verdict, aside.verdict), key=("given", "shown", "weak", "not shown").index)
     else:
         middle, note = 0.0, "if the ICRs lie evenly about the body's middle"

@@ -181,6 +181,11 @@ class Calibration:
         """Return multiplier and radius factors of the recommended model for a controller."""
         return _controller_numbers(*self.geometry(), self.robot)
 
+    def log_names(self) -> str:
+        """Return the names of the logs that it was fitted to, and how many they are."""
+        names = ", ".join(log.name for log in self.logs)
+        return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
+
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
         """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks; NaN without."""
         rows = [one for one in self.held_out if one.model == model and one.horizon_m == horizon_m]

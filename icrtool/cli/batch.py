@@ -15,53 +15,36 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import plot_formats
 from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.options import POSITIVE
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
+    from icrtool.fleet.batch import BatchOptions
+    from icrtool.fleet.fit_and_report import ReportOptions
     from icrtool.fleet.one_log import Request
+    from icrtool.fleet.roll_up import PooledCalibration
     from icrtool.fleet.row import Row
 
 
 @click.command("batch")
 @click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
-@click.option("-o", "--output", metavar="DIR", required=True, type=click.Path(path_type=Path),
+@click.option("-o", "--output", metavar="DIR", required=True, type=options.FILE,
               help="Folder of the tables and, under runs/, of the run directories.")  # fmt: skip
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
               help="Logs at the same time; default: cores, fewer where memory would not hold them.")  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
-@click.option("--timeout", "timeout_s", metavar="SECONDS", type=POSITIVE, default=1800.0, show_default=True,
+@click.option("--timeout", "timeout_s", metavar="SECONDS", type=options.POSITIVE, default=1800.0, show_default=True,
               help="End a log that takes longer.")  # fmt: skip
 @click.option("--redo", is_flag=True, help="Process logs again that are done.")
 @click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
-@click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
-              help="Distance over which 95 % of the trials stay within this error; repeatable.")  # fmt: skip
-@click.option(
-    "--gate",
-    "gates",
-    metavar="TEXT",
-    multiple=True,
-    help="Acceptance limit: exit status 3 if it is not met; repeatable.",
-)
-@click.option("--ladder/--no-ladder", default=True, show_default=True,
-              help="Compare all models on distance they were not fitted to.")  # fmt: skip
-@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
-@options.page
-@options.baseline
-@click.option(
-    "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
-)
-@click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
+@options.report
 @json_option
 @options.configuration
 @options.verbosity
 def command(
     places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
-    redo: bool, overwrite: bool, budgets: tuple[float, ...], gates: tuple[str, ...], ladder: bool,
-    plots: str, page: bool, baseline: Path | None, strict: bool, junit: Path | None, markdown: Path | None,
-    as_json: bool,
+    redo: bool, overwrite: bool, asked: ReportOptions, baseline: Path | None, junit: Path | None,
+    markdown: Path | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -77,60 +60,84 @@ def command(
       icrtool batch season/ -o results --robot husky-a200
       icrtool batch logs.csv -o results -j 4 --gate "icr.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
-    from icrtool.fleet.acceptance import changes_of, format_fleet_markdown, suites_of
-    from icrtool.fleet.batch import BatchOptions, plan, run_batch
-    from icrtool.fleet.fleet_files import PLOTS, calibrations_text, fleet_document, write_fleet
+    from icrtool.fleet.batch import BatchOptions, plan
+    from icrtool.fleet.fleet_files import PLOTS, write_fleet
     from icrtool.fleet.roll_up import pooled_calibrations
-    from icrtool.output.atomic_file import check_place, write_file
 
-    asked = BatchOptions(
-        config_file, robot, sets, plot_formats(plots), gates, budgets, ladder, redo, timeout_s, overwrite, baseline,
-        strict, page,
-    )  # fmt: skip
-    for file in (junit, markdown):
-        if file is not None:
-            check_place(file)
-    compared = options.open_baseline(baseline, gates)
-    requests = plan(places, output, asked)
+    compared = options.baseline_of(baseline, asked.gates)
+    batch = BatchOptions(config_file, robot, sets, asked, redo, timeout_s, overwrite, baseline)
+    requests = plan(places, output, batch)
     output.mkdir(parents=True, exist_ok=True)
     view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
+    rows = run_all(requests, jobs, scheduler, batch, view)
+    calibrations = list(pooled_calibrations(rows, output)) if asked.ladder else []
+    drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
+    write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
+    missing = compared.missing(row.log for row in rows) if compared is not None else []
+    write_exports(rows, missing, output if asked.page else None, junit=junit, markdown=markdown)
+    if compared is not None:
+        from icrtool.fleet.acceptance import changes_of
+
+        options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
+    print_results(rows, calibrations, output, quiet=quiet, as_json=as_json)
+    options.check_compared(one for row in rows for one in row.verdicts)
+    missed = any(row.gates_failed for row in rows)
+    if missed or any(row.status == "failed" for row in rows):
+        raise SystemExit(3 if missed else 1)
+
+
+def run_all(
+    requests: Sequence[Request], jobs: int | None, scheduler: str | None, batch: BatchOptions, view: View
+) -> list[Row]:
+    """Process all logs, and return a row of each, in the order of the requests."""
+    from icrtool.fleet.batch import run_batch
+
     rows: list[Row] = []
     with (
         executor_of(requests, jobs, scheduler) as executor,
         view.live(),
-        closing(run_batch(requests, executor, asked, view.stage)) as coming,
+        closing(run_batch(requests, executor, batch, view.stage)) as coming,
     ):
         for row in coming:
             rows.append(row)
             view.row(row)
     order = {request.row.log: number for number, request in enumerate(requests)}
-    rows.sort(key=lambda row: order[row.log])
-    calibrations = [] if not asked.ladder else list(pooled_calibrations(rows, output))
-    drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
-    write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
-    missing = compared.missing(row.log for row in rows) if compared is not None else []
+    return sorted(rows, key=lambda row: order[row.log])
+
+
+def write_exports(
+    rows: Sequence[Row], missing: Sequence[str], page: Path | None, *, junit: Path | None, markdown: Path | None
+) -> None:
+    """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
     if junit is not None:
+        from icrtool.fleet.acceptance import suites_of
         from icrtool.output.exports.acceptance import write_junit
 
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
+        from icrtool.fleet.acceptance import format_fleet_markdown
+        from icrtool.output.atomic_file import write_file
+
         write_file(markdown, format_fleet_markdown(rows, missing))
-    if compared is not None:
-        options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
-    if page:
+    if page is not None:
+        from icrtool.fleet.fleet_files import fleet_document
         from icrtool.output.page.fleet_page import write_fleet_page
 
-        write_fleet_page(fleet_document(rows), output)
+        write_fleet_page(fleet_document(rows), page)
+
+
+def print_results(
+    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, *, quiet: bool, as_json: bool
+) -> None:
+    """Print what the logs came to."""
+    from icrtool.fleet.fleet_files import calibrations_text, fleet_document
+
     if as_json:
         print_json("batch", fleet_document(rows, calibrations) | {"output": escaped(str(output))})
     elif not quiet:
         click.echo(summary_of(rows, output))
         if calibrations:
             click.echo(f"\n{shown(calibrations_text(calibrations), keep=chr(10))}", nl=False)
-    options.check_compared([(one.relative, bool(one.not_checked)) for row in rows for one in row.verdicts])
-    missed = any(row.gates_failed for row in rows)
-    if missed or any(row.status == "failed" for row in rows):
-        raise SystemExit(3 if missed else 1)
 
 
 @contextmanager
@@ -199,7 +206,7 @@ class View:
             click.echo(line_of(row))
         for verdict in row.verdicts:
             if not verdict.passed:
-                click.echo(shown(verdict.line), err=True)
+                click.echo(shown(verdict.line()), err=True)
         self._show()
 
     def _show(self) -> None:
@@ -225,6 +232,8 @@ class View:
 
 def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
+    from icrtool.fleet.row import SHOWN_ERROR
+
     parts = [f"{row.status:7}", shown(row.log)]
     if row.duration_s is not None and row.distance_m is not None:
         parts.append(f"{row.duration_s:.0f} s  {row.distance_m:.0f} m")
@@ -232,7 +241,7 @@ def line_of(row: Row) -> str:
     if right is not None and left is not None:
         std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
         parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
-    if (p95 := row.errors.get("icr_p95_10m_m")) is not None:
+    if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
 

@@ -20,21 +20,11 @@ if TYPE_CHECKING:
 
 @click.command("calibrate")
 @click.argument("sources", metavar="LOG|RUN...", nargs=-1, required=True, type=options.LOG)
-@click.option(
-    "-o", "--output", metavar="FILE|DIR", type=click.Path(path_type=Path), help="Write the calibration file here."
-)
-@click.option(
-    "--x-icr",
-    metavar="METRES",
-    type=float,
-    help="Known forward position of the ICRs; gives the antenna's position. One log.",
-)
-@click.option(
-    "--plot",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Draw the residuals before and after the calibration: png, svg, pdf. One log.",
-)
+@click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
+@click.option("--x-icr", metavar="METRES", type=float,
+              help="Known forward position of the ICRs; gives the antenna's position. One log.")  # fmt: skip
+@click.option("--plot", metavar="FILE", type=options.FILE,
+              help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
 @json_option
 @options.configuration
 @options.verbosity

@@ -1,11 +1,15 @@
-"""Options for a simulated drive and its sensors: paths, parsers of values, and --change."""
+"""Options for a simulated drive and its sensors, and parsers of their values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from typing import Any
 
 import click
+
+from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Command
 
 PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
@@ -65,11 +69,64 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
         raise click.BadParameter(why, param_hint="--change")
 
 
-CHANGE = click.option(
-    "--change",
-    "changes",
-    metavar="T:YR,YL,X",
-    type=change_text,
-    multiple=True,
-    help="The ICRs become these after T seconds; repeatable.",
-)
+class Degrees(click.FloatRange):
+    """An angle in degrees; the command gets radians."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:  # noqa: ANN401 - click's
+        """Return radians."""
+        return math.radians(super().convert(value, param, ctx))
+
+
+OPTIONS: dict[str, tuple[str, str | None, Any, str]] = {
+    "--icrs": (
+        "icrs_m",
+        "YR,YL,X",
+        icrs_text,
+        "True ICRs [m]; default: wider than the robot; of a study, the paper's.",
+    ),
+    "--path": ("kind", None, click.Choice(PATHS), "What is driven; in study convergence, this alone."),
+    "--duration": (
+        "duration_s",
+        "S",
+        POSITIVE,
+        "Length of the drive [s]; default 100, or that of --speeds or the study.",
+    ),
+    "--speed": ("speed_mps", "MPS", POSITIVE, "Speed of the body; of the faster track on the spot."),
+    "--radius": ("radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
+    "--leg": ("leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
+    "--encoder-counts": (
+        "encoder_counts",
+        "N",
+        POSITIVE,
+        "Counts of a wheel revolution; default the robot's, or 8192.",
+    ),
+    "--input-noise": ("input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of the track speeds, a sample."),
+    "--input-bias": ("input_bias_mps", "MPS", float, "Bias of both track speeds."),
+    "--gnss": ("gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: 0.01, 0.30 or so many metres."),
+    "--gnss-rate": ("gnss_rate_hz", "HZ", POSITIVE, "Fixes a second."),
+}
+"""Options of `simulate` and `study`: the field of the plan, path or sensors that each sets, metavar, type, help."""
+
+
+def drive_options(**defaults: object) -> Callable[[Command], Command]:
+    """Add `OPTIONS` and --change to a command; `defaults`: by field, none for the others."""
+
+    def add(command: Command) -> Command:
+        text = "The ICRs become these after T seconds; repeatable."
+        command = click.option("--change", "changes", metavar="T:YR,YL,X", type=change_text, multiple=True, help=text)(
+            command
+        )
+        for name, (field, metavar, kind, text) in reversed(OPTIONS.items()):
+            default = defaults.get(field)
+            command = click.option(
+                name, field, metavar=metavar, type=kind, default=default, show_default=default is not None, help=text
+            )(command)
+        return command
+
+    return add
+
+
+def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that set fields of a record, those that were given or have a default."""
+    names = (field.name for field in fields(record))
+    return {name: given[name] for name in names if given.get(name) not in (None, ())}

@@ -5,26 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS, FitRequest, fit_log, logs_of, plot_formats, run_directories
+from icrtool.cli.fit import RUNS, fit_log, logs_of, run_directories
 from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.options import POSITIVE
 from icrtool.cli.stages import Stages
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
-    from icrtool.calibration.record import Calibration
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
+    from icrtool.fleet.fit_and_report import ReportOptions
     from icrtool.output.baseline_file import Baseline
     from icrtool.output.exports.acceptance import Outcome
-    from icrtool.records.dropout import Gate
     from icrtool.records.run import Run
 
 EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
@@ -36,28 +35,20 @@ class Request:
 
     Attributes
     ----------
-    horizons_m, outage_s : empty: those of the run's configuration
     config : that of the options; logs are fitted with it
+    asked, baseline : of `icrtool.cli.options.report`
+    further : further arguments of `icrtool.dropout_report`
+    horizons_m, outage_s : empty: those of the run's configuration
     prints : results on standard output
     """
 
     config: Config
+    asked: ReportOptions
+    baseline: Baseline | None
+    further: dict[str, Any]
     horizons_m: tuple[float, ...]
     outage_s: tuple[float, ...]
-    outage_at_s: tuple[float, ...]
-    budgets_m: tuple[float, ...]
-    calibrations: tuple[Calibration, ...]
-    gates: tuple[Gate, ...]
-    baseline: Baseline | None
-    strict: bool
-    starts: Literal["moving", "all"]
-    without_events: bool
     trials: bool
-    seed: int
-    formats: tuple[str, ...]
-    ladder: bool
-    page: bool
-    smoothed: bool
     overwrite: bool
     quiet: bool
     prints: bool
@@ -67,50 +58,31 @@ class Request:
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @options.place
-@click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,), show_default=True,
-              help="Report how far 95 % of the trials stay within this error; repeatable.")  # fmt: skip
 @click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
-@click.option(
-    "--gate",
-    "gates",
-    metavar="TEXT",
-    multiple=True,
-    help="Acceptance limit: exit status 3 if it is not met; repeatable.",
-)
-@options.baseline
-@click.option("--calibration", "calibrations", metavar="CAL.json", type=click.Path(path_type=Path), multiple=True,
+@click.option("--calibration", "calibrations", metavar="CAL.json", type=options.FILE, multiple=True,
               help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
-@click.option("--outage", "outages", metavar="SECONDS", type=POSITIVE, multiple=True,
+@click.option("--outage", "outages", metavar="SECONDS", type=options.POSITIVE, multiple=True,
               help="Force outages of this length on the filter; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
               help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
-@click.option("--ladder/--no-ladder", default=True, show_default=True,
-              help="Compare all models on distance they were not fitted to, gyro included.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
               help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
-@click.option(
-    "--without-events", is_flag=True, help="Leave out trials that cross a slip event, and report what they cost."
-)
+@click.option("--without-events", is_flag=True,
+              help="Leave out trials that cross a slip event, and report what they cost.")  # fmt: skip
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
               help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
-@click.option(
-    "--junit", metavar="FILE", type=click.Path(path_type=Path), help="Write the gates' verdicts as JUnit XML."
-)
-@click.option("--markdown", metavar="FILE", type=click.Path(path_type=Path), help="Write a summary for a pull request.")
-@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
-@options.page
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
+@options.report
 @json_option
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
-    budgets: tuple[float, ...], horizons: str | None,
-    gates: tuple[str, ...], baseline: Path | None, strict: bool,
+    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool, horizons: str | None,
     calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    ladder: bool, reference: str, starts: Literal["moving", "all"], without_events: bool, trials: bool,
-    junit: Path | None, markdown: Path | None, plots: str, page: bool, seed: int | None, as_json: bool,
+    reference: Literal["filter", "smoothed"], without_events: bool, starts: Literal["moving", "all"], trials: bool,
+    seed: int | None, asked: ReportOptions, baseline: Path | None, junit: Path | None, markdown: Path | None,
+    as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
@@ -125,23 +97,20 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    formats = plot_formats(plots)
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    from icrtool.dropout_analysis.acceptance_limits import parse_gate
     from icrtool.output.calibration_file import open_calibration
-    from icrtool.records.dropout import DEFAULT_SEED
 
+    further = {
+        "calibrations": tuple(open_calibration(file) for file in calibrations), "outage_at_s": outages_at,
+        "starts": starts, "without_events": without_events, "reference": reference,
+    } | ({"seed": seed} if seed is not None else {})  # fmt: skip
     request = Request(
-        config=config, horizons_m=lengths, outage_s=outages, outage_at_s=outages_at, budgets_m=budgets,
-        calibrations=tuple(open_calibration(file) for file in calibrations),
-        gates=tuple(parse_gate(text) for text in gates), baseline=options.open_baseline(baseline, gates), strict=strict,
-        starts=starts, without_events=without_events, trials=trials,
-        seed=seed if seed is not None else DEFAULT_SEED, formats=formats, ladder=ladder, page=page,
-        smoothed=reference == "smoothed", overwrite=overwrite, quiet=quiet,
+        config=config, asked=asked, baseline=options.baseline_of(baseline, asked.gates), further=further,
+        horizons_m=lengths, outage_s=outages, trials=trials, overwrite=overwrite, quiet=quiet,
         prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
-    sources, places = plan_sources(sources, (output, into), config, (junit, markdown), quiet=quiet)
+    sources, places = plan_sources(sources, (output, into), config, quiet=quiet)
     outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request)]
     if as_json:
         print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
@@ -174,7 +143,6 @@ def plan_sources(
     sources: tuple[Path, ...],
     places: tuple[Path | None, Path | None],
     config: Config,
-    exports: tuple[Path | None, ...],
     *,
     quiet: bool,
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
@@ -185,15 +153,10 @@ def plan_sources(
     Parameters
     ----------
     places : -o and --into
-    exports : files to be written
     """
-    from icrtool.output.atomic_file import check_place
     from icrtool.output.run_directory import RUN_FILE
     from icrtool.output.stored_run import newest_run
 
-    for export in exports:
-        if export is not None:
-            check_place(export)
     sources = sources or (newest_run(RUNS),)
     sources = logs_of(sources, quiet=quiet)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
@@ -228,7 +191,7 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
     failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
     missed = any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError))
     verdicts = [one for _, outcome in outcomes if not isinstance(outcome, IcrToolError) for one in outcome.verdicts]
-    options.check_compared([(bool(one.gate.baseline_factor), bool(one.not_checked)) for one in verdicts])
+    options.check_compared(verdicts)
     options.leave(failed, len(outcomes), "runs and logs", gate_failed=missed)
 
 
@@ -251,21 +214,17 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
     if place is None:
         run = _read(source)
     else:
-        run = fit_log(source, place, FitRequest(
-            request.config, formats=request.formats, smooths=request.smoothed, overwrite=request.overwrite,
-            quiet=request.quiet, verbose=request.verbose,
-        ))  # fmt: skip
+        run = fit_log(
+            source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
+            overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
+        )  # fmt: skip
     directory = source if place is None else place
     report = _analyse(run, directory, request)
-    if request.page:
-        from icrtool.output.page.run_page import write_page
-
-        write_page(run, report, directory / PAGE_FILE, plots=directory)
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
         show(format_dropout(report))
-        page = f"; page: {directory / PAGE_FILE}" if request.page else ""
+        page = f"; page: {directory / PAGE_FILE}" if request.asked.page else ""
         click.echo(f"\nwritten to {directory / 'dropout'}{page}")
     else:
         for verdict in report.verdicts:
@@ -298,40 +257,19 @@ def _read(directory: Path) -> Run:
 def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
     """Compute the report of a run and write it."""
     from icrtool.dropout_analysis.dropout_report import dropout_report, forced_lengths_s
-    from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, report_writer
+    from icrtool.fleet.fit_and_report import report_and_write
 
     dropout, given = request.config.dropout, request.config.given
     horizons = request.horizons_m or (dropout.horizons_m if "dropout.horizons_m" in given else None)
     outages = request.outage_s or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None)
-    if request.outage_at_s and not forced_lengths_s(run, outages):
+    if request.further["outage_at_s"] and not forced_lengths_s(run, outages):
         raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    stamps = run.table.stamp_ns if request.trials else None
-    inputs = run.summary["inputs"]
-    baseline = request.baseline.find(run.name, inputs) if request.baseline is not None else None
-    with (
-        Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages,
-        report_writer(directory / DROPOUT_DIRECTORY, request.formats, stamps) as writer,
-    ):
-        stages.begin("dropout analysis")
-        report = dropout_report(
-            run,
-            horizons_m=horizons,
-            budgets_m=request.budgets_m,
-            gates=request.gates,
-            baseline=baseline,
-            strict=request.strict,
-            calibrations=request.calibrations,
-            outage_s=outages,
-            outage_at_s=request.outage_at_s,
-            starts=request.starts,
-            without_events=request.without_events,
-            comparison=request.ladder,
-            reference="smoothed" if request.smoothed else "filter",
-            seed=request.seed,
-            sink=writer.sink,
-        )
-        stages.begin("dropout report, pictures" if request.formats else "dropout report")
-        writer.finish(report)
+    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
+    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
+        report = report_and_write(
+            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
+            analyse=partial(dropout_report, horizons_m=horizons, outage_s=outages, **request.further),
+        )  # fmt: skip
     if baseline is not None:
         options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
     return report

@@ -25,9 +25,9 @@ ALL_THE_SAME = "--force exports it all the same"
 
 
 @click.command("export")
-@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=click.Path(path_type=Path))
+@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.FILE)
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
-@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
+@click.option("-o", "--output", metavar="FILE", type=options.FILE,
               help="Write it here. For evo and kitti, DIR: a file for each path of the run.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Also a calibration that is not fit for use.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -21,54 +21,25 @@ if TYPE_CHECKING:
 RUNS = Path("icrtool-runs")
 
 
-class FitRequest(NamedTuple):
-    """What the options ask for, the same for every log."""
-
-    config: Config
-    states: Literal["csv", "parquet"] | None = None
-    formats: tuple[str, ...] = ()
-    warm_start: Path | None = None
-    changes_s: tuple[float, ...] = ()
-    smooths: bool = False
-    overwrite: bool = False
-    quiet: bool = False
-    verbose: bool = False
-    start: str | None = None
-    end: str | None = None
-
-
 @click.command("fit")
 @options.LOGS
 @options.place
-@click.option(
-    "--states",
-    type=click.Choice(["csv", "parquet"]),
-    help="Format of the states; default: csv, parquet for over a million states.",
-)
-@click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", help="Formats of the pictures.")
-@click.option(
-    "--warm-start",
-    metavar="RUN|CAL.json",
-    type=click.Path(path_type=Path),
-    help="Start from another run's final ICRs and covariance, or from those of a calibration.",
-)
-@click.option(
-    "--terrain-change",
-    "changes",
-    metavar="T",
-    type=float,
-    multiple=True,
-    help="Inflate the ICR covariance T seconds after the start. Repeatable.",
-)
-@click.option("--smooth", "smooths", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
+@click.option("--states", type=click.Choice(["csv", "parquet"]),
+              help="Format of the states; default: csv, parquet for over a million states.")  # fmt: skip
+@options.plots
+@click.option("--warm-start", metavar="RUN|CAL.json", type=options.FILE,
+              help="Start from another run's final ICRs and covariance, or from those of a calibration.")  # fmt: skip
+@click.option("--terrain-change", "changes", metavar="T", type=float, multiple=True,
+              help="Inflate the ICR covariance T seconds after the start. Repeatable.")  # fmt: skip
+@click.option("--smooth", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
 @json_option
 @options.cut
 @options.configuration
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
-    states: Literal["csv", "parquet"] | None, plots: str,
-    warm_start: Path | None, changes: tuple[float, ...], smooths: bool, as_json: bool,
+    states: Literal["csv", "parquet"] | None, plots: tuple[str, ...],
+    warm_start: Path | None, changes: tuple[float, ...], smooth: bool, as_json: bool,
     start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
@@ -85,17 +56,17 @@ def command(
     from icrtool.errors import IcrToolError
 
     config = options.load(config_file, robot, sets)
-    request = FitRequest(
-        config, states, plot_formats(plots), warm_start,
-        check_times(changes), smooths, overwrite, quiet, verbose, start, end,
-    )  # fmt: skip
+    check_times(changes)
     logs = logs_of(logs, quiet=quiet)
     directories = run_directories(logs, output, into)
     documents: list[dict[str, Any]] = []
     failed: list[Path] = []
     for log, directory in zip(logs, directories, strict=True):
         try:
-            run = fit_log(log, directory, request)
+            run = fit_log(
+                log, directory, config, quiet=quiet, verbose=verbose, overwrite=overwrite, plots=plots, states=states,
+                span=(start, end), warm_start=warm_start, changes_s=changes, smooth=smooth,
+            )  # fmt: skip
         except IcrToolError as err:
             failed.append(log)
             options.report_error(err, log)
@@ -107,30 +78,16 @@ def command(
             from icrtool.output.tables.run import format_run
 
             show(format_run(run))
-            click.echo(f"\nwritten to {place}{_beside(request)}")
+            click.echo(f"\nwritten to {place}{_beside(warm_start, smooth=smooth)}")
     if as_json:
         print_json("fit", {"logs": documents})
     options.leave(failed, len(logs), "logs")
 
 
-def check_times(times: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the times [s] of ``--terrain-change``, all finite."""
+def check_times(times: tuple[float, ...]) -> None:
+    """Refuse times [s] of ``--terrain-change`` that are not finite."""
     if not all(math.isfinite(time) for time in times):
         raise click.BadParameter("give finite seconds", param_hint="--terrain-change")
-    return times
-
-
-def plot_formats(text: str) -> tuple[str, ...]:
-    """Return the picture formats of ``--plots``."""
-    formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
-    if formats == ("none",):
-        return ()
-    unknown = [part for part in formats if part not in ("png", "svg", "pdf")]
-    if unknown or not formats:
-        raise click.BadParameter(
-            f"{', '.join(unknown) or text!r} is not one of png, svg, pdf, none", param_hint="--plots"
-        )
-    return formats
 
 
 def logs_of(places: tuple[Path, ...], *, quiet: bool) -> tuple[Path, ...]:
@@ -161,20 +118,18 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
     return [(parent or RUNS) / name for name in distinct_names(logs)]
 
 
-def _other_robot(request: FitRequest, start: WarmStart | None) -> tuple[str, ...]:
+def _other_robot(source: Path | None, start: WarmStart | None, config: Config) -> tuple[str, ...]:
     """Warn where the run to start from was made with another track width."""
-    theirs, ours = start.track_width_m if start is not None else None, request.config.robot.track_width_m
+    theirs, ours = start.track_width_m if start is not None else None, config.robot.track_width_m
     if theirs is None or ours is None or math.isclose(theirs, ours, rel_tol=0.01):
         return ()
-    return (
-        f"{request.warm_start}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?",
-    )
+    return (f"{source}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?",)
 
 
-def _beside(request: FitRequest) -> str:
+def _beside(warm_start: Path | None, *, smooth: bool) -> str:
     """Return a text about further options that had an effect."""
-    done = [f"started from {request.warm_start}"] if request.warm_start is not None else []
-    done += ["with the smoother's states"] if request.smooths else []
+    done = [f"started from {warm_start}"] if warm_start is not None else []
+    done += ["with the smoother's states"] if smooth else []
     return f" ({', '.join(done)})" if done else ""
 
 
@@ -189,37 +144,31 @@ def _warm_start(source: Path) -> WarmStart:
     return open_run(source).ended_with
 
 
-def fit_log(log: Path, directory: Path, request: FitRequest) -> Run:
-    """Fit a log, write its run directory, and print warnings and chosen streams on stderr."""
-    from icrtool.output.run_directory import check_target, replaced_log, write_run
+def fit_log(
+    log: Path, directory: Path, config: Config, *, quiet: bool, verbose: bool, warm_start: Path | None = None,
+    **options_of_fit: Any,
+) -> Run:  # fmt: skip
+    """Fit a log, write its run directory, and print warnings and chosen streams on stderr.
 
-    check_target(directory, log, overwrite=request.overwrite)
-    start = _warm_start(request.warm_start) if request.warm_start is not None else None
+    Parameters
+    ----------
+    warm_start : run or calibration to start from
+    options_of_fit : of `icrtool.fleet.fit_and_report.fit_and_write`
+    """
+    from icrtool.fleet.fit_and_report import fit_and_write
+
+    start = _warm_start(warm_start) if warm_start is not None else None
     notes: list[str] = []
-    with Stages(LogText(log.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        from icrtool.logs.read_log import read_log
-
-        stages.begin("reading")
-        logs = [read_log(log, request.config, stages.share, start=request.start, end=request.end)]
-        from icrtool.calibration.fit import fit
-
-        run = fit(
-            logs.pop(),  # whose columns are freed where they are needed no longer
-            request.config,
-            warm_start=start,
-            changes_s=request.changes_s,
-            smooth=request.smooths,
-            watch=stages.begin,
-        )
-        if (before := replaced_log(directory, run)) is not None:
-            notes.append(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
-        stages.begin("writing, pictures" if request.formats else "writing")
-        write_run(run, directory, states=request.states, plots=request.formats, note=notes.append)
-    options.warn((*run.warnings, *_other_robot(request, start), *notes), quiet=request.quiet)
+    with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
+        run = fit_and_write(
+            log, directory, config, stages.begin, warm_start=start, share=stages.share, note=notes.append,
+            **options_of_fit,
+        )  # fmt: skip
+    options.warn((*run.warnings, *_other_robot(warm_start, start, config), *notes), quiet=quiet)
     from icrtool.records.samples import ROLE_WORDS
 
     for stream in run.summary["streams"]:
-        if request.verbose or ("chosen over" in stream["why"] and not request.quiet):
+        if verbose or ("chosen over" in stream["why"] and not quiet):
             click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
     return run
 

@@ -17,16 +17,15 @@ if TYPE_CHECKING:
 
 
 @click.command("forecast")
-@click.option("--calibration", "calibration_file", metavar="CAL.json", required=True, type=click.Path(path_type=Path),
+@click.option("--calibration", "calibration_file", metavar="CAL.json", required=True, type=options.FILE,
               help="File that icrtool calibrate -o wrote.")  # fmt: skip
-@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=click.Path(path_type=Path),
+@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.FILE,
               help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
-@click.option("--budget", "budgets", metavar="METRES", type=options.POSITIVE, multiple=True, default=(0.5,),
-              show_default=True, help="Report how far 95 % of the errors stay within this; repeatable.")  # fmt: skip
-@click.option("-o", "--output", metavar="FILE.csv", type=click.Path(path_type=Path), help="Write a row for each metre.")
-@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw it: png, svg, pdf.")
+@options.budgets
+@click.option("-o", "--output", metavar="FILE.csv", type=options.FILE, help="Write a row for each metre.")
+@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw it: png, svg, pdf.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="Print no results.")
+@options.quiet
 def command(
     calibration_file: Path, path: Path, budgets: tuple[float, ...], output: Path | None, plot: Path | None,
     as_json: bool, quiet: bool,

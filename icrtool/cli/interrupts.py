@@ -1,7 +1,7 @@
 """Ctrl-C and SIGTERM: they end a command in order, and by force where that takes too long.
 
-In order means by an exception in the main thread, whose handlers remove what is half written. It waits while modules
-are imported: an exception in the middle of an import can leave the import lock held, and other threads then wait for
+In order means by an exception in the main thread, whose handlers remove what is half written. None is raised while
+modules are imported: in the middle of an import it can leave the import lock held, and other threads then wait for
 ever; in the middle of llvmlite's bookkeeping it is lost, or reported as an error of llvmlite. And the interpreter
 raises it only after the compiled loop, or the call of a library, that the main thread is in. So a second thread
 watches the time: after `GRACE_S` it removes what is half written and ends the process.
@@ -30,16 +30,13 @@ LLVMLITE = f"{os.sep}llvmlite{os.sep}"
 OVER = 0
 """Stands for the end of the block where the number of a signal is read."""
 
-AGAIN_S = 0.005
-"""A signal that had to wait is handled again after this time [s]."""
-
 
 @contextmanager
 def end_in_order(boundary: CodeType) -> Iterator[None]:
     """Have SIGINT raise KeyboardInterrupt and SIGTERM leave with `TERMINATED`, at the latest after `GRACE_S`.
 
-    The exceptions come once no module is being loaded. The limit holds until the process ends: at its end the
-    interpreter waits for threads, which may be compiling. After the block, signals have their default effect.
+    Where a module is being loaded, the process ends after that time. The limit holds until the process ends: at its
+    end the interpreter waits for threads, which may be compiling. After the block, signals have their default effect.
 
     Parameters
     ----------
@@ -48,21 +45,19 @@ def end_in_order(boundary: CodeType) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    ending = _Ending(boundary)
+    watched = hasattr(signal, "pthread_sigmask")  # not on Windows
+    ending = _Ending(boundary, watched=watched)
     # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
     handled = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
     for number in handled:
         signal.signal(number, ending.come)
-    if not hasattr(signal, "setitimer"):
-        yield  # Windows
+    if not watched:
+        yield
         return
-    signal.signal(signal.SIGALRM, ending.come_again)
     with _watched(ending):
         try:
             yield
         finally:
-            # The interpreter forgets the handler of the alarm before it ends, and the alarm would kill it.
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
             for number in handled:
                 signal.signal(number, signal.SIG_DFL)
 
@@ -77,7 +72,7 @@ def _watched(ending: _Ending) -> Iterator[None]:
     over = threading.Event()
     thread = threading.Thread(target=_watch, args=(arrived, over), name="interrupts", daemon=True)
     # It inherits this: where the main thread holds signals, another thread must not receive them either.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGALRM})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     thread.start()
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:
@@ -112,25 +107,21 @@ def end_by_force(status: int) -> None:
 class _Ending:
     """The end of a command, once a signal has asked for it; `ended`: its exception was raised."""
 
-    def __init__(self, boundary: CodeType) -> None:
+    def __init__(self, boundary: CodeType, *, watched: bool) -> None:
         self._boundary = boundary
-        self._waiting: int | None = None
+        self._watched = watched
         self.ended = False
 
     def come(self, number: int, frame: FrameType | None) -> None:
-        """End the command, or wait; asked a second time, do not wait."""
-        if self.ended:
-            return  # what is half written is being removed, in limited time
-        if self._waiting is None and self._loading(frame) and hasattr(signal, "setitimer"):
-            self._waiting = number
-            signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
-        else:
-            self._end(number)
-
-    def come_again(self, _: int, frame: FrameType | None) -> None:
-        """End the command if nothing is loaded any more."""
-        if self._waiting is not None and not self._loading(frame):
-            self._end(self._waiting)
+        """End the command, or leave that to the thread that watches the time."""
+        # Once ended, what is half written is being removed, in limited time.
+        if self.ended or (self._watched and self._loading(frame)):
+            return
+        self.ended = self._watched
+        if number == signal.SIGTERM:
+            # Killed by a timeout or at a shutdown, a command still removes what is half written.
+            sys.exit(TERMINATED)
+        raise KeyboardInterrupt
 
     def _loading(self, frame: FrameType | None) -> bool:
         """Return whether the main thread is in the middle of an import, or in llvmlite."""
@@ -140,13 +131,3 @@ class _Ending:
                 return True
             frame = frame.f_back
         return False
-
-    def _end(self, number: int) -> None:
-        if self._waiting is not None:
-            self._waiting = None
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-        self.ended = hasattr(signal, "setitimer")
-        if number == signal.SIGTERM:
-            # Killed by a timeout or at a shutdown, a command still removes what is half written.
-            sys.exit(TERMINATED)
-        raise KeyboardInterrupt

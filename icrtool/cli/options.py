@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
     from icrtool.output.baseline_file import Baseline
+    from icrtool.records.dropout import Verdict
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -31,17 +33,25 @@ LOG = click.Path(path_type=Path, readable=False)
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
+FILE = click.Path(path_type=Path)
+
+PLOT_FORMATS = ("png", "svg", "pdf")
+
+
 def configuration(command: Command) -> Command:
     """Add --config, --robot and --set."""
     options = (
-        click.option(
-            "--config", "config_file", metavar="FILE.toml", type=click.Path(path_type=Path), help="Configuration file."
-        ),
+        click.option("--config", "config_file", metavar="FILE.toml", type=FILE, help="Configuration file."),
         click.option("--robot", metavar="NAME", shell_complete=_robots,
                      help="Built-in robot, for example husky-a200; icrtool robots lists them."),
         click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
                      help="Set a configuration key; icrtool config lists them; repeatable."),
     )  # fmt: skip
+    return _with(command, *options)
+
+
+def _with(command: Command, *options: Callable[[Command], Command]) -> Command:
+    """Add options to a command, in this order."""
     for option in reversed(options):
         command = option(command)
     return command
@@ -61,45 +71,106 @@ def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 
 def place(command: Command) -> Command:
     """Add -o, --into and --overwrite, as `output`, `into` and `overwrite`."""
-    command = click.option("--overwrite", is_flag=True, help="Also replace the run of another recording.")(command)
-    command = click.option("--into", metavar="DIR", type=click.Path(path_type=Path),
-                           help="Parent of the run directories, also of one log.")(command)  # fmt: skip
-    return click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path),
-                        help="Run directory of a log; of several logs: its parent.")(command)  # fmt: skip
+    return _with(
+        command,
+        click.option("-o", "--output", metavar="DIR", type=FILE,
+                     help="Run directory of a log; of several logs: its parent."),
+        click.option("--into", metavar="DIR", type=FILE, help="Parent of the run directories, also of one log."),
+        click.option("--overwrite", is_flag=True, help="Also replace the run of another recording."),
+    )  # fmt: skip
 
 
-def baseline(command: Command) -> Command:
-    """Add --baseline and --strict-gates, as `baseline` and `strict`."""
-    command = click.option("--strict-gates", "strict", is_flag=True,
-                           help="A gate on the baseline fails by its number alone, also where the interval of the "
-                           "difference reaches the bound.")(command)  # fmt: skip
-    return click.option("--baseline", metavar="REPORT.json|DIR", type=click.Path(path_type=Path),
-                        help="Earlier report, run or batch to compare with; a gate may then read "
-                        "\"icr.p95@10m <= 1.1 * baseline\".")(command)  # fmt: skip
+def seed(command: Command) -> Command:
+    """Add --seed, by default 0."""
+    text = "Seed of all noise; the same seed, the same numbers."
+    return click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help=text)(command)
 
 
-def open_baseline(place: Path | None, gates: Sequence[str]) -> Baseline | None:
-    """Find the reports of --baseline; refuse gates that need one where there is none."""
+def plot_formats(text: str) -> tuple[str, ...]:
+    """Read ``png,svg,pdf`` or ``none``."""
+    formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
+    if formats == ("none",):
+        return ()
+    unknown = [part for part in formats if part not in PLOT_FORMATS]
+    if unknown or not formats:
+        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(PLOT_FORMATS)}, none")
+    return formats
+
+
+def plots(command: Command) -> Command:
+    """Add --plots, as a tuple of formats."""
+    return click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", type=plot_formats,
+                        help="Formats of the pictures.")(command)  # fmt: skip
+
+
+def budgets(command: Command) -> Command:
+    """Add --budget, as `budgets`."""
+    return click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,),
+                        show_default=True, help="Report how far 95 % of the errors stay within this; repeatable.",
+                        )(command)  # fmt: skip
+
+
+def report(command: Command) -> Command:
+    """Add the options of a dropout report that are the same for one log and for many.
+
+    The command gets them as `asked`, a `ReportOptions`; and `baseline`, `junit` and `markdown`.
+    """
+
+    @wraps(command)
+    def with_options(
+        *, plots: tuple[str, ...], gates: tuple[str, ...], budgets: tuple[float, ...], ladder: bool, strict: bool,
+        page: bool, junit: Path | None, markdown: Path | None, **others: object,
+    ) -> object:  # fmt: skip
+        from icrtool.fleet.fit_and_report import ReportOptions
+        from icrtool.output.atomic_file import check_place
+
+        for file in (junit, markdown):
+            if file is not None:
+                check_place(file)
+        asked = ReportOptions(plots, gates, budgets, ladder, strict, page)
+        return command(asked=asked, junit=junit, markdown=markdown, **others)
+
+    return _with(
+        cast("Command", with_options),
+        budgets,
+        click.option("--gate", "gates", metavar="TEXT", multiple=True,
+                     help="Acceptance limit: exit status 3 if it is not met; repeatable."),
+        click.option("--baseline", metavar="REPORT.json|DIR", type=FILE,
+                     help="Earlier report, run or batch to compare with; a gate may then read "
+                     "\"icr.p95@10m <= 1.1 * baseline\"."),
+        click.option("--strict-gates", "strict", is_flag=True,
+                     help="A gate on the baseline fails by its number alone, also where the interval of the "
+                     "difference reaches the bound."),
+        click.option("--ladder/--no-ladder", default=True, show_default=True,
+                     help="Compare all models on distance they were not fitted to, gyro included."),
+        click.option("--junit", metavar="FILE", type=FILE, help="Write the gates' verdicts as JUnit XML."),
+        click.option("--markdown", metavar="FILE", type=FILE, help="Write a summary for a pull request."),
+        plots,
+        click.option("--page/--no-page", default=True, show_default=True,
+                     help="Also write report.html: pictures, tables and an interactive map in one file."),
+    )  # fmt: skip
+
+
+def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
+    """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
     from icrtool.errors import ConfigError
-    from icrtool.output.baseline_file import open_baseline
 
     relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]
-    if place is None and relative:
+    if place is not None:
+        from icrtool.output.baseline_file import open_baseline
+
+        return open_baseline(place)
+    if relative:
         raise ConfigError(f"gate {relative[0]!r}", "needs an earlier report", "name it with --baseline REPORT.json|DIR")
-    return open_baseline(place) if place is not None else None
+    return None
 
 
-def check_compared(verdicts: Sequence[tuple[bool, bool]]) -> None:
-    """Refuse a baseline that has none of the logs: a gate that is never checked would always pass.
-
-    Parameters
-    ----------
-    verdicts : for each, whether its limit is relative to the baseline, and whether it was not checked
-    """
+def check_compared(verdicts: Iterable[Verdict]) -> None:
+    """Refuse a baseline that has none of the logs: a gate that is never checked would always pass."""
     from icrtool.errors import ConfigError
 
-    relative = [not_checked for is_relative, not_checked in verdicts if is_relative]
+    relative = [bool(one.not_checked) for one in verdicts if one.gate.baseline_factor]
     if relative and all(relative):
         raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
 
@@ -107,20 +178,25 @@ def check_compared(verdicts: Sequence[tuple[bool, bool]]) -> None:
 def cut(command: Command) -> Command:
     """Add --from and --to, as `start` and `end`."""
     what = "seconds since the log's first message, or a time in ISO 8601 (UTC without a zone)"
-    command = click.option("--to", "end", metavar="TIME", help="Read the log up to here.")(command)
-    return click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}.")(command)
+    return _with(
+        command,
+        click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}."),
+        click.option("--to", "end", metavar="TIME", help="Read the log up to here."),
+    )
 
 
-def page(command: Command) -> Command:
-    """Add --page."""
-    what = "Also write report.html: pictures, tables and an interactive map in one file."
-    return click.option("--page/--no-page", default=True, show_default=True, help=what)(command)
+def quiet(command: Command) -> Command:
+    """Add -q alone."""
+    return click.option("-q", "--quiet", is_flag=True, help="Print no results.")(command)
 
 
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
-    command = click.option("-v", "--verbose", is_flag=True, help="Print more details.")(command)
-    return click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings.")(command)
+    return _with(
+        command,
+        click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings."),
+        click.option("-v", "--verbose", is_flag=True, help="Print more details."),
+    )
 
 
 def load(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> Config:

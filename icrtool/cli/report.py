@@ -8,17 +8,17 @@ from pathlib import Path
 
 import click
 
+from icrtool.cli import options
 from icrtool.cli.fit import RUNS
 
 
 @click.command("report")
-@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=click.Path(path_type=Path))
-@click.option("-o", "--output", metavar="FILE", type=click.Path(path_type=Path),
+@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=options.FILE)
+@click.option("-o", "--output", metavar="FILE", type=options.FILE,
               help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
-@click.option(
-    "--no-coordinates", is_flag=True, help="Leave out where on the globe a run was, for a page that is passed on."
-)
-@click.option("-q", "--quiet", is_flag=True, help="Print no results.")
+@click.option("--no-coordinates", is_flag=True,
+              help="Leave out where on the globe a run was, for a page that is passed on.")  # fmt: skip
+@options.quiet
 def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import CHANGE, PATHS, check_changes, gnss_text, icrs_text, place_text, span_text
+from icrtool.cli.drive_options import Degrees, check_changes, drive_options, given_fields, place_text, span_text
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
@@ -27,174 +27,44 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
 
 
 @click.command("simulate")
-@click.option(
-    "-o",
-    "--output",
-    "log",
-    metavar="LOG",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="Log to make: .mcap, .bag, or a ROS 2 directory.",
-)
+@click.option("-o", "--output", "log", metavar="LOG", required=True, type=options.FILE,
+              help="Log to make: .mcap, .bag, or a ROS 2 directory.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Replace a log that is there.")
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Seed of all noise; the same seed, the same bytes.",
-)
-@click.option("--path", "kind", type=click.Choice(PATHS), default="curved", show_default=True, help="What is driven.")
-@click.option(
-    "--speeds",
-    metavar="FILE.csv",
-    type=click.Path(path_type=Path),
-    help="Drive these track speeds instead: t_s, v_left_mps, v_right_mps.",
-)
-@click.option(
-    "--duration", metavar="S", type=POSITIVE, help="Length of the drive [s]; default 100, or that of --speeds."
-)
-@click.option(
-    "--speed",
-    metavar="MPS",
-    type=POSITIVE,
-    default=0.4,
-    show_default=True,
-    help="Speed of the body; of the faster track on the spot.",
-)
-@click.option(
-    "--radius",
-    metavar="M",
-    type=NOT_NEGATIVE,
-    default=1.5,
-    show_default=True,
-    help="Radius of circles and of the tightest bends.",
-)
-@click.option(
-    "--leg", metavar="M", type=POSITIVE, default=10.0, show_default=True, help="Length of a lawnmower's legs."
-)
-@click.option(
-    "--start-heading",
-    metavar="DEG",
-    type=float,
-    default=30.0,
-    show_default=True,
-    help="Heading at the start, clockwise from north.",
-)
-@click.option(
-    "--icrs",
-    metavar="YR,YL,X",
-    type=icrs_text,
-    help="True ICRs [m]; default: 1.5 times half the track width to either side, x 0.",
-)
-@CHANGE
-@click.option(
-    "--wheels",
-    type=click.Choice(["encoder", "commanded"]),
-    default="encoder",
-    show_default=True,
-    help="Content of the wheel messages: true travel, counted travel, or the motor commands.",
-)
-@click.option(
-    "--wheel-messages",
-    type=click.Choice(WHEEL_MESSAGES),
-    default="joint_states",
-    show_default=True,
-    help="Message type of the wheels.",
-)
-@click.option("--wheel-rate", metavar="HZ", type=POSITIVE, help="Wheel messages a second; default 100, commanded 10.")
-@click.option(
-    "--encoder-counts", metavar="N", type=POSITIVE, help="Counts of a wheel revolution; default the robot's, or 8192."
-)
-@click.option(
-    "--motor-lag",
-    metavar="S",
-    type=NOT_NEGATIVE,
-    default=0.0,
-    show_default=True,
-    help="Time constant with which the tracks follow their commands.",
-)
-@click.option(
-    "--input-noise",
-    metavar="MPS",
-    type=NOT_NEGATIVE,
-    default=0.0,
-    show_default=True,
-    help="White noise of the track speeds, a sample.",
-)
-@click.option(
-    "--input-bias", metavar="MPS", type=float, default=0.0, show_default=True, help="Bias of both track speeds."
-)
-@click.option(
-    "--gnss",
-    metavar="rtk|waas|METRES",
-    type=gnss_text,
-    default="rtk",
-    show_default=True,
-    help="Noise of north and east: 0.01, 0.30 or so many metres.",
-)
-@click.option("--gnss-rate", metavar="HZ", type=POSITIVE, default=20.0, show_default=True, help="Fixes a second.")
-@click.option(
-    "--outage",
-    "outages",
-    metavar="BEGIN:END",
-    type=span_text,
-    multiple=True,
-    help="No fixes between these seconds; repeatable.",
-)
-@click.option(
-    "--antenna",
-    metavar="FORWARD,RIGHT",
-    type=place_text,
-    default="0,0",
-    help="Position of the antenna, from the body origin [m].",
-)
-@click.option(
-    "--gnss-delay", metavar="S", type=float, default=0.0, show_default=True, help="The stamps of the fixes lag by this."
-)
-@click.option(
-    "--heading",
-    "convention",
-    type=click.Choice(["enu", "ned"]),
-    default="enu",
-    show_default=True,
-    help="Convention of the Imu: REP-103, or REP-145's NED.",
-)
-@click.option(
-    "--heading-std",
-    metavar="DEG",
-    type=NOT_NEGATIVE,
-    default=1.0,
-    show_default=True,
-    help="White noise of the heading.",
-)
-@click.option(
-    "--heading-resolution",
-    metavar="DEG",
-    type=NOT_NEGATIVE,
-    default=0.05,
-    show_default=True,
-    help="Headings are rounded to this.",
-)
-@click.option(
-    "--heading-rate", metavar="HZ", type=POSITIVE, default=100.0, show_default=True, help="Headings a second."
-)
-@click.option(
-    "--heading-offset",
-    metavar="DEG",
-    type=float,
-    default=0.0,
-    show_default=True,
-    help="Added to every heading, clockwise.",
-)
-@click.option(
-    "--heading-delay",
-    metavar="S",
-    type=float,
-    default=0.0,
-    show_default=True,
-    help="The stamps of the headings lag by this.",
-)
+@options.seed
+@click.option("--speeds", metavar="FILE.csv", type=options.FILE,
+              help="Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")  # fmt: skip
+@drive_options(
+    kind="curved", speed_mps=0.4, radius_m=1.5, leg_m=10.0, input_noise_mps=0.0, input_bias_mps=0.0, gnss_std_m="rtk",
+    gnss_rate_hz=20.0,
+)  # fmt: skip
+@click.option("--start-heading", "start_heading_rad", metavar="DEG", type=Degrees(), default=30.0, show_default=True,
+              help="Heading at the start, clockwise from north.")  # fmt: skip
+@click.option("--wheels", type=click.Choice(["encoder", "commanded"]), default="encoder", show_default=True,
+              help="Content of the wheel messages: counted travel, or the motor commands.")  # fmt: skip
+@click.option("--wheel-messages", type=click.Choice(WHEEL_MESSAGES), default="joint_states", show_default=True,
+              help="Message type of the wheels.")  # fmt: skip
+@click.option("--wheel-rate", "wheel_rate_hz", metavar="HZ", type=POSITIVE,
+              help="Wheel messages a second; default 100, commanded 10.")  # fmt: skip
+@click.option("--motor-lag", "motor_lag_s", metavar="S", type=NOT_NEGATIVE, default=0.0, show_default=True,
+              help="Time constant with which the tracks follow their commands.")  # fmt: skip
+@click.option("--outage", "outages_s", metavar="BEGIN:END", type=span_text, multiple=True,
+              help="No fixes between these seconds; repeatable.")  # fmt: skip
+@click.option("--antenna", metavar="FORWARD,RIGHT", type=place_text, default="0,0",
+              help="Position of the antenna, from the body origin [m].")  # fmt: skip
+@click.option("--gnss-delay", "gnss_delay_s", metavar="S", type=float, default=0.0, show_default=True,
+              help="The stamps of the fixes lag by this.")  # fmt: skip
+@click.option("--heading", "convention", type=click.Choice(["enu", "ned"]), default="enu", show_default=True,
+              help="Convention of the Imu: REP-103, or REP-145's NED.")  # fmt: skip
+@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=Degrees(min=0), default=1.0, show_default=True,
+              help="White noise of the heading.")  # fmt: skip
+@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=Degrees(min=0), default=0.05,
+              show_default=True, help="Headings are rounded to this.")  # fmt: skip
+@click.option("--heading-rate", "heading_rate_hz", metavar="HZ", type=POSITIVE, default=100.0, show_default=True,
+              help="Headings a second.")  # fmt: skip
+@click.option("--heading-offset", "heading_offset_rad", metavar="DEG", type=Degrees(), default=0.0, show_default=True,
+              help="Added to every heading, clockwise.")  # fmt: skip
+@click.option("--heading-delay", "heading_delay_s", metavar="S", type=float, default=0.0, show_default=True,
+              help="The stamps of the headings lag by this.")  # fmt: skip
 @options.configuration
 @options.verbosity
 def command(
@@ -258,8 +128,8 @@ def _plan(config: Config, given: dict[str, Any]) -> DrivePlan:
     from icrtool.simulation.drives import DrivePlan
     from icrtool.simulation.paths import PathPlan
 
-    path: Any = PathPlan(given["kind"], given["speed"], given["radius"], given["leg"])
-    duration = given["duration"]
+    path: Any = PathPlan(**given_fields(PathPlan, given))
+    duration = given["duration_s"]
     if given["speeds"] is not None:
         from icrtool.output.truth_file import read_speeds
 
@@ -267,40 +137,23 @@ def _plan(config: Config, given: dict[str, Any]) -> DrivePlan:
         duration = duration if duration is not None else float(path.t_s[-1])
     duration = duration if duration is not None else 100.0
     check_changes(given["changes"], duration)
-    rate = given["wheel_rate"] or COMMAND_RATE_HZ
-    return DrivePlan(
-        icrs_m=given["icrs"] or default_icrs(config),
-        changes=given["changes"],
-        path=path,
-        duration_s=duration,
-        start_heading_rad=math.radians(given["start_heading"]),
-        command_rate_hz=rate if given["wheels"] == "commanded" else None,
-        motor_lag_s=given["motor_lag"],
-    )
+    commanded = given["wheels"] == "commanded"
+    return DrivePlan(**given_fields(DrivePlan, given) | {
+        "icrs_m": given["icrs_m"] or default_icrs(config), "path": path, "duration_s": duration,
+        "command_rate_hz": (given["wheel_rate_hz"] or COMMAND_RATE_HZ) if commanded else None,
+    })  # fmt: skip
 
 
 def _sensors(config: Config, given: dict[str, Any]) -> Sensors:
     from icrtool.simulation.drives import Sensors
 
     default_rate = COMMAND_RATE_HZ if given["wheels"] == "commanded" else ENCODER_RATE_HZ
-    return Sensors(
-        wheels=given["wheels"],
-        wheel_rate_hz=given["wheel_rate"] or default_rate,
-        metres_per_count=2 * math.pi * needed(config, "wheel_radius_m") / encoder_counts(config, given),
-        input_noise_mps=given["input_noise"],
-        input_bias_mps=given["input_bias"],
-        gnss_std_m=given["gnss"],
-        gnss_rate_hz=given["gnss_rate"],
-        outages_s=given["outages"],
-        heading_std_rad=math.radians(given["heading_std"]),
-        heading_resolution_rad=math.radians(given["heading_resolution"]),
-        heading_rate_hz=given["heading_rate"],
-        heading_offset_rad=math.radians(given["heading_offset"]),
-        antenna_forward_m=given["antenna"][0],
-        antenna_right_m=given["antenna"][1],
-        gnss_delay_s=given["gnss_delay"],
-        heading_delay_s=given["heading_delay"],
-    )
+    forward, right = given["antenna"]
+    return Sensors(**given_fields(Sensors, given) | {
+        "wheel_rate_hz": given["wheel_rate_hz"] or default_rate,
+        "metres_per_count": 2 * math.pi * needed(config, "wheel_radius_m") / encoder_counts(config, given),
+        "antenna_forward_m": forward, "antenna_right_m": right,
+    })  # fmt: skip
 
 
 def encoder_counts(config: Config, given: dict[str, Any]) -> float:

@@ -16,6 +16,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.kernels.trials import Summary
 from icrtool.records.dropout import BudgetDistance, Gate, Verdict
+from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
@@ -96,7 +97,7 @@ def check_gate(
     column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
     value = float(getattr(summary, column)[h])
     if gate.baseline_factor and baseline is None:
-        return Verdict(gate, value, math.nan, True, report.name, not_checked="this log is not in the baseline")
+        return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
     half_width, before = math.nan, math.nan
     if gate.baseline_factor and baseline is not None:
         row = baseline.row(gate)
@@ -110,7 +111,8 @@ def check_gate(
     passed = _RELATIONS[gate.relation](value, bound)
     if not strict and not passed and margin + half_width >= 0.0:
         passed = True
-    return Verdict(gate, value, margin, passed, report.name, bound, before, half_width)
+    low, high = margin - half_width, margin + half_width
+    return Verdict(gate, passed, *plain((value, margin, low, high, bound, before, report.name)))
 
 
 def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[BlockSums | None, ...]]:

@@ -11,6 +11,7 @@ from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.block_sums import BlockSums, variance_of_sum
 from icrtool.records.dropout import Gate
+from icrtool.records.run_document import RunDocument
 
 LEVEL = 0.95
 """The interval of a difference holds the true one with this probability."""
@@ -58,7 +59,7 @@ class BaselineReport:
         what = f"no {gate.model} over {gate.horizon_m:g} m"
         raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
 
-    def changes(self, run_summary: Mapping[str, Any]) -> tuple[str, ...]:
+    def changes(self, run_summary: RunDocument) -> tuple[str, ...]:
         """Return what differs beside the numbers: log, configuration, version; a sentence each."""
         found = []
         if not self.is_of(run_summary):
@@ -71,7 +72,7 @@ class BaselineReport:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)
 
-    def is_of(self, run_summary: Mapping[str, Any]) -> bool:
+    def is_of(self, run_summary: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
         return bool(self.sha256) and self.sha256 == tuple(file["sha256"] for file in run_summary["inputs"])
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from icrtool.calibration.model_comparison import ModelComparison
     from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.baseline import BaselineReport
+    from icrtool.records.run_document import RunDocument
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -78,7 +79,7 @@ class DropoutReport:
     states: int
     standing: int
     seed: int
-    run_summary: dict[str, Any]
+    run_summary: RunDocument
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
@@ -164,7 +165,7 @@ class DropoutReport:
             if self.run_directory is None:
                 raise ValueError("path: this run was not read from a directory; name one for its report")
             path = self.run_directory / "dropout"
-        call_output("dropout_directory", "write_report", self, Path(path), plots=plots)
+        call_output("dropout_directory", "write_report", lambda _: self, Path(path), plots=plots)
 
     def __repr__(self) -> str:
         icr, last = self.result("icr"), len(self.horizons_m) - 1

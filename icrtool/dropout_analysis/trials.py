@@ -129,47 +129,69 @@ def dropout(
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)
-    groups = _groups(len(horizons), len(run.table))
-    counts: list[TrialCounts] = []
-    reference: list[ReferenceErrors] = []
-    before: list[Summary] = []
-    after: list[Summary] = []
-    parts: dict[str, list[ModelResult]] = {model.name: [] for model in predictors}
-    if len(parts) < len(predictors):
+    if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
+    asked = _Asked(run, drive, predictors, left_out, learned, seed, sink)
     with ThreadPoolExecutor(THREADS) as pool:
-        for group in groups:
-            ends, count = _ends(drive, horizons[group], left_out, pool)
-            blocks = _blocks(drive, horizons[group], ends, pool)
-            counts.append(count)
-            reference.append(reference_error(run, drive, ends, seed))
-            for model in predictors:
-                errors = _errors(drive, model, ends, pool)
-                tested = blocks
-                if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
-                    tested = _blocks(drive, horizons[group], np.where(np.isfinite(errors.T), ends, -1), pool)
-                if sink is not None:
-                    sink(model.name, horizons[group], errors)
-                parts[model.name].append(_summarise(model, errors, tested, seed, pool))
-                if model.name == "icr":
-                    before.append(summarise(errors[:learned]))
-                    after.append(summarise(errors[learned:] if learned is not None else errors[:0]))
+        parts = [_part(asked, horizons[group], pool) for group in _groups(len(horizons), len(run.table))]
+    splits = [part.by_learning for part in parts if part.by_learning is not None]
     return DropoutReport(
         name=run.name,
         horizons_m=horizons,
-        results=tuple(_joined(part) for part in parts.values()),
-        counts=TrialCounts(*_columns(counts)),
+        results=tuple(_joined(of_model) for of_model in zip(*(part.results for part in parts), strict=True)),
+        counts=TrialCounts(*_columns(part.counts for part in parts)),
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
         starts=starts,
-        reference_error=ReferenceErrors(*_columns(reference)),
-        by_learning=_learned_split(run, learned, before, after) if before else None,
+        reference_error=ReferenceErrors(*_columns(part.reference for part in parts)),
+        by_learning=_learned_split(run, learned, splits) if splits else None,
         seed=seed,
         run_summary=run.summary,
         run_directory=run.directory,
         reference_north_m=run.table.north_m,
         reference_east_m=run.table.east_m,
     )
+
+
+class _Asked(NamedTuple):
+    """What is the same for all horizons; `left_out` (n,): starts that count as none, `learned`: the first after it."""
+
+    run: Run
+    drive: Drive
+    predictors: Sequence[Model | ConstantModel]
+    left_out: Bools
+    learned: int | None
+    seed: int
+    sink: ErrorSink | None
+
+
+class _Part(NamedTuple):
+    """The trials of some horizons; `by_learning`: before and after the ICRs were learned, of the momentary ICRs."""
+
+    counts: TrialCounts
+    reference: ReferenceErrors
+    results: list[ModelResult]
+    by_learning: tuple[Summary, Summary] | None
+
+
+def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
+    """Return the errors of all models at some horizons."""
+    drive, learned, by_learning = asked.drive, asked.learned, None
+    ends, counts = _ends(drive, horizons, asked.left_out, pool)
+    blocks = _blocks(drive, horizons, ends, pool)
+    results = []
+    for model in asked.predictors:
+        errors = _errors(drive, model, ends, pool)
+        tested = blocks
+        if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
+            tested = _blocks(drive, horizons, np.where(np.isfinite(errors.T), ends, -1), pool)
+        if asked.sink is not None:
+            asked.sink(model.name, horizons, errors)
+        results.append(_summarise(model, errors, tested, asked.seed, pool))
+        if model.name == "icr":
+            after = errors[learned:] if learned is not None else errors[:0]
+            by_learning = summarise(errors[:learned]), summarise(after)
+    return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
 
 
 def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
@@ -263,14 +285,15 @@ def _columns(parts: Iterable[tuple[NDArray[np.generic], ...]]) -> Iterator[Any]:
     return (np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def _learned_split(run: Run, learned: int | None, before: list[Summary], after: list[Summary]) -> LearnedSplit:
+def _learned_split(run: Run, learned: int | None, splits: Sequence[tuple[Summary, Summary]]) -> LearnedSplit:
     """Return the trials before and after the state at which the ICRs were learned."""
     table = run.table
+    before, after = (Summary(*_columns(part)) for part in zip(*splits, strict=True))
     return LearnedSplit(
         learned_s=float(table.t_s[learned]) if learned is not None else None,
         distance_m=float(table.distance_m[learned]) if learned is not None else None,
-        before=Summary(*_columns(before)),
-        after=Summary(*_columns(after)),
+        before=before,
+        after=after,
     )
 
 
@@ -323,7 +346,7 @@ def _bin_width(p95_m: float, largest_m: float) -> float:
     return round_bin_width(max(min(largest_m, BULK_IN_P95 * p95_m), largest_m / MOST_BULKS))
 
 
-def _joined(parts: list[ModelResult]) -> ModelResult:
+def _joined(parts: Sequence[ModelResult]) -> ModelResult:
     """Join what several horizons, or groups of them, gave for one model."""
     return ModelResult(
         parts[0].name,

@@ -108,7 +108,7 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None, wi
         float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
         float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),
     )  # fmt: skip
-    stds = dict(zip(ICR_COLUMNS, (float(value) for value in std), strict=True))
+    stds: dict[str, float] = dict(zip(ICR_COLUMNS, (float(value) for value in std), strict=True))
     verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}
     return Excitation(
         std_m=stds,

@@ -30,19 +30,19 @@ class OdometryPath:
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class WheelPaths:
     """Both paths of a run: with the ICRs it ended with, and without slip (None where the track width is not known)."""
 
     icr: OdometryPath
     no_slip: OdometryPath | None
 
 
-def odometry(run: Run) -> Odometry:
+def odometry(run: Run) -> WheelPaths:
     """Return the wheels-only paths of a run; run.json holds their end errors as ``odometry``."""
     return drive_odometry(run.table, run.in_gap, run.track_width_m)
 
 
-def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) -> Odometry:
+def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) -> WheelPaths:
     """Return the path with the final ICRs, and that of the no-slip model (Eqs. 38-39).
 
     Parameters
@@ -53,7 +53,7 @@ def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) ->
     """
     icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
     b = track_width_m
-    return Odometry(_path(table, in_gap, *icrs), _path(table, in_gap, b / 2, -b / 2, 0.0) if b is not None else None)
+    return WheelPaths(_path(table, in_gap, *icrs), _path(table, in_gap, b / 2, -b / 2, 0.0) if b is not None else None)
 
 
 def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:

@@ -18,6 +18,7 @@ from icrtool.estimation.filter_setup import (
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.ekf_step import PLACES
 from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
@@ -105,7 +106,7 @@ def run_filter(
         outages_ns=_outages(table, gnss, sensors.losses_ns),
         gnss=gnss,
         heading=heading,
-        covariance=_square(output.P),
+        covariance=output.P[PLACES],
         noise=adapted.noise,
         start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
         least_icr_m=setup.parameters.least_icr,
@@ -206,10 +207,3 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     if table.stamp_ns[-1] - used[-1] > longest:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)
-
-
-def _square(upper: Floats) -> Floats:
-    """Return the symmetric (6, 6) matrix of an upper triangle."""
-    P = np.zeros((6, 6))
-    P[np.triu_indices(6)] = upper
-    return P + np.triu(P, 1).T

@@ -13,7 +13,7 @@ from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import Odometry, drive_odometry
+from icrtool.estimation.odometry import WheelPaths, drive_odometry
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -23,7 +23,8 @@ from icrtool.kernels.measurement_codes import RECOVERED
 from icrtool.records.events import EVENT_COLUMNS, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, WarmStart, make_drive
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive
+from icrtool.records.run_document import IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
 
@@ -48,7 +49,7 @@ def summarise(
     inputs: tuple[InputFile, ...],
     datum: Datum | None,
     rejected_fixes: dict[str, int],
-) -> dict[str, Any]:
+) -> RunDocument:
     """Return all numbers and warnings of a run as plain data, equal to what run.json gives back.
 
     Parameters
@@ -59,33 +60,20 @@ def summarise(
     inputs, datum, rejected_fixes : of the log
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
-    name = sensors.name
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
-    warnings = [
-        *measurements.warnings,
-        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
-        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
-        *(
-            f"{name}: no terrain change at {t:g} s: the drive lasts {table.t_s[-1]:.1f} s"
-            for t in filtered.changes_s
-            if t not in changes_s
-        ),
-        *noise_warnings(name, config, filtered.noise),
-        *(f"{name}: {sentence}" for sentence in excitation.sentences),
-    ]
-    document: dict[str, Any] = plain(
+    document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,
             "tool_version": __version__,
-            "log": name,
+            "log": sensors.name,
             "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": warnings,
+            "warnings": _warnings(measurements, filtered, config, multiplier, excitation),
             "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
@@ -96,7 +84,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": odometry_summary(drive_odometry(table, filtered.in_gap, width)),
+            "odometry": _end_errors(drive_odometry(table, filtered.in_gap, width)),
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
@@ -108,25 +96,50 @@ def summarise(
             "outages_ns": filtered.outages_ns,
             "rtk_losses_ns": sensors.losses_ns,
             "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
-            "filter": {
-                "preset": config.filter.preset,
-                "process_position_mps": filtered.noise.position_mps,
-                "process_heading_degps": filtered.noise.heading_degps,
-                "reference_delay_s": measurements.position_delay_s,
-                "heading_correlation_s": sensors.heading_correlation_s,
-                "heading_from_position": sensors.heading_from_position,
-                "heading_is_estimated": sensors.heading_is_estimated,
-                "antenna_m": sensors.antenna_m,
-                "antenna_is_known": measurements.antenna_is_known,
-                "states": len(table),
-                "warm_start": warm_start_summary(filtered.began_with),
-                "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
-            }
-            | nis_summary(filtered.gnss, filtered.heading),
+            "filter": filter_summary(measurements, filtered, config),
             "excitation": excitation.summary(),
         }
     )
     return document if config.filter.preset == "paper" else without_unlearned(document)
+
+
+def _warnings(
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation
+) -> list[str]:
+    """Return the warnings of alignment and filter, in the order they were found."""
+    name, table = filtered.sensors.name, filtered.table
+    end_s = float(table.t_s[-1])
+    return [
+        *measurements.warnings,
+        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
+        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
+        *(
+            f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
+            for t in filtered.changes_s
+            if not 0.0 < t < end_s
+        ),
+        *noise_warnings(name, config, filtered.noise),
+        *(f"{name}: {sentence}" for sentence in excitation.sentences),
+    ]
+
+
+def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> dict[str, Any]:
+    """Return what the filter was run with, and the statistics of its innovations."""
+    sensors, start = filtered.sensors, filtered.began_with
+    return {
+        "preset": config.filter.preset,
+        "process_position_mps": filtered.noise.position_mps,
+        "process_heading_degps": filtered.noise.heading_degps,
+        "reference_delay_s": measurements.position_delay_s,
+        "heading_correlation_s": sensors.heading_correlation_s,
+        "heading_from_position": sensors.heading_from_position,
+        "heading_is_estimated": sensors.heading_is_estimated,
+        "antenna_m": sensors.antenna_m,
+        "antenna_is_known": measurements.antenna_is_known,
+        "states": len(filtered.table),
+        "warm_start": None if start is None else {"icrs_m": start.icrs_m, "covariance_m2": start.covariance_m2},
+        "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
+    } | nis_summary(filtered.gnss, filtered.heading)
 
 
 def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation]:
@@ -161,15 +174,15 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     return covariance + np.diag([0.0, 0.0, (speed * clock_std_s) ** 2]), excitation
 
 
-def without_unlearned(document: dict[str, Any]) -> dict[str, Any]:
+def without_unlearned(document: RunDocument) -> RunDocument:
     """Return the summary with null in place of the ICRs that are not shown, and of a multiplier made of one."""
-    icr: dict[str, Any] = dict(document["icr"])
+    icr: Any = dict(document["icr"])
     hidden = [name for name, verdict in document["excitation"]["verdict"].items() if verdict == "not shown"]
     for key in ("final", "final_std", "mean", "std"):
         icr[key] = {name: None if name in hidden else value for name, value in icr[key].items()}
     if "y_icr_right_m" in hidden or "y_icr_left_m" in hidden:
         icr |= {"separation_multiplier": None, "separation_multiplier_std": None}
-    return document | {"icr": icr}
+    return {**document, "icr": icr}
 
 
 def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
@@ -181,17 +194,10 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
     return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
-def odometry_summary(found: Odometry) -> dict[str, Any]:
+def _end_errors(found: WheelPaths) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
     paths = {"icr": found.icr, "no_slip": found.no_slip}
     return {name: {"end_error_m": path.end_error_m} if path is not None else None for name, path in paths.items()}
-
-
-def warm_start_summary(warm_start: WarmStart | None) -> dict[str, Any] | None:
-    """Return what a run was warm-started with, None where it was not."""
-    if warm_start is None:
-        return None
-    return {"icrs_m": warm_start.icrs_m, "covariance_m2": warm_start.covariance_m2}
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
@@ -212,7 +218,7 @@ def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementO
     }
 
 
-def converge(table: States, until_s: float | None = None) -> dict[str, tuple[float, float] | None]:
+def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
     """Find when each ICR estimate converged, up to a time where one is given.
 
     Returns
@@ -226,7 +232,7 @@ def converge(table: States, until_s: float | None = None) -> dict[str, tuple[flo
     -----
     Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
     """
-    spans: dict[str, tuple[float, float] | None] = {}
+    spans: dict[IcrColumn, tuple[float, float] | None] = {}
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
     settled_by = np.searchsorted(t_s, t_s + SETTLED_S)
@@ -294,7 +300,7 @@ def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
 
 
 def icr_summary(
-    table: States, convergence: dict[str, tuple[float, float] | None], covariance: Floats
+    table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats
 ) -> dict[str, Any]:
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
 

@@ -6,25 +6,18 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from icrtool.fleet.row import Row
+from icrtool.fleet.row import SHOWN_ERROR, Row
 
 if TYPE_CHECKING:
     from icrtool.output.exports.acceptance import Suite
-
-SHOWN = "icr_p95_10m_m"
-"""The number of each log that is shown against the baseline."""
 
 
 def suites_of(rows: Sequence[Row]) -> list[Suite]:
     """Return a suite per log."""
     # Not at import: it loads the analysis, which a batch that is finished does not need.
-    from icrtool.output.exports.acceptance import Case, Suite
+    from icrtool.output.exports.acceptance import Suite
 
-    return [
-        Suite(row.log, [Case(one.gate, one.passed, one.line, one.not_checked) for one in row.verdicts],
-              row.reason if row.status == "failed" else "")
-        for row in rows
-    ]  # fmt: skip
+    return [Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows]
 
 
 def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
@@ -34,7 +27,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    from icrtool.output.exports.acceptance import escaped_markdown
+    from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
     counts = Counter(row.status for row in rows)
     failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
@@ -45,24 +38,24 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     shown = [(row, one) for row in rows for one in row.verdicts]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
-        lines += ["| log | gate | number | baseline | bound | margin | 95 % interval | verdict |",
-                  "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |"]  # fmt: skip
+        limits = []
         for row, one in shown:
             interval = f"{one.margin_low_m:+.3f} to {one.margin_high_m:+.3f} m" if one.margin_low_m is not None and (
                 one.margin_high_m is not None) else "-"  # fmt: skip
             verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
             numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
-            cells = [escaped_markdown(row.log), escaped_markdown(one.gate), *numbers, interval, verdict]
-            lines.append(f"| {' | '.join(cells)} |")
-        lines.append("")
-    lines += ["| log | 95 % after 10 m, ICR | baseline | difference |", "| --- | ---: | ---: | ---: |"]
+            limits.append([escaped_markdown(row.log), escaped_markdown(one.gate.text), *numbers, interval, verdict])
+        head = ("log", "gate", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
+        lines += [*markdown_table(head, limits, (0, 1, 7)), ""]
+    errors = []
     for row in rows:
         if row.status == "failed":
-            lines.append(f"| {escaped_markdown(row.log)} | could not be used: {escaped_markdown(row.reason)} | | |")
+            errors.append([escaped_markdown(row.log), f"could not be used: {escaped_markdown(row.reason)}", "", ""])
             continue
-        now, before = row.errors.get(SHOWN), row.baseline.get(SHOWN)
+        now, before = row.errors.get(SHOWN_ERROR), row.baseline.get(SHOWN_ERROR)
         difference = f"{now - before:+.3f} m" if now is not None and before is not None else "-"
-        lines.append(f"| {escaped_markdown(row.log)} | {_metres(now)} | {_metres(before)} | {difference} |")
+        errors.append([escaped_markdown(row.log), _metres(now), _metres(before), difference])
+    lines += markdown_table(("log", "95 % after 10 m, ICR", "baseline", "difference"), errors)
     changes = changes_of(rows, missing)
     return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
 

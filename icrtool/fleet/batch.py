@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import blake2b, sha256
 from pathlib import Path
 
@@ -14,9 +14,10 @@ import msgspec
 from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
 from icrtool.errors import ConfigError, OutputError
+from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import Request, files_of, path_of
-from icrtool.fleet.recordings import Recording, find_recordings
+from icrtool.fleet.recordings import FoundRecording, find_recordings
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
@@ -42,23 +43,18 @@ class BatchOptions:
     config_file, robot, sets : as in `icrtool.load_config`; a manifest's line comes before the first two
     redo : process logs again that are done
     timeout_s : a log that takes longer is ended
-    baseline : earlier report, run or batch to compare with; `strict`: as in `icrtool.dropout_report`
     overwrite : the run of another recording may be replaced
+    baseline : earlier report, run or batch to compare with
     """
 
     config_file: Path | None = None
     robot: str | None = None
     sets: tuple[str, ...] = ()
-    plots: tuple[str, ...] = ("png",)
-    gates: tuple[str, ...] = ()
-    budgets_m: tuple[float, ...] = (0.5,)
-    ladder: bool = True
+    report: ReportOptions = field(default_factory=ReportOptions)
     redo: bool = False
     timeout_s: float = 1800.0
     overwrite: bool = False
     baseline: Path | None = None
-    strict: bool = False
-    page: bool = True
 
 
 def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
@@ -76,7 +72,7 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
     from icrtool.output.run_directory import RUN_FILE
 
-    for gate in options.gates:
+    for gate in options.report.gates:
         parse_gate(gate)
     if (output / RUN_FILE).is_file():
         raise OutputError(output, "is a run itself", "name another place for the batch")
@@ -113,7 +109,7 @@ def finished(request: Request) -> Row | None:
     if (
         not Path(path_of(request.directory), "run.json").is_file()
         or not Path(path_of(request.directory), "dropout").is_dir()
-        or (request.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
+        or (request.report.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
     ):
         return None
     why = "done before: same input, configuration and version"
@@ -186,11 +182,12 @@ def _stage(watch: Watch, log: str) -> Callable[[str], None]:
     return lambda stage: watch(log, stage)
 
 
-def _request(one: Recording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
+def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
     config = _config(one, known, options)
-    document = {"config": config.effective(), "version": __version__, "plots": options.plots, "gates": options.gates,
-                "budgets": options.budgets_m, "ladder": options.ladder, "robot": known.robot,
-                "baseline": baseline, "strict": options.strict}  # fmt: skip
+    report = options.report
+    document = {"config": config.effective(), "version": __version__, "plots": report.plots, "gates": report.gates,
+                "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
+                "baseline": baseline, "strict": report.strict}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
     row = Row(one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot, group=known.group, tags=known.tags, key=key)
     place = blake2b(os.fsencode(one.name), digest_size=16).hexdigest()
@@ -198,14 +195,13 @@ def _request(one: Recording, known: About, output: Path, options: BatchOptions, 
     folder = output.absolute()
     return Request(
         path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
-        row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, plots=options.plots, gates=options.gates,
-        budgets_m=options.budgets_m, ladder=options.ladder, overwrite=options.overwrite,
+        row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, report=report,
+        overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
-        strict=options.strict, page=options.page,
     )  # fmt: skip
 
 
-def _config(one: Recording, known: About, options: BatchOptions) -> Config:
+def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
     """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
     builtin = known.robot in builtin_robots()
     if known.robot and not builtin and known.config is None and options.config_file is None:

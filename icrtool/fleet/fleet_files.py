@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from icrtool import __version__
-from icrtool.fleet.roll_up import PooledCalibration, calibration_documents
-from icrtool.fleet.row import Row, columns_of
+from icrtool.fleet.roll_up import PooledCalibration
+from icrtool.fleet.row import SHOWN_ERROR, Row, columns_of
 from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
+from icrtool.records.dropout import Verdict
 
 FLEET_SCHEMA = "icrtool/fleet/1"
 
@@ -22,8 +24,6 @@ FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 
 PLOTS = "plots"
-
-SHOWN_ERROR = "icr_p95_10m_m"
 
 
 def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
@@ -34,9 +34,18 @@ def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration
         "tool_version": __version__,
         "counts": {status: counts[status] for status in ("done", "failed", "skipped")},
         "gates_failed": sum(row.gates_failed for row in rows),
-        "calibrations": calibration_documents(calibrations),
-        "logs": [msgspec.to_builtins(row) for row in rows],
+        "calibrations": [asdict(one) for one in calibrations],
+        "logs": [msgspec.to_builtins(row) | {"verdicts": [_verdict(one) for one in row.verdicts]} for row in rows],
     }
+
+
+def _verdict(one: Verdict) -> dict[str, Any]:
+    return {
+        "gate": one.gate.text, "value_m": one.value_m, "margin_m": one.margin_m, "passed": one.passed,
+        "line": one.line(), "relative": bool(one.gate.baseline_factor), "bound_m": one.bound_m,
+        "baseline_m": one.baseline_m, "margin_low_m": one.margin_low_m, "margin_high_m": one.margin_high_m,
+        "not_checked": one.not_checked,
+    }  # fmt: skip
 
 
 def write_fleet(

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
-from icrtool.fleet.row import HORIZONS_M, ICRS, File, GateVerdict, Row, as_text
+from icrtool.fleet.fit_and_report import ReportOptions, Stage, fit_and_write, report_and_write
+from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
 from icrtool.logs.containers.split_files import files_of_log
+from icrtool.records.plain_data import plain
+from icrtool.records.run import ICR_COLUMNS
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
-    from icrtool.records.dropout import Verdict
-
-Stage = Callable[[str], None]
+    from icrtool.records.run_document import RunDocument
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +44,9 @@ class Request:
     directory: bytes
     row_file: bytes
     config: Config
-    plots: tuple[str, ...] = ("png",)
-    gates: tuple[str, ...] = ()
-    budgets_m: tuple[float, ...] = (0.5,)
-    ladder: bool = True
+    report: ReportOptions
     overwrite: bool = False
     baseline: bytes = b""
-    strict: bool = False
-    page: bool = True
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -119,40 +115,21 @@ def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File,
 
 def _results(request: Request, stage: Stage) -> Row:
     """Fit and analyse a log, write run and report."""
-    from icrtool.calibration.fit import fit
-    from icrtool.dropout_analysis.dropout_report import dropout_report
-    from icrtool.logs.read_log import read_log
     from icrtool.output.baseline_file import open_baseline
-    from icrtool.output.run_directory import PAGE_FILE, check_target
 
-    directory = path_of(request.directory)
-    check_target(directory, path_of(request.path), overwrite=request.overwrite)
-    stage("reading")
-    logs = [read_log(path_of(request.path), request.config)]
-    stage("filtering")
-    run = fit(logs.pop(), request.config)
-    stage("writing the run")
-    run.write(directory, plots=request.plots)
-    stage("dropout analysis")
-    place = path_of(request.baseline) if request.baseline else None
-    baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
-    report = dropout_report(
-        run, budgets_m=request.budgets_m, gates=request.gates, comparison=request.ladder, baseline=baseline,
-        strict=request.strict,
+    directory, place = path_of(request.directory), path_of(request.baseline) if request.baseline else None
+    run = fit_and_write(
+        path_of(request.path), directory, request.config, stage, overwrite=request.overwrite,
+        plots=request.report.plots,
     )  # fmt: skip
-    stage("writing the report")
-    report.write(directory / "dropout", plots=request.plots)
-    if request.page:
-        from icrtool.output.page.run_page import write_page
-
-        stage("writing the page")
-        write_page(run, report, directory / PAGE_FILE, plots=directory)
+    baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
+    report = report_and_write(run, directory, request.report, stage, baseline=baseline)
     return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
 
 
-def _row(request: Request, summary: dict[str, Any], first_ns: int, report: DropoutReport) -> Row:
+def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:
     icr = summary["icr"]
-    final, std = icr.get("final") or {}, icr.get("final_std") or {}
+    final, std = icr["final"], icr["final_std"]
     return replace(
         request.row,
         status="done",
@@ -160,14 +137,14 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary["drive"]["duration_s"],
         distance_m=summary["drive"]["distance_m"],
-        icr={name: final.get(name) for name in ICRS} | {f"std_{name}": std.get(name) for name in ICRS},
+        icr={name: final[name] for name in ICR_COLUMNS} | {f"std_{name}": std[name] for name in ICR_COLUMNS},
         multiplier=icr["separation_multiplier"],
         multiplier_std=icr["separation_multiplier_std"],
         errors=_errors(report),
         events=len(summary["events"]),
         outages=len(report.outages),
         warnings=len(summary["warnings"]),
-        verdicts=tuple(_verdict(replace(one, log=request.row.log)) for one in report.verdicts),
+        verdicts=tuple(replace(one, log=request.row.log) for one in report.verdicts),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
@@ -175,38 +152,23 @@ def _row(request: Request, summary: dict[str, Any], first_ns: int, report: Dropo
 
 
 def _errors(report: DropoutReport) -> dict[str, float | None]:
-    columns = report.summary_columns()
-    rows = list(zip(*(columns[name] for name in ("model", "horizon_m", "p95_m", "expected_error_m")), strict=True))
     errors: dict[str, float | None] = {}
-    for model, horizon_m, p95_m, expected_m in rows:
-        if float(horizon_m) in HORIZONS_M:
-            errors[f"{model}_p95_{float(horizon_m):g}m_m"] = _finite(p95_m)
-            errors[f"{model}_expected_{float(horizon_m):g}m_m"] = _finite(expected_m)
+    for result in report.results:
+        for h, horizon_m in enumerate(report.horizons_m.tolist()):
+            if horizon_m in HORIZONS_M:
+                errors[f"{result.name}_p95_{horizon_m:g}m_m"] = plain(result.summary.p95[h])
+                errors[f"{result.name}_expected_{horizon_m:g}m_m"] = plain(result.summary.expected[h])
     for budget in report.budgets:
-        errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = _finite(budget.distance_m)
+        errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = plain(budget.distance_m)
     return errors
-
-
-def _verdict(one: Verdict) -> GateVerdict:
-    low, high = one.interval_m
-    return GateVerdict(
-        one.gate.text, _finite(one.value_m), _finite(one.margin_m), one.passed, one.line(),
-        bool(one.gate.baseline_factor), _finite(one.bound_m), _finite(one.baseline_m), _finite(low), _finite(high),
-        one.not_checked,
-    )  # fmt: skip
 
 
 def _baseline_numbers(report: DropoutReport) -> dict[str, float | None]:
     """Return the baseline's p95 and expected errors under the names of `_errors`."""
     rows = report.baseline.rows if report.baseline is not None else {}
     return {
-        f"{model}_{metric}_{horizon_m:g}m_m": _finite(row.values_m[metric])
+        f"{model}_{metric}_{horizon_m:g}m_m": plain(row.values_m[metric])
         for (model, horizon_m), row in rows.items()
         if horizon_m in HORIZONS_M and report.result(model) is not None
         for metric in ("p95", "expected")
     }
-
-
-def _finite(value: Any) -> float | None:  # noqa: ANN401 - a number of numpy's or Python's
-    number = float(value)
-    return number if number - number == 0 else None

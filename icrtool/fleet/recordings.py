@@ -37,7 +37,7 @@ FIRST_BYTES = 65536
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class FoundRecording:
     """One recording.
 
     Attributes
@@ -52,7 +52,7 @@ class Recording:
     log: str
 
 
-def find_recordings(places: Sequence[Path]) -> list[Recording]:
+def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
     """Return the recordings among files and, searched recursively, folders; each once, in the order of their paths.
 
     Raises
@@ -176,7 +176,7 @@ def distinct_names(logs: Sequence[Path]) -> list[str]:
     taken = {name.casefold() for name in names if count[name.casefold()] == 1}
     for index, name in enumerate(names):
         if count[name.casefold()] > 1:
-            names[index] = _unique(longer[index], taken)
+            names[index] = unique_name(longer[index], taken)
     return names
 
 
@@ -244,7 +244,7 @@ def _search(folder: Path) -> Iterable[Path]:
             yield entry
 
 
-def _named(paths: Sequence[Path], root: Path) -> list[Recording]:
+def _named(paths: Sequence[Path], root: Path) -> list[FoundRecording]:
     """Name each recording after its path below `root`; where names collide, with the suffix of the file."""
     logs = [PurePosixPath(Path(os.path.relpath(_absolute(path), root)).as_posix()) for path in paths]
     short = [str(log.parent / log_name(path)) for log, path in zip(logs, paths, strict=True)]
@@ -256,11 +256,13 @@ def _named(paths: Sequence[Path], root: Path) -> list[Recording]:
         for name, log in zip(short, logs, strict=True)
     ]
     taken: set[str] = set()
-    names = [_unique(name, taken) for name in names]
-    return [Recording(path, as_text(name), as_text(log)) for path, name, log in zip(paths, names, logs, strict=True)]
+    names = [unique_name(name, taken) for name in names]
+    return [
+        FoundRecording(path, as_text(name), as_text(log)) for path, name, log in zip(paths, names, logs, strict=True)
+    ]
 
 
-def _unique(name: str, taken: set[str]) -> str:
+def unique_name(name: str, taken: set[str]) -> str:
     """Return a name, with a number where it is taken; add it to those that are."""
     unique, number = name, 2
     while unique.casefold() in taken:

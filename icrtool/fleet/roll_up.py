@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import msgspec
 
 from icrtool import __version__
 from icrtool.errors import IcrToolError, LogError
+from icrtool.fleet.recordings import unique_name
 from icrtool.fleet.row import Row
 from icrtool.output.atomic_file import write_file
 from icrtool.output.json_file import FLEET_FILE, json_bytes
@@ -107,11 +108,6 @@ def is_fleet(directory: Path) -> bool:
     return (directory / FLEET_FILE).is_file()
 
 
-def calibration_documents(found: Sequence[PooledCalibration]) -> list[dict[str, Any]]:
-    """Return plain data for fleet.json."""
-    return [asdict(one) for one in found]
-
-
 def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, name: str) -> PooledCalibration:
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.output.stored_run import open_run
@@ -134,19 +130,17 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     try:
         result = calibrate_runs(usable())
     except IcrToolError as err:
-        return _without(one, tuple(left_out), str(err))
+        return replace(one, left_out=tuple(left_out), reason=str(err))
     (directory / CALIBRATIONS).mkdir(exist_ok=True)
     file = f"{CALIBRATIONS}/{name}.json"
     write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.wheels)))
-    used = tuple(log for log in one.logs if log not in left_out)
-    return PooledCalibration(one.robot, one.group, used, tuple(left_out), file, "", result.calibration.recommended,
-                             float(numbers.multiplier), float(numbers.multiplier_std), table, one.key)  # fmt: skip
-
-
-def _without(one: PooledCalibration, left_out: tuple[str, ...], reason: str) -> PooledCalibration:
-    return PooledCalibration(one.robot, one.group, one.logs, left_out, reason=reason, key=one.key)
+    return replace(
+        one, logs=tuple(log for log in one.logs if log not in left_out), left_out=tuple(left_out), file=file,
+        recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
+        multiplier_std=float(numbers.multiplier_std), table=table,
+    )  # fmt: skip
 
 
 def _stored(directory: Path) -> list[PooledCalibration]:
@@ -162,8 +156,4 @@ def _file_name(robot: str, group: str, taken: set[str]) -> str:
     """Return a file name for a robot and group, distinct from those that are taken."""
     text = "-".join(part for part in (robot, group) if part) or "all"
     name = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text)[:100].strip(".") or "all"
-    unique, number = name, 2
-    while unique.casefold() in taken:
-        unique, number = f"{name}-{number}", number + 1
-    taken.add(unique.casefold())
-    return unique
+    return unique_name(name, taken)

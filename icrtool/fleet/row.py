@@ -6,9 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+from icrtool.records.dropout import Verdict
+from icrtool.records.run import ICR_COLUMNS
 
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+
+SHOWN_ERROR = "icr_p95_10m_m"
+"""The error of each log that is printed, drawn, and compared with the baseline."""
 
 Status = Literal["done", "failed", "skipped"]
 
@@ -21,29 +25,6 @@ class File:
     bytes: int
     mtime_ns: int
     sha256: str
-
-
-@dataclass(frozen=True, slots=True)
-class GateVerdict:
-    """What became of an acceptance limit; as `icrtool.records.dropout.Verdict`, None where that has NaN.
-
-    Attributes
-    ----------
-    line : the verdict in one line
-    relative : the limit is one on the baseline
-    """
-
-    gate: str
-    value_m: float | None
-    margin_m: float | None
-    passed: bool
-    line: str = ""
-    relative: bool = False
-    bound_m: float | None = None
-    baseline_m: float | None = None
-    margin_low_m: float | None = None
-    margin_high_m: float | None = None
-    not_checked: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +67,7 @@ class Row:
     events: int | None = None
     outages: int | None = None
     warnings: int | None = None
-    verdicts: tuple[GateVerdict, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
     baseline: dict[str, float | None] = field(default_factory=dict)
     changes: tuple[str, ...] = ()
     inputs: tuple[File, ...] = ()
@@ -110,7 +91,7 @@ class Row:
             "start_utc": self.start_utc,
             "duration_s": self.duration_s,
             "distance_m": self.distance_m,
-            **{name: self.icr.get(name) for name in (*ICRS, *(f"std_{name}" for name in ICRS))},
+            **{name: self.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{name}" for name in ICR_COLUMNS))},
             "multiplier": self.multiplier,
             "multiplier_std": self.multiplier_std,
             **self.errors,

@@ -22,7 +22,8 @@ from typing import IO, NamedTuple
 
 import msgspec
 
-from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
+from icrtool.fleet.fit_and_report import Stage
+from icrtool.fleet.one_log import Request, decode_request, failed, process
 from icrtool.fleet.row import Row
 from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished

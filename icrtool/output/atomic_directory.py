@@ -28,7 +28,7 @@ LONGEST_NAME_BYTES = 200
 NAMES_SHOWN = 5
 
 
-def check_place(directory: Path, ours: IsOurs, *, kind: str) -> None:
+def check_directory(directory: Path, ours: IsOurs, *, kind: str) -> None:
     """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
 
     Parameters
@@ -81,7 +81,7 @@ def atomic_directory(
 
     Parameters
     ----------
-    directory, ours, kind : as in `check_place`
+    directory, ours, kind : as in `check_directory`
     names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
     made_from : absolute paths of the files that the content is made from
     note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
@@ -94,9 +94,9 @@ def atomic_directory(
     Raises
     ------
     OutputError
-        As `check_place`, and for every OSError of the block (disk full, no permission).
+        As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
-    check_place(directory, ours, kind=kind)
+    check_directory(directory, ours, kind=kind)
     made: list[Path] = []
     try:
         place = _resolved(directory)
@@ -104,7 +104,7 @@ def atomic_directory(
         _make_parents(place, made)
         with hidden_directory(place, names) as partial:
             yield partial
-            check_place(place, ours, kind=kind)
+            check_directory(place, ours, kind=kind)
             done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -45,13 +45,18 @@ ERROR_COLUMNS = ("icr", "no_slip")
 Cell = str | int | float | None
 
 
-@contextmanager
-def report_writer(directory: Path, plots: tuple[str, ...], stamp_ns: Ints | None = None) -> Iterator[ReportWriter]:
-    """Give a writer of one report; its files appear as `directory` when the block ends well, or not at all.
+def write_report(
+    analyse: Callable[[ErrorSink | None], DropoutReport],
+    directory: Path,
+    *,
+    plots: tuple[str, ...] = ("png",),
+    stamp_ns: Ints | None = None,
+) -> DropoutReport:
+    """Write a report, whole or not at all; an old one in its place is replaced.
 
     Parameters
     ----------
-    directory : where the report shall appear; an old report there is replaced
+    analyse : gives the report; it is called with what takes every single trial, None where they are not written
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
 
@@ -60,39 +65,15 @@ def report_writer(directory: Path, plots: tuple[str, ...], stamp_ns: Ints | None
     OutputError
         Something that is not a dropout report stands in its place, or the disk does not take it.
     """
-    with (
-        atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial,
-        trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink,
-    ):
-        yield ReportWriter(partial, plots, sink)
-
-
-class ReportWriter:
-    """Writes one report; `report_writer` gives one.
-
-    Attributes
-    ----------
-    sink : takes every single trial, None where they are not written
-    """
-
-    def __init__(self, directory: Path, plots: tuple[str, ...], sink: ErrorSink | None) -> None:
-        self._directory = directory
-        self._plots = plots
-        self.sink = sink
-
-    def finish(self, report: DropoutReport) -> None:
-        """Draw the figures and write the tables."""
-        if self._plots:
+    with atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial:
+        with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
+            report = analyse(sink)
+        if plots:
             from icrtool.output.figure_catalogue import draw_figures
 
-            draw_figures("report", report, self._directory / "plots", self._plots)
-        write_tables(report, self._directory)
-
-
-def write_report(report: DropoutReport, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
-    """Write a finished report, whole or not at all; see `DropoutReport.write`."""
-    with report_writer(directory, plots) as writer:
-        writer.finish(report)
+            draw_figures("report", report, partial / "plots", plots)
+        write_tables(report, partial)
+    return report
 
 
 def is_dropout_directory(directory: Path) -> bool:
@@ -158,8 +139,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
                 "value_bound_m": verdict.bound_m,
                 "baseline_m": verdict.baseline_m,
                 "margin_m": verdict.margin_m,
-                "margin_low_m": verdict.interval_m[0],
-                "margin_high_m": verdict.interval_m[1],
+                "margin_low_m": verdict.margin_low_m,
+                "margin_high_m": verdict.margin_high_m,
                 "not_checked": verdict.not_checked or None,
                 "passed": verdict.passed,
                 "verdict": verdict.line(),

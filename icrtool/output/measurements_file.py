@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,6 +17,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
 from icrtool.records.tables import States
 
@@ -36,19 +37,6 @@ KINDS = {
 
 WHEEL_COLUMNS = ("stamp_ns", "v_left_mps", "v_right_mps")
 """Stored for the samples before the first state; the states hold the others."""
-
-
-class FilterInputs(NamedTuple):
-    """What run.json holds of the sensors: numbers that are no column."""
-
-    name: str
-    heading_from_position: bool
-    heading_is_estimated: bool
-    heading_correlation_s: float
-    antenna_m: tuple[float, float]
-    losses_ns: Ints
-    events: tuple[SlipEvent, ...]
-    icr_start: IcrStart | None
 
 
 def write_measurements(run: Run, path: Path) -> None:
@@ -77,9 +65,13 @@ def write_measurements(run: Run, path: Path) -> None:
 
 
 def read_measurements(
-    path: Path, table: States, inputs: FilterInputs
+    path: Path, table: States, document: RunDocument
 ) -> tuple[SensorData, MeasurementOutcome, MeasurementOutcome]:
     """Read what `write_measurements` wrote: the sensors, and what became of fixes and headings.
+
+    Parameters
+    ----------
+    table : the states of the run; `document`: its run.json, which holds what is no column
 
     Raises
     ------
@@ -88,6 +80,8 @@ def read_measurements(
     OSError
         The file cannot be read.
     """
+    facts, events = document["filter"], cast("list[dict[str, Any]]", document["events"])
+    start = facts["icr_start"]
     try:
         with np.load(path) as stored:
             columns = {name: stored[name] for name in stored.files}
@@ -96,18 +90,18 @@ def read_measurements(
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
         headings = HeadingSamples(**_columns(columns, "headings", _names(HeadingSamples)))
         sensors = SensorData(
-            name=inputs.name,
+            name=document["log"],
             wheels=WheelSamples(stamps, left, right),
             fixes=fixes,
             headings=headings,
             gyro=_gyro(columns) if "gyro_topic" in columns else None,
-            heading_from_position=inputs.heading_from_position,
-            heading_correlation_s=inputs.heading_correlation_s,
-            antenna_m=inputs.antenna_m,
-            losses_ns=inputs.losses_ns,
-            events=inputs.events,
-            icr_start=inputs.icr_start,
-            heading_is_estimated=inputs.heading_is_estimated,
+            heading_from_position=facts["heading_from_position"],
+            heading_correlation_s=facts["heading_correlation_s"],
+            antenna_m=(facts["antenna_m"][0], facts["antenna_m"][1]),
+            losses_ns=spans_of(document["rtk_losses_ns"]),
+            events=tuple(SlipEvent(*(event[name] for name in SlipEvent._fields)) for event in events),
+            icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
+            heading_is_estimated=facts["heading_is_estimated"],
             attitude=HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
             if "attitude_stamp_ns" in columns
             else None,
@@ -119,6 +113,16 @@ def read_measurements(
     except (BadZipFile, KeyError, EOFError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     return sensors, outcomes[0], outcomes[1]
+
+
+def spans_of(pairs: object) -> Ints:
+    """Return the spans of a run.json as an array (k, 2) [ns]."""
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _triple(numbers: list[float]) -> tuple[float, float, float]:
+    one, two, three = numbers
+    return one, two, three
 
 
 def _names(record: type) -> tuple[str, ...]:

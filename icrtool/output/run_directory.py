@@ -12,7 +12,7 @@ from typing import Any
 
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
-from icrtool.output.atomic_directory import atomic_directory, check_place
+from icrtool.output.atomic_directory import atomic_directory, check_directory
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
@@ -56,7 +56,7 @@ def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = 
     OutputError
         A file, a directory that is not a run of ours, or the run of another recording is there.
     """
-    check_place(directory, is_run_directory, kind="run directory")
+    check_directory(directory, is_run_directory, kind="run directory")
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
         other = log_of_run(directory) or "data frames"
         advice = "name another place, or replace it with --overwrite"
@@ -72,12 +72,13 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     if any(os.path.realpath(file) in places for file in files):
         return True
     return bool(inputs) and all(
-        any(file.stat().st_size == one.get("bytes") and _sha256(file) == one.get("sha256") for file in files)
+        any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)
         for one in inputs
     )
 
 
-def _sha256(file: Path) -> str:
+def file_sha256(file: Path) -> str:
+    """Return the SHA-256 of a file (hex)."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

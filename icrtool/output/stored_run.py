@@ -6,15 +6,15 @@ import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 
 from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, RunError
-from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.split_files import numbered_file, split_path
-from icrtool.output.measurements_file import MEASUREMENTS_FILE, FilterInputs, read_measurements
+from icrtool.output.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
 from icrtool.output.run_directory import (
     CHECKSUM_FILE,
     RUN_FILE,
@@ -23,11 +23,9 @@ from icrtool.output.run_directory import (
     STATES_FILES,
     is_run_directory,
 )
-from icrtool.output.run_schema import check_run_document
 from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
-from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import IcrStart
 from icrtool.records.run import RUN_SCHEMA, Run
+from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
 from icrtool.records.text import LogText, escaped
 
@@ -35,6 +33,15 @@ FIT_AGAIN = "fit the log again"
 
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
+
+TOGETHER = (
+    ("icr", "separation_multiplier", "separation_multiplier_std"),
+    ("gnss", "mean_difference_m", "max_difference_m"),
+    ("gnss", "delay_s", "delay_std_s"),
+    ("heading", "delay_s", "delay_std_s"),
+    ("heading", "offset_deg", "offset_std_deg"),
+)
+"""Section, and two keys of it that are both known or both null."""
 
 
 def open_run(path: str | Path) -> Run:
@@ -58,7 +65,7 @@ def open_run(path: str | Path) -> Run:
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
-        check_run_document(document)
+        run_document = check_run_document(document)
         config = _config(document["config"], directory)
         # Keys that somebody removed have their defaults.
         document["config"] = config.effective()
@@ -67,18 +74,8 @@ def open_run(path: str | Path) -> Run:
             raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
-        losses = _spans(document["rtk_losses_ns"])
-        facts = document["filter"]
-        forward, right = facts["antenna_m"]
-        start = facts["icr_start"]
-        inputs = FilterInputs(
-            document["log"], facts["heading_from_position"], facts["heading_is_estimated"],
-            facts["heading_correlation_s"], (forward, right), losses,
-            tuple(SlipEvent(**{name: event[name] for name in SlipEvent._fields}) for event in document["events"]),
-            None if start is None else IcrStart(tuple(start["icrs_m"]), tuple(start["std_m"])),
-        )  # fmt: skip
         _check_sum(directory, MEASUREMENTS_FILE, sums)
-        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, inputs)
+        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, run_document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
@@ -86,13 +83,13 @@ def open_run(path: str | Path) -> Run:
             name=document["log"],
             config=config,
             table=table,
-            in_gap=np.isin(table.stamp_ns, _spans(document["wheel_gaps_ns"])[:, 0]),
-            outages_ns=_spans(document["outages_ns"]),
+            in_gap=np.isin(table.stamp_ns, spans_of(run_document["wheel_gaps_ns"])[:, 0]),
+            outages_ns=spans_of(run_document["outages_ns"]),
             sensors=sensors,
             gnss=gnss,
             heading=heading,
             smoothed=smoothed,
-            summary=document,
+            summary=run_document,
             directory=directory,
         )
     except (OSError, StatesFileError, ValueError, OverflowError) as err:
@@ -139,6 +136,30 @@ def newest_run(runs: Path) -> Path:
     if not found:
         raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
     return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
+
+
+def check_run_document(document: dict[str, Any]) -> RunDocument:
+    """Return plain data, which must be that of a run.
+
+    Raises
+    ------
+    ValueError
+        A key is missing, of another type, or null without its companion; its path is named.
+    """
+    try:
+        msgspec.convert(document, RunDocument)
+    except msgspec.ValidationError as err:
+        raise ValueError(str(err)) from err
+    for section, one, other in TOGETHER:
+        if (document[section][one] is None) != (document[section][other] is None):
+            raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")
+    icr = document["icr"]
+    for column in icr["final"]:
+        if len({icr[key][column] is None for key in ("final", "final_std", "mean", "std")}) > 1:
+            raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
+    if document["usable"] != (document["unusable_because"] is None):
+        raise ValueError("usable and unusable_because contradict each other - at `$`")
+    return cast("RunDocument", document)
 
 
 def _config(document: Mapping[str, Any], directory: Path) -> Config:
@@ -208,7 +229,3 @@ def _check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
         raise RunError(directory, f"{name} is missing or unreadable", FIT_AGAIN) from err
     if found != sums.get(name):
         raise RunError(directory, f"{name} was edited or cut short since the run", FIT_AGAIN)
-
-
-def _spans(pairs: object) -> Ints:
-    return np.array(pairs, np.int64).reshape(-1, 2)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.output.atomic_directory import atomic_directory, check_place
+from icrtool.output.atomic_directory import atomic_directory, check_directory
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.simulation.studies import KINDS, Column, StudyResult
@@ -27,7 +27,7 @@ def check_study_target(directory: Path) -> None:
     OutputError
         A file or a directory that is not a study of ours is there.
     """
-    check_place(directory, is_study_directory, kind=KIND)
+    check_directory(directory, is_study_directory, kind=KIND)
 
 
 def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from icrtool.output.text_blocks import Line
+
+if TYPE_CHECKING:
+    from icrtool.records.run_document import RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -14,18 +17,18 @@ FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others"
 """What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
 
 
-def run_title(summary: Mapping[str, Any]) -> str:
+def run_title(summary: RunDocument) -> str:
     """Return the log's name, and the robot's where it has one; `summary` is that of a run."""
     log, robot = summary["log"], summary["config"]["robot"]["name"]
     return f"{log}  ({robot})" if robot else str(log)
 
 
-def unusable_lines(summary: Mapping[str, Any]) -> list[Line]:
+def unusable_lines(summary: RunDocument) -> list[Line]:
     """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
     return [] if summary["usable"] else [Line(f"NOT USABLE: {summary['unusable_because']}", "bad")]
 
 
-def position_word(summary: Mapping[str, Any]) -> str:
+def position_word(summary: RunDocument) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
     return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
 

@@ -223,34 +223,29 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether an acceptance limit was kept.
+    """Whether an acceptance limit was kept; numbers are None where there is none.
 
     Attributes
     ----------
-    value_m : NaN where the log has no trial of that length
-    margin_m : negative where the number exceeds the bound
     passed : of a limit relative to the baseline also where the interval of the difference reaches the bound
+    value_m : None where the log has no trial of that length
+    margin_m : negative where the number exceeds the bound; margin_low_m, margin_high_m : its 95 % confidence interval,
+        of a limit relative to the baseline
+    bound_m : that of the gate, with the baseline's share; baseline_m : the baseline's number
     log : name of the log
-    bound_m : that of the gate, with the baseline's share
-    baseline_m : the baseline's number, NaN without one
-    half_width_m : half the 95 % confidence interval of the difference to the baseline, NaN without one
     not_checked : why the limit was not checked; empty where it was
     """
 
     gate: Gate
-    value_m: float
-    margin_m: float
     passed: bool
+    value_m: float | None
+    margin_m: float | None = None
+    margin_low_m: float | None = None
+    margin_high_m: float | None = None
+    bound_m: float | None = None
+    baseline_m: float | None = None
     log: str = ""
-    bound_m: float = math.nan
-    baseline_m: float = math.nan
-    half_width_m: float = math.nan
     not_checked: str = ""
-
-    @property
-    def interval_m(self) -> tuple[float, float]:
-        """Interval of the margin [m]; NaN without one."""
-        return self.margin_m - self.half_width_m, self.margin_m + self.half_width_m
 
     def line(self) -> str:
         """Return the verdict in one line, which names the log."""
@@ -258,19 +253,20 @@ class Verdict:
         log = f" (log {self.log})" if self.log else ""
         if self.not_checked:
             return f"none  {self.gate.text}: not checked: {self.not_checked}{log}"
-        if math.isnan(self.value_m):
+        if self.value_m is None:
             return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log{log}"
         return f"{word}  {self.gate.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
 
     def _bound_text(self) -> str:
-        margin = f", margin {self.margin_m:+.4g} m"
+        numbers = (self.margin_m, self.bound_m, self.baseline_m)
+        margin_m, bound_m, baseline_m = (math.nan if one is None else one for one in numbers)
+        margin = f", margin {margin_m:+.4g} m"
         if not self.gate.baseline_factor:
             return margin
         interval = ", no interval"
-        if not math.isnan(self.half_width_m):
-            low, high = self.interval_m
-            interval = f" (95 %: {low:+.4g} to {high:+.4g} m)"
-        return f", bound {self.bound_m:.4g} m (baseline {self.baseline_m:.4g} m){margin}{interval}"
+        if self.margin_low_m is not None:
+            interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
+        return f", bound {bound_m:.4g} m (baseline {baseline_m:.4g} m){margin}{interval}"
 
 
 class TurningSplit(NamedTuple):

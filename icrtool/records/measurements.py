@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.events import SlipEvent
-from icrtool.records.samples import GyroSamples, HeadingSamples, StreamChoice, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
@@ -33,7 +33,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Fixes:
+class Fixes(Samples):
     """Positions of the antenna as the filter uses them.
 
     Attributes
@@ -54,10 +54,6 @@ class Fixes:
     fix_class: Bytes
     misreported: Bools
     down_weighted: Bools
-
-    def cut(self, rows: slice) -> Fixes:
-        """Return the fixes of some rows."""
-        return Fixes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 class IcrStart(NamedTuple):
@@ -100,25 +96,13 @@ class SensorData:
     heading_is_estimated: bool = False
     attitude: HeadingSamples | None = None
 
-    def earlier(self, delay_s: float) -> SensorData:
-        """Return it with the position reference taken `delay_s` earlier, and the heading that comes with it."""
-        if delay_s == 0.0:
-            return self
-        shift = round(delay_s * 1e9)
-        headings = self.headings
-        if self.heading_from_position:
-            headings = replace(headings, stamp_ns=headings.stamp_ns - shift)
-        fixes = replace(self.fixes, stamp_ns=self.fixes.stamp_ns - shift)
-        return replace(self, fixes=fixes, headings=headings, losses_ns=self.losses_ns - shift)
-
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""
         wheels = self.wheels.cut(rows)
         span = wheels.stamp_ns[[0, -1]]
         fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
         samples = slice(*np.searchsorted(self.headings.stamp_ns, span))
-        headings = HeadingSamples(*(getattr(self.headings, field.name)[samples] for field in fields(self.headings)))
-        return replace(self, wheels=wheels, fixes=self.fixes.cut(fixes), headings=headings)
+        return replace(self, wheels=wheels, fixes=self.fixes.cut(fixes), headings=self.headings.cut(samples))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -20,11 +20,13 @@ from icrtool.records.tables import States
 if TYPE_CHECKING:
     import pandas as pd
 
+    from icrtool.records.run_document import IcrColumn, IcrDocument, RunDocument
+
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
 
-ICR_WORDS = {"y_icr_right_m": "y right", "y_icr_left_m": "y left", "x_icr_m": "x"}
-ICR_COLUMNS = tuple(ICR_WORDS)
+ICR_COLUMNS: tuple[IcrColumn, ...] = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), strict=True))
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""
@@ -103,7 +105,7 @@ class Run:
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
     smoothed: States | None
-    summary: dict[str, Any] = field(repr=False)
+    summary: RunDocument = field(repr=False)
     directory: Path | None = None
 
     @property
@@ -127,10 +129,10 @@ class Run:
         return tuple(change["t_s"] for change in self.summary["terrain"]["changes"])
 
     @property
-    def convergence_s(self) -> dict[str, tuple[float, float] | None]:
+    def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
         spans = self.summary["icr"]["convergence_span_s"]
-        return {name: (span[0], span[1]) if span is not None else None for name, span in spans.items()}
+        return {name: (span[0], span[1]) if (span := spans[name]) is not None else None for name in ICR_COLUMNS}
 
     @property
     def settled_s(self) -> float:
@@ -140,7 +142,7 @@ class Run:
     @property
     def process_position_mps(self) -> float:
         """Position process noise the run ended with."""
-        return float(self.summary["filter"]["process_position_mps"])
+        return self.summary["filter"]["process_position_mps"]
 
     @property
     def began_with(self) -> WarmStart | None:
@@ -161,14 +163,14 @@ class Run:
 
         It holds configured and estimated scales; dividing by it gives back the speeds that the wheels reported.
         """
-        wheels = self.summary.get("wheels", {})
+        wheels = self.summary["wheels"]
         common = wheels.get("applied_scale", 1.0)
         return float(wheels.get("applied_left_scale", common)), float(wheels.get("applied_right_scale", common))
 
     @property
     def usable(self) -> bool:
         """Whether the ICRs may be used; ``unusable_because`` of `summary` is the reason where not."""
-        return bool(self.summary["usable"])
+        return self.summary["usable"]
 
     def write(
         self,
@@ -208,7 +210,7 @@ class Run:
         )
 
 
-def icr_text(icr: dict[str, Any], column: str) -> str:
+def icr_text(icr: IcrDocument, column: IcrColumn) -> str:
     """Return a final ICR with its standard deviation, of the summary's section ``icr``."""
     final, std = icr["final"][column], icr["final_std"][column]
     return f"{final:+.3f} ± {std:.3f}" if final is not None else "not shown"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal, Self, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bytes, Floats, Ints
 
@@ -20,17 +21,33 @@ NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
 fixed, RTK fixed or float."""
 
 
-def _check_lengths(stamp_ns: Ints, *columns: Floats | Bytes) -> None:
-    lengths = [len(column) for column in columns]
-    if any(length != len(stamp_ns) for length in lengths):
-        raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(stamp_ns)}")
+class Samples:
+    """Columns of one sensor, as many values in each as there are stamps in `stamp_ns`."""
+
+    __slots__ = ()
+
+    stamp_ns: Ints
+
+    def __post_init__(self) -> None:
+        lengths = {name: len(column) for name, column in self._columns().items()}
+        if any(length != len(self.stamp_ns) for length in lengths.values()):
+            raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(self.stamp_ns)}")
+
+    def cut(self, rows: slice) -> Self:
+        """Return the samples of some rows."""
+        part: Self = replace(cast(Any, self), **{name: column[rows] for name, column in self._columns().items()})
+        return part
+
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        values = {field.name: getattr(self, field.name) for field in fields(cast(Any, self))}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]
 
 
 @dataclass(frozen=True, slots=True)
-class WheelSamples:
+class WheelSamples(Samples):
     """Speeds of the left and the right side.
 
     Attributes
@@ -48,9 +65,6 @@ class WheelSamples:
     unit: WheelUnit = "mps"
     from_position: bool = False
 
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.left, self.right)
-
     @property
     def v_left_mps(self) -> Floats:
         """Speed of the left side [m/s], (n,)."""
@@ -61,10 +75,6 @@ class WheelSamples:
         """Speed of the right side [m/s], (n,)."""
         return self._in_mps(self.right)
 
-    def cut(self, rows: slice) -> WheelSamples:
-        """Return the samples of some rows."""
-        return replace(self, stamp_ns=self.stamp_ns[rows], left=self.left[rows], right=self.right[rows])
-
     def _in_mps(self, speed: Floats) -> Floats:
         if self.unit not in ("mps", "m"):
             raise ValueError(f"wheels in {self.unit} per second: icrtool.alignment.wheel_units makes speeds of them")
@@ -72,7 +82,7 @@ class WheelSamples:
 
 
 @dataclass(frozen=True, slots=True)
-class PositionFixes:
+class PositionFixes(Samples):
     """Positions of the antenna (or of the tracked reference point) in the local plane.
 
     Attributes
@@ -91,26 +101,9 @@ class PositionFixes:
     cov_north_east_m2: Floats
     stated_class: Bytes | None = None
 
-    def __post_init__(self) -> None:
-        stated = () if self.stated_class is None else (self.stated_class,)
-        _check_lengths(
-            self.stamp_ns,
-            self.north_m,
-            self.east_m,
-            self.var_north_m2,
-            self.var_east_m2,
-            self.cov_north_east_m2,
-            *stated,
-        )
-
-    def cut(self, rows: slice) -> PositionFixes:
-        """Return the fixes of some rows."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
-
 
 @dataclass(frozen=True, slots=True)
-class HeadingSamples:
+class HeadingSamples(Samples):
     """Headings, clockwise from north.
 
     Attributes
@@ -124,12 +117,9 @@ class HeadingSamples:
     heading_rad: Floats
     var_rad2: Floats
 
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.heading_rad, self.var_rad2)
-
 
 @dataclass(frozen=True, slots=True)
-class GyroSamples:
+class GyroSamples(Samples):
     """Turn rates, clockwise positive.
 
     Attributes
@@ -143,12 +133,9 @@ class GyroSamples:
     stamp_ns: Ints
     rate_radps: Floats
 
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.rate_radps)
-
 
 @dataclass(frozen=True, slots=True)
-class GyroAxes:
+class GyroAxes(Samples):
     """Turn rates about the three axes of an inertial unit, as sent.
 
     Attributes
@@ -161,9 +148,6 @@ class GyroAxes:
     topic: str
     stamp_ns: Ints
     rates_radps: Floats
-
-    def __post_init__(self) -> None:
-        _check_lengths(self.stamp_ns, self.rates_radps)
 
 
 @dataclass(frozen=True, slots=True)

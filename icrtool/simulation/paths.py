@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
 
 PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "straight"]
-PATH_KINDS: tuple[PathKind, ...] = get_args(PathKind)
 
 CURVED_SWINGS = ((0.8, 1.4), (0.2, 3.0))
 """Share of the curvature, and length in radii per radian, of the two oscillations of path ``curved``: the heading

@@ -6,7 +6,7 @@ import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -29,7 +29,6 @@ StudyName = Literal[
     "rate",
     "consistency",
 ]
-STUDY_NAMES: tuple[StudyName, ...] = get_args(StudyName)
 
 Preset = Literal["paper", "field"]
 Column = Floats | Ints | Bools | list[str]

@@ -14,8 +14,8 @@ from icrtool.simulation.drives import Icrs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, measure_times, trace
-from icrtool.simulation.study_runs import Chunk, Progress
-from icrtool.simulation.study_sweeps import Level, base_scenario, run_levels, spread
+from icrtool.simulation.study_runs import Chunk, Progress, Scenario
+from icrtool.simulation.study_sweeps import levels_of, run_levels, spread
 
 CHANGE_TIMES_S = (175.0, 350.0)
 """Pentzer 2014, Figs. 8 and 9."""
@@ -45,11 +45,9 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
             why = f"{plan.duration_s:g} s end before the first change, at {CHANGE_TIMES_S[0]:g} s"
             raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
     request = replace(request, plan=plan)
-    levels = [
-        Level(preset, name, replace(base_scenario(request, preset), inflate=inflate))
-        for preset in request.presets
-        for name, inflate in (("not inflated", False), ("inflated", True))
-    ]
+    levels = levels_of(
+        request, ("not inflated", "inflated"), lambda base, name: replace(base, inflate=name == "inflated")
+    )
     times = [time for time, _ in plan.changes]
     edges = [*times, plan.duration_s]
 
@@ -102,14 +100,14 @@ def study_turn_radius(request: StudyRequest, progress: Progress | None) -> Study
     """
     path, change = cast(PathPlan, request.plan.path), (RADIUS_CHANGE_S, changed(request.plan.icrs_m, 1))
     outer = abs(request.plan.icrs_m[1])
-    levels = []
-    for preset in request.presets:
-        base = base_scenario(request, preset)
-        for radius in request.values:
-            speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
-            circle = replace(path, kind="circle", radius_m=radius, speed_mps=speed)
-            plan = replace(base.plan, path=circle, changes=base.plan.changes or (change,))
-            levels.append(Level(preset, radius, replace(base, plan=plan, inflate=True)))
+
+    def on_circle(base: Scenario, radius: float) -> Scenario:
+        speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
+        circle = replace(path, kind="circle", radius_m=radius, speed_mps=speed)
+        plan = replace(base.plan, path=circle, changes=base.plan.changes or (change,))
+        return replace(base, plan=plan, inflate=True)
+
+    levels = levels_of(request, request.values, on_circle)
     since = levels[0].scenario.plan.changes[0][0]
 
     def measure(chunk: Chunk) -> dict[str, Floats]:

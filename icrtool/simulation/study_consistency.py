@@ -11,6 +11,7 @@ from icrtool.alignment.align import sensors_as_sent
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.batch_filter import model_states, run_batch
+from icrtool.kernels.ekf_step import PLACES
 from icrtool.simulation.drives import Readings, Sensors, sample_times
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
@@ -24,7 +25,6 @@ from icrtool.simulation.study_runs import (
     on_all_cores,
     readings_log,
     run_scenarios,
-    square,
     stack,
     with_start,
 )
@@ -229,7 +229,7 @@ def _model_chunk(
     stops = np.append(np.searchsorted(wheel_t, stops_s, side="right") - 1, len(wheel_t) - 1)
     out = run_batch(stack(readings, setup, stops), setup.parameters)
     error = out.x[:, stops - (len(wheel_t) - out.x.shape[1])] - np.array(truths)[:, stops]
-    return _reduced(error, square(out), wheel_t[stops], out.gnss_nis, out.heading_nis)
+    return _reduced(error, out.P[..., PLACES], wheel_t[stops], out.gnss_nis, out.heading_nis)
 
 
 def _readings(

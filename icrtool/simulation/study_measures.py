@@ -103,7 +103,7 @@ def trace(chunk: Chunk, until_s: float = np.inf) -> dict[str, Floats]:
     return {"trace": np.concatenate([times, chunk.x[:, rows, 3:]], axis=2)}
 
 
-def open_loop_errors(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
+def open_loop_p95(chunk: Chunk, track_width_m: float) -> dict[str, Floats]:
     """Return the 95th percentile (runs,) of the open-loop error after 10 m [m]: with the final ICRs, and without slip.
 
     Notes

@@ -14,7 +14,8 @@ from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.batch_filter import Batch, BatchOutput, run_batch
+from icrtool.kernels.batch_filter import Batch, run_batch
+from icrtool.kernels.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -176,7 +177,7 @@ def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float,
         std=np.sqrt(np.maximum(out.variance, 0.0)),
         true_icrs_m=truths[0].icrs_m[truths[0].which[truths[0].rows(times)]],
         stops_s=at_stops,
-        P=square(out),
+        P=out.P[..., PLACES],
         true_pose=np.array([truth.poses(at_stops) for truth in truths]),
         truths=truths,
         gnss_nis=out.gnss_nis,
@@ -240,12 +241,3 @@ def stack(readings: Sequence[Readings], setup: FilterSetup, stops: Ints) -> Batc
         P0=setup.P0[np.triu_indices(6)],
         stops=stops,
     )
-
-
-def square(out: BatchOutput) -> Floats:
-    """Return the covariances at the stops as symmetric matrices, (runs, s, 6, 6)."""
-    P = np.zeros((*out.P.shape[:2], 6, 6))
-    rows, columns = np.triu_indices(6)
-    P[..., rows, columns] = out.P
-    P[..., columns, rows] = out.P
-    return P

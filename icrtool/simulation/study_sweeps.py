@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from icrtool.config import Config
 from icrtool.kernels.arrays import Floats
 from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
-from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_errors, trace
+from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_p95, trace
 from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
 
 HIDDEN = frozenset({"trace", "zoom"})
@@ -34,14 +33,29 @@ class Level:
     scenario: Scenario
 
 
-def with_preset(config: Config, preset: str) -> Config:
-    """Return the configuration with a filter preset."""
-    return config.with_filter(preset=preset)
-
-
 def base_scenario(request: StudyRequest, preset: str) -> Scenario:
     """Return the scenario of a request in a preset, before anything is varied."""
-    return Scenario(request.plan, request.sensors, with_preset(request.config, preset), request.vary_path)
+    return Scenario(request.plan, request.sensors, request.config.with_filter(preset=preset), request.vary_path)
+
+
+Value = TypeVar("Value", bound=float | str)
+
+
+def levels_of(
+    request: StudyRequest, values: Iterable[Value], change: Callable[[Scenario, Value], Scenario]
+) -> list[Level]:
+    """Return a level for each preset and value, with what `change` makes of the preset's scenario."""
+    values = tuple(values)
+    return [
+        Level(preset, value, change(base_scenario(request, preset), value))
+        for preset in request.presets
+        for value in values
+    ]
+
+
+def with_sensors(scenario: Scenario, **changes: Any) -> Scenario:
+    """Return a scenario with other sensors."""
+    return replace(scenario, sensors=replace(scenario.sensors, **changes))
 
 
 def run_levels(
@@ -75,13 +89,9 @@ def spread(values: Floats) -> tuple[float, float, float]:
 def study_convergence(request: StudyRequest, progress: Progress | None) -> StudyResult:
     """Return the convergence times from the preset's start, by kind of path (Figs. 4, 5)."""
     path = cast(PathPlan, request.plan.path)
-    levels = []
-    for preset in request.presets:
-        base = base_scenario(request, preset)
-        levels += [
-            Level(preset, kind, replace(base, plan=replace(base.plan, path=replace(path, kind=kind))))
-            for kind in request.paths
-        ]
+    levels = levels_of(
+        request, request.paths, lambda base, kind: replace(base, plan=replace(base.plan, path=replace(path, kind=kind)))
+    )
     columns, records, found = run_levels(
         levels,
         request,
@@ -116,15 +126,8 @@ def study_input_bias(request: StudyRequest, progress: Progress | None) -> StudyR
     return _vary_sensors(request, "input_bias_mps", "Fig. 13's axis: -0.1 to 0.02 m", progress)
 
 
-def _vary_sensors(
-    request: StudyRequest, name: Literal["input_noise_mps", "input_bias_mps"], paper: str, progress: Progress | None
-) -> StudyResult:
-    levels = []
-    for preset in request.presets:
-        base = base_scenario(request, preset)
-        levels += [
-            Level(preset, value, replace(base, sensors=_varied(base.sensors, name, value))) for value in request.values
-        ]
+def _vary_sensors(request: StudyRequest, name: str, paper: str, progress: Progress | None) -> StudyResult:
+    levels = levels_of(request, request.values, lambda base, value: with_sensors(base, **{name: value}))
     columns, records, found = run_levels(levels, request, measure_errors, progress)
     findings = [
         StudyNumber(
@@ -138,12 +141,6 @@ def _vary_sensors(
     return StudyResult(request, columns, records, tuple(findings))
 
 
-def _varied(sensors: Sensors, name: Literal["input_noise_mps", "input_bias_mps"], value: float) -> Sensors:
-    if name == "input_noise_mps":
-        return replace(sensors, input_noise_mps=value)
-    return replace(sensors, input_bias_mps=value)
-
-
 def study_input_source(request: StudyRequest, progress: Progress | None) -> StudyResult:
     """Return the ICR errors with encoders and with commanded speeds (Fig. 11, Section 5.3), on the same drives.
 
@@ -154,11 +151,7 @@ def study_input_source(request: StudyRequest, progress: Progress | None) -> Stud
         "encoder": replace(request.sensors, wheels="encoder", input_bias_mps=0.0),
         "commanded": replace(request.sensors, wheels="commanded", wheel_rate_hz=rate),
     }
-    levels = [
-        Level(preset, name, replace(base_scenario(request, preset), sensors=sensors))
-        for preset in request.presets
-        for name, sensors in views.items()
-    ]
+    levels = levels_of(request, views, lambda base, name: replace(base, sensors=views[name]))
     columns, records, found = run_levels(levels, request, measure_errors, progress)
     findings = [
         StudyNumber(f"{level.series}: error of {icr}, {level.value} speeds", spread(one[f"error_{icr}_m"]), "m")
@@ -178,15 +171,9 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
     width = cast(float, request.config.robot.track_width_m)
 
     def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_errors(chunk, width)}
+        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_p95(chunk, width)}
 
-    levels = []
-    for preset in request.presets:
-        base = base_scenario(request, preset)
-        levels += [
-            Level(preset, value, replace(base, sensors=replace(base.sensors, gnss_std_m=value)))
-            for value in request.values
-        ]
+    levels = levels_of(request, request.values, lambda base, value: with_sensors(base, gnss_std_m=value))
     columns, records, found = run_levels(levels, request, measure, progress)
     findings = []
     for level, one in zip(levels, found, strict=True):
@@ -203,13 +190,12 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
 
 def study_rate(request: StudyRequest, progress: Progress | None) -> StudyResult:
     """Return the ICR errors of the same drives recorded at several rates."""
-    levels = []
-    for preset in request.presets:
-        base = base_scenario(request, preset)
-        for rate in request.values:
-            gnss_rate = min(rate, base.sensors.gnss_rate_hz)
-            sensors = replace(base.sensors, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
-            levels.append(Level(preset, rate, replace(base, sensors=sensors)))
+
+    def at_rate(base: Scenario, rate: float) -> Scenario:
+        gnss_rate = min(rate, base.sensors.gnss_rate_hz)
+        return with_sensors(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
+
+    levels = levels_of(request, request.values, at_rate)
     columns, records, found = run_levels(levels, request, measure_errors, progress)
     findings = []
     for preset in request.presets:

@@ -11,25 +11,27 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a signal cannot come again later there")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no thread watches the time there")
 
 LOADING = """
-import os, signal
-for _ in range(int(os.environ["TIMES"])):
-    os.kill(os.getpid(), int(os.environ["SIGNAL"]))
-    signal.pause()  # until the alarm of the signal that has to wait
-print("loaded")
+import os, signal, sys, time
+os.kill(os.getpid(), int(os.environ["SIGNAL"]))
+time.sleep(float(os.environ["REST_S"]))
+print("loaded", flush=True)
 """
 
 COMMAND = """
-import signal
-from icrtool.cli import interrupts
+import signal, sys
+from pathlib import Path
 from icrtool.cli.interrupts import end_in_order
-interrupts.GRACE_S = 30.0
+from icrtool.records.unfinished import unfinished
 
 def command():
-    import loading
-    signal.pause()
+    half = Path(sys.argv[1])
+    with unfinished(half):
+        half.write_text("half")
+        import loading
+        signal.pause()
 
 try:
     with end_in_order(command.__code__):
@@ -39,39 +41,34 @@ except KeyboardInterrupt:
 """
 
 
-def load(folder: Path, number: int, times: int = 1, before: str = "") -> tuple[int, list[str]]:
-    """Load a module that gets a signal; return the exit status and what was said."""
+def load(folder: Path, number: int, rest_s: float, before: str = "") -> tuple[int, list[str]]:
+    """Load a module that gets a signal and goes on for some time; return the exit status and what was printed."""
     (folder / "loading.py").write_text(LOADING)
     path = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "SIGNAL": str(int(number)), "TIMES": str(times)}
-    code = before + COMMAND
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert not done.stderr
+    environment = {**os.environ, "PYTHONPATH": path, "SIGNAL": str(int(number)), "REST_S": str(rest_s)}
+    line = [sys.executable, "-c", before + COMMAND, str(folder / "half")]
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stderr == ("Aborted!\n" if done.returncode == 130 else "")
     return done.returncode, done.stdout.split()
 
 
-def test_ctrl_c_waits_for_the_import(tmp_path: Path) -> None:
-    assert load(tmp_path, signal.SIGINT) == (0, ["loaded", "interrupted"])
-
-
-def test_a_kill_waits_for_the_import(tmp_path: Path) -> None:
-    assert load(tmp_path, signal.SIGTERM) == (143, ["loaded"])
-
-
-def test_a_second_ctrl_c_does_not_wait(tmp_path: Path) -> None:
-    assert load(tmp_path, signal.SIGINT, times=2) == (0, ["interrupted"])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("rest_s", "printed"), [(0.0, ["loaded"]), (30.0, [])])
+def test_a_signal_in_an_import_ends_the_process_soon_and_leaves_nothing(
+    tmp_path: Path, number: int, status: int, rest_s: float, printed: list[str]
+) -> None:
+    assert load(tmp_path, number, rest_s) == (status, printed)
+    assert not (tmp_path / "half").exists()
 
 
 def test_an_import_further_out_is_no_matter(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(COMMAND.replace("import loading", "import os; os.kill(os.getpid(), 2)"))
-    assert load(tmp_path, signal.SIGINT, times=0, before="import outer; raise SystemExit\n") == (0, ["interrupted"])
+    assert load(tmp_path, signal.SIGINT, 0.0, before="import outer; raise SystemExit\n") == (0, ["interrupted"])
 
 
 def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
     before = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); signal.pause = lambda: None\n"
-    assert load(tmp_path, signal.SIGINT, before=before) == (0, ["loaded"])
+    assert load(tmp_path, signal.SIGINT, 0.0, before=before) == (0, ["loaded"])
 
 
 COMPUTING = """

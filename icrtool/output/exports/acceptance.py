@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
@@ -15,25 +15,17 @@ from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import write_file
 from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
 from icrtool.output.text_format import run_title, xml_text
+from icrtool.records.dropout import Verdict
 
 Outcome = DropoutReport | IcrToolError
 """What became of one argument: a report, or why there is none."""
-
-
-class Case(NamedTuple):
-    """One acceptance limit of a log: its text, its verdict in one line, and why it was not checked, if it was not."""
-
-    gate: str
-    passed: bool
-    line: str
-    not_checked: str = ""
 
 
 class Suite(NamedTuple):
     """The acceptance limits of a log; `error`: why the log could not be used, empty if it could."""
 
     log: str
-    cases: Sequence[Case] = ()
+    verdicts: Sequence[Verdict] = ()
     error: str = ""
 
 
@@ -41,8 +33,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     """Return the acceptance limits of a report, or of a log that has none."""
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
-    cases = [Case(one.gate.text, one.passed, one.line(), one.not_checked) for one in outcome.verdicts]
-    return Suite(run_title(outcome.run_summary), cases)
+    return Suite(run_title(outcome.run_summary), outcome.verdicts)
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -92,8 +83,8 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown."""
     shown = shown_horizons(report)
-    head = ["distance without GNSS", *(f"{report.horizons_m[h]:g} m" for h in shown)]
-    rows = [head, ["---", *("---:" for _ in shown)]]
+    head = ("distance without GNSS", *(f"{report.horizons_m[h]:g} m" for h in shown))
+    rows = []
     for result in report.results:
         for label, column in (("95 %", result.summary.p95), ("expected", result.summary.expected)):
             cells = [
@@ -111,20 +102,16 @@ def format_markdown(report: DropoutReport) -> str:
         lines += [word, "", *(f"- {escaped_markdown(verdict.line())}" for verdict in report.verdicts), ""]
     lines += [f"Open loop from each of {report.states:,} states. In words:", ""]
     lines += [f"- {escaped_markdown(line)}" for line in budget_lines(report.budgets)]
-    lines += ["", *("| " + " | ".join(row) + " |" for row in rows)]
+    lines += ["", *markdown_table(head, rows)]
     if report.baseline is not None:
         lines += _baseline_lines(report, report.baseline)
     if report.outages:
-        lines += [
-            "",
-            "| outage | from | length | distance | end error | max error |",
-            "| --- | ---: | ---: | ---: | ---: | ---: |",
-        ]
-        lines += [
-            f"| {one.kind} | {one.begin_s:.1f} s | {one.end_s - one.begin_s:.1f} s | {one.distance_m:.1f} m "
-            f"| {metres_text(one.end_error_m)} | {metres_text(one.max_error_m)} |"
+        rows = [
+            [one.kind, f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s", f"{one.distance_m:.1f} m",
+             metres_text(one.end_error_m), metres_text(one.max_error_m)]
             for one in report.outages
-        ]
+        ]  # fmt: skip
+        lines += ["", *markdown_table(("outage", "from", "length", "distance", "end error", "max error"), rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -137,10 +124,8 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
         f"Against the baseline ({escaped_markdown(baseline.log)}, icrtool {escaped_markdown(baseline.tool_version)}):",
         "",
     ]
-    rows = [
-        ["difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown)],
-        ["---", *("---:" for _ in shown)],
-    ]
+    head = ("difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown))
+    rows = []
     same = baseline.is_of(report.run_summary)
     for result in report.results:
         for label, metric, column in (
@@ -159,31 +144,39 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
                 interval = f" ± {metres_text(half)}" if math.isfinite(half) else ""
                 cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
-    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), *([""] if changes else []), *changes]
+    return [*lines, *markdown_table(head, rows), *([""] if changes else []), *changes]
 
 
 def _suite(one: Suite, command: str) -> ET.Element:
     name = xml_text(one.log)
     counts = {
-        "tests": len(one.cases) + bool(one.error),
-        "failures": sum(not case.passed for case in one.cases),
+        "tests": len(one.verdicts) + bool(one.error),
+        "failures": sum(not verdict.passed for verdict in one.verdicts),
         "errors": int(bool(one.error)),
-        "skipped": sum(bool(case.not_checked) for case in one.cases),
+        "skipped": sum(bool(verdict.not_checked) for verdict in one.verdicts),
     }
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
-    for case in one.cases:
-        element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(case.gate))
-        if case.not_checked:
-            ET.SubElement(element, "skipped", message=xml_text(case.not_checked))
-        elif not case.passed:
-            failure = ET.SubElement(element, "failure", type="gate", message=xml_text(case.line))
-            failure.text = xml_text(case.line)
+    for verdict in one.verdicts:
+        element, line = (
+            ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate.text)),
+            verdict.line(),
+        )
+        if verdict.not_checked:
+            ET.SubElement(element, "skipped", message=xml_text(verdict.not_checked))
+        elif not verdict.passed:
+            ET.SubElement(element, "failure", type="gate", message=xml_text(line)).text = xml_text(line)
         else:
-            ET.SubElement(element, "system-out").text = xml_text(case.line)
+            ET.SubElement(element, "system-out").text = xml_text(line)
     if one.error:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
         ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
     return suite
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], texts: Collection[int] = (0,)) -> list[str]:
+    """Return a table as lines; columns but those in `texts` are aligned to the right."""
+    rule = ["---" if column in texts else "---:" for column in range(len(head))]
+    return [f"| {' | '.join(row)} |" for row in (head, rule, *rows)]
 
 
 def escaped_markdown(text: str) -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable
-from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Literal, get_args
 
+import numpy as np
+
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, ExportNumbers, export_numbers
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, export_warnings, factor_to_old
+from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
@@ -41,47 +43,81 @@ def format_export(calibration: Calibration, target: Target) -> str:
     DataError
         The drives were too short to measure covariances, which every target but ``icr`` holds.
     """
-    return format_twist(calibration) if target == "icr" else _WRITERS[target](export_numbers(calibration))
+    if target == "icr":
+        return format_twist(calibration)
+    if calibration.controller is None:
+        advice = "covariances need a longer drive"
+        raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
+    return _WRITERS[target](calibration, calibration.controller)
 
 
-def _json(numbers: ExportNumbers) -> str:
-    document = {"schema": EXPORT_SCHEMA, "tool_version": __version__, "date": _date(numbers), **asdict(numbers)}
+def _json(calibration: Calibration, errors: ControllerErrors) -> str:
+    numbers, robot = calibration.controller_numbers(), calibration.robot
+    geometry, covariance = calibration.geometry()
+    document = {
+        "schema": EXPORT_SCHEMA,
+        "tool_version": __version__,
+        "date": _date(calibration),
+        "log": calibration.log_names(),
+        "begin_ns": _begin_ns(calibration),
+        "distance_m": _distance_m(calibration),
+        "robot": robot["name"],
+        "track_width_m": calibration.width_m,
+        "wheel_radius_m": robot["wheel_radius_m"],
+        "model": calibration.recommended,
+        "created": calibration.created,
+        "separation_multiplier": numbers.multiplier,
+        "separation_multiplier_std": numbers.multiplier_std,
+        "left_radius_multiplier": numbers.left_radius,
+        "left_radius_multiplier_std": numbers.left_radius_std,
+        "right_radius_multiplier": numbers.right_radius,
+        "right_radius_multiplier_std": numbers.right_radius_std,
+        "icrs_m": geometry[:3],
+        "icr_std_m": np.sqrt(np.diag(covariance)[:3]),
+        **errors._asdict(),
+        "warnings": export_warnings(calibration),
+        "twist_width_m": robot.get("twist_width_m"),
+    }
     return json_bytes(document).decode().rstrip("\n")
 
 
-def _diff_drive_controller(numbers: ExportNumbers) -> str:
-    body = ["diff_drive_controller:  # your controller's name", "  ros__parameters:", *_controller(numbers, 4)]
-    return "\n".join([*_header(numbers), *body])
+def _diff_drive_controller(calibration: Calibration, errors: ControllerErrors) -> str:
+    body = [
+        "diff_drive_controller:  # your controller's name",
+        "  ros__parameters:",
+        *_controller(calibration, errors, 4),
+    ]
+    return "\n".join([*_header(calibration, errors), *body])
 
 
-def _clearpath(numbers: ExportNumbers) -> str:
+def _clearpath(calibration: Calibration, errors: ControllerErrors) -> str:
     body = [
         "# robot.yaml: merge into its platform section",
         "platform:",
         "  extras:",
         "    ros_parameters:",
         "      platform_velocity_controller:",
-        *_controller(numbers, 8),
+        *_controller(calibration, errors, 8),
     ]
-    return "\n".join([*_header(numbers), *body])
+    return "\n".join([*_header(calibration, errors), *body])
 
 
-def _husarion(numbers: ExportNumbers) -> str:
+def _husarion(calibration: Calibration, errors: ControllerErrors) -> str:
     body = [
         "# husarion_ugv_controller: WH0x_controller.yaml, passed as controller_config_path",
         "/**:",
         "  drive_controller:",
         "    ros__parameters:",
-        *_controller(numbers, 6),
+        *_controller(calibration, errors, 6),
     ]
-    return "\n".join([*_header(numbers), *body])
+    return "\n".join([*_header(calibration, errors), *body])
 
 
-def _nav2(numbers: ExportNumbers) -> str:
-    (alpha1, alpha2), (alpha3, alpha4) = numbers.turn_noise, numbers.way_noise
+def _nav2(calibration: Calibration, errors: ControllerErrors) -> str:
+    (alpha1, alpha2), (alpha3, alpha4) = errors.turn_noise, errors.way_noise
     body = [
         "# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the odometry message:",
-        f"# set there twist_covariance_diagonal: {_diagonal(numbers.twist_variance)}",
+        f"# set there twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
         "ekf_filter_node:",
         "  ros__parameters:",
         "    two_d_mode: true",
@@ -99,59 +135,60 @@ def _nav2(numbers: ExportNumbers) -> str:
         f"    alpha3: {_number(alpha3)}",
         f"    alpha4: {_number(alpha4)}",
     ]
-    return "\n".join([*_header(numbers), *body])
+    return "\n".join([*_header(calibration, errors), *body])
 
 
-def _controller(numbers: ExportNumbers, indent: int) -> list[str]:
+def _controller(calibration: Calibration, errors: ControllerErrors, indent: int) -> list[str]:
     """Return the parameters of a diff_drive_controller."""
-    lines = [f"wheel_separation: {_number(numbers.track_width_m)}"]
-    if numbers.wheel_radius_m is not None:
-        lines.append(f"wheel_radius: {_number(numbers.wheel_radius_m)}")
+    numbers, radius = calibration.controller_numbers(), calibration.robot["wheel_radius_m"]
+    lines = [f"wheel_separation: {_number(calibration.width_m)}"]
+    if radius is not None:
+        lines.append(f"wheel_radius: {_number(radius)}")
     for key, value, std in (
-        ("wheel_separation_multiplier", numbers.separation_multiplier, numbers.separation_multiplier_std),
-        ("left_wheel_radius_multiplier", numbers.left_radius_multiplier, numbers.left_radius_multiplier_std),
-        ("right_wheel_radius_multiplier", numbers.right_radius_multiplier, numbers.right_radius_multiplier_std),
+        ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std),
+        ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
+        ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
     ):
         lines.append(f"{key}: {value:.4f}  # ± {std:.4f}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
-        f"pose_covariance_diagonal: {_diagonal(numbers.pose_variance)}",
+        f"pose_covariance_diagonal: {_diagonal(errors.pose_variance)}",
         f"# of velocities over {TWIST_OVER_M:g} m",
-        f"twist_covariance_diagonal: {_diagonal(numbers.twist_variance)}",
+        f"twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
     ]
     return [" " * indent + line for line in lines]
 
 
-def _header(numbers: ExportNumbers) -> list[str]:
+def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     """Return the comments above: where the numbers come from, and what they cannot express."""
-    right, left, x = numbers.icrs_m
-    std_right, std_left, std_x = numbers.icr_std_m
-    robot = f", {_one_line(numbers.robot)}" if numbers.robot else ""
-    distance_m = numbers.distance_m
+    geometry, covariance = calibration.geometry()
+    right, left, x = geometry[:3]
+    std_right, std_left, std_x = np.sqrt(np.diag(covariance)[:3])
+    robot = f", {_one_line(name)}" if (name := calibration.robot["name"]) else ""
     origin = (
-        f"icrtool {__version__}: {_one_line(numbers.log)}, driven {_date(numbers)}, {distance_m:.0f} m{robot}, "
-        f"fitted {numbers.created[:10]}"
+        f"icrtool {__version__}: {_one_line(calibration.log_names())}, driven {_date(calibration)}, "
+        f"{_distance_m(calibration):.0f} m{robot}, fitted {calibration.created[:10]}"
     )
     icrs = (
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+.3f} ± {std_x:.3f} m (body: x forward, y right)"
     )
     held_out = (
-        f"held out of the fit, wheels alone, after {POSE_AFTER_M:g} m: 95 % within {numbers.p95_m:.2f} m with these "
-        f"numbers, {numbers.full_p95_m:.2f} m with the whole model ({numbers.model}; icrtool export --for icr)"
+        f"held out of the fit, wheels alone, after {POSE_AFTER_M:g} m: 95 % within {errors.p95_m:.2f} m with these "
+        f"numbers, {errors.full_p95_m:.2f} m with the whole model ({calibration.recommended}; icrtool export --for icr)"
     )
     lost = (
         f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
     )
     sentences = [origin, icrs, held_out, lost]
-    if numbers.factor_to_old is not None and numbers.twist_width_m is not None:
-        old = numbers.twist_width_m / numbers.track_width_m
+    if (factor := factor_to_old(calibration)) is not None:
+        old = calibration.robot["twist_width_m"] / calibration.width_m
         sentences.append(
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
-            f"{numbers.factor_to_old:.4f} times the old"
+            f"{factor:.4f} times the old"
         )
-    sentences += [f"WARNING: {_one_line(warning)}" for warning in numbers.warnings]
+    sentences += [f"WARNING: {_one_line(warning)}" for warning in export_warnings(calibration)]
     return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TEXT_WIDTH)]
 
 
@@ -172,10 +209,18 @@ def _number(value: float) -> str:
     return text if "." in text else f"{text}.0"
 
 
-def _date(numbers: ExportNumbers) -> str:
-    if not numbers.begin_ns:
+def _begin_ns(calibration: Calibration) -> int:
+    return min(log.begin_ns for log in calibration.logs)
+
+
+def _distance_m(calibration: Calibration) -> float:
+    return sum(log.distance_m for log in calibration.logs)
+
+
+def _date(calibration: Calibration) -> str:
+    if not (begin_ns := _begin_ns(calibration)):
         return "at an unknown date"
-    return datetime.fromtimestamp(numbers.begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def _one_line(text: str) -> str:
@@ -183,7 +228,7 @@ def _one_line(text: str) -> str:
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
-_WRITERS: dict[Target, Callable[[ExportNumbers], str]] = {
+_WRITERS: dict[Target, Callable[[Calibration, ControllerErrors], str]] = {
     "diff_drive_controller": _diff_drive_controller,
     "clearpath": _clearpath,
     "nav2": _nav2,

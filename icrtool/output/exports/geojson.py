@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -140,7 +140,7 @@ _USES = {UNSEEN: "not in the run", GATED: "rejected"}
 
 
 def _event_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
-    events = run.summary["events"]
+    events: Sequence[Mapping[str, Any]] = run.summary["events"]
     if not events:
         return
     columns = {name: [event[name] for event in events] for name in events[0] if name not in ("north_m", "east_m")}

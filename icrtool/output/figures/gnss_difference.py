@@ -57,11 +57,10 @@ def gnss_difference(run: Run) -> Figure:
     t, difference = run.gnss.t_s / seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
-    if used.any():
+    if (mean := facts["mean_difference_m"]) is not None and (most := facts["max_difference_m"]) is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
-        mean, most = (metres_text(facts[name]) for name in ("mean_difference_m", "max_difference_m"))
-        _draw_used(axes, t[trusted], difference[trusted], f"used, max {most}")
-        axes.axhline(facts["mean_difference_m"], label=f"mean {mean}", **MEAN.keywords())
+        _draw_used(axes, t[trusted], difference[trusted], f"used, max {metres_text(most)}")
+        axes.axhline(mean, label=f"mean {metres_text(mean)}", **MEAN.keywords())
     _mark(axes, t, difference, gated, top, "rejected", "x", color=BAD_FIX_COLOR, markersize=4.5)
     weak = run.sensors.fixes.down_weighted & used
     _mark(axes, t, difference, weak, top, "down-weighted", ".", color=FLOAT_COLOR, markersize=4.0)

@@ -27,6 +27,7 @@ from icrtool.output.figures.style import (
 )
 from icrtool.output.text_format import run_title, signed
 from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run_document import IcrColumn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +94,7 @@ def icr_clusters(run: Run) -> Figure:
     figure = new_figure(run_title(run.summary), subtitle, height_in=3.9, margins_in=(0.65, 0.2, 1.0, 0.9))
     panels = figure.subplots(1, 3, sharey=True)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
-    columns = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
+    columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
     spans = [float(np.ptp(percentiles(value, CLUSTER_RANGE_PERCENT))) for value in values]
     span = max(*spans, 2 * LEAST_HALF_RANGE_M)
@@ -114,7 +115,7 @@ def _spans_s(run: Run) -> list[tuple[float, float]]:
     return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
 
 
-def _draw_estimate(axes: Axes, run: Run, column: str, span_s: tuple[float, float], *, first: bool) -> None:
+def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
     """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
     table, unit = run.table, time_unit(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
@@ -156,7 +157,7 @@ def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
             )  # fmt: skip
 
 
-def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[float]:
+def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> list[float]:
     """Draw b/2 and the begin and end of the convergence; return where they are [m]."""
     heights: list[float] = []
     marks = ("white", "10 %"), ("black", "90 % of the change")
@@ -169,17 +170,17 @@ def _draw_convergence(axes: Axes, run: Run, column: str, unit_s: float) -> list[
     return heights
 
 
-def _convergence_text(run: Run, column: str) -> str:
+def _convergence_text(run: Run, column: IcrColumn) -> str:
     span = run.convergence_s[column]
     return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "hardly moved from its start"
 
 
-def _final_text(run: Run, column: str) -> str:
-    final, std = (run.summary["icr"][key][column] for key in ("final", "final_std"))
+def _final_text(run: Run, column: IcrColumn) -> str:
+    final, std = run.summary["icr"]["final"][column], run.summary["icr"]["final_std"][column]
     return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
 
 
-def _draw_histogram(axes: Axes, run: Run, column: str, value: Floats, weight: Floats, span_m: float) -> None:
+def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weight: Floats, span_m: float) -> None:
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m

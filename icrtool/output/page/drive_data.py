@@ -17,7 +17,7 @@ from icrtool.calibration.model_comparison import FAMILY, turned_path
 from icrtool.calibration.pooled import calibrated_path, fitted_path, gyro_recording_of, heading_recording_of
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import Odometry, OdometryPath, odometry
+from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.models import MODELS, FittedModel, MotionModel
 from icrtool.output.decimate import extremes, places
@@ -169,7 +169,7 @@ def _headings_data(run: Run) -> dict[str, Any]:
     }
 
 
-def _odometry_data(found: Odometry, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     table = run.table
     extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
 

@@ -31,7 +31,7 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
     config = {**summary["config"], "frames": {**summary["config"]["frames"], "datum": None}}
     hidden = dict.fromkeys(("magnetic_declination_deg", "utm_convergence_deg", "offset_name"))
     datum = summary["gnss"]["datum"]
-    shown = {
+    shown: Any = {
         **summary,
         "config": config,
         "warnings": [one.replace(cause, f"its cause is {HIDDEN}") if cause else one for one in summary["warnings"]],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
@@ -18,6 +16,7 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
+from icrtool.records.run_document import ClassDocument
 from icrtool.records.samples import ROLE_WORDS
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
@@ -79,11 +78,11 @@ def _stream_table(run: Run) -> Table:
     head = ("stream".ljust(LABEL), "topic", "type", "rate", "samples", "clock")
     rows = []
     for stream in run.summary["streams"]:
-        kind = stream["message_type"].replace("/msg/", "/")
+        type_name = stream["message_type"].replace("/msg/", "/")
         hz = stream["rate_hz"]
         rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
         role = ROLE_WORDS[stream["role"]] if run.summary["gnss"]["datum"] is None else stream["role"]
-        rows.append((role, stream["topic"], kind, rate, count, stream["clock"]))
+        rows.append((role, stream["topic"], type_name, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
     # Long names are cut: the topic keeps its end, the type its begin.
     space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
@@ -96,7 +95,7 @@ def _icr_table(run: Run) -> Table:
     icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
     rows = []
     for column in ICR_COLUMNS:
-        mean, std, time_s = (icr[key][column] for key in ("mean", "std", "convergence_s"))
+        mean, std, time_s = icr["mean"][column], icr["std"][column], icr["convergence_s"][column]
         if icr["final"][column] is None:
             rows.append((ICR_WORDS[column], icr_text(icr, column), "", "", ""))
             continue
@@ -149,8 +148,8 @@ def _position_rows(run: Run) -> list[Row]:
     gnss = run.summary["gnss"]
     word = position_word(run.summary)
     lines = []
-    if gnss["mean_difference_m"] is not None:
-        mean, most = length_text(gnss["mean_difference_m"]), length_text(gnss["max_difference_m"])
+    if (difference := gnss["mean_difference_m"]) is not None and (largest := gnss["max_difference_m"]) is not None:
+        mean, most = length_text(difference), length_text(largest)
         raised = run.process_position_mps != configured_noise(run.config).position_mps
         why = "; follows them closely, for its position noise was raised" if raised else ""
         lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
@@ -174,7 +173,7 @@ def _position_rows(run: Run) -> list[Row]:
     return lines
 
 
-def _class_rows(classes: dict[str, dict[str, Any]], jumps: int) -> list[Row]:
+def _class_rows(classes: dict[str, ClassDocument], jumps: int) -> list[Row]:
     """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
     lines = []
     for name, one in classes.items() if len(classes) > 1 else ():
@@ -213,7 +212,7 @@ def _delay_rows(run: Run) -> list[Row]:
     found = []
     for word, facts in (("headings", run.summary["heading"]), ("fixes", run.summary["gnss"])):
         delay, std = facts["delay_s"], facts["delay_std_s"]
-        if delay is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
+        if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
             found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
     lines = [*found, "not corrected: slip of the wheels has the same effect"] if found else []
     speed = run.summary["drive"]["speed_mean_mps"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from icrtool.calibration.held_out import block_trials, plan_folds
-from icrtool.calibration.model_comparison import _errors_along, comparison_table
+from icrtool.calibration.model_comparison import ModelComparison, _errors_along, compare_models
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import parse_config
 from icrtool.errors import DataError
@@ -23,6 +24,10 @@ CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 ROUNDING_M = 1e-6
 CHORD_M = 1e-5
 """The lever moves along its arc with a measured heading, along the chord of each turn in steps: over 5 m, 3 um."""
+
+
+def comparison_table(run: Run, headings: Sequence[MeasuredHeading] = ()) -> ModelComparison:
+    return compare_models(run, headings).table
 
 
 @pytest.fixture(scope="module")

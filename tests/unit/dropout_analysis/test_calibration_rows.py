@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 
 import icrtool
-from icrtool.calibration.controller_numbers import export_numbers
 from icrtool.calibration.pooled import predictor, recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.dropout_report import dropout_report
@@ -80,17 +79,17 @@ def test_what_is_recommended_is_not_better_than_what_knew_the_drive(report: Drop
 
 def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, report: DropoutReport) -> None:
     assert report.calibration is not None
-    numbers, exported = report.calibration.controller_numbers(), export_numbers(own)
+    numbers, exported = report.calibration.controller_numbers(), json.loads(format_export(own, "json"))
     assert numbers == own.controller_numbers()
-    assert exported.separation_multiplier == numbers.multiplier
-    assert exported.separation_multiplier_std == numbers.multiplier_std
+    assert exported["separation_multiplier"] == numbers.multiplier
+    assert exported["separation_multiplier_std"] == numbers.multiplier_std
     assert f"wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}" in " ".join(
         format_dropout(report).split()
     )
-    assert json.loads(format_export(own, "json"))["left_radius_multiplier"] == numbers.left_radius
+    assert exported["left_radius_multiplier"] == numbers.left_radius
     # the controller's model is tested in the same trials as the whole one
-    assert exported.full_p95_m == report.comparison.score("extended").summary.p95[1]  # type: ignore[union-attr]
-    assert exported.p95_m != exported.full_p95_m
+    assert exported["full_p95_m"] == report.comparison.score("extended").summary.p95[1]  # type: ignore[union-attr]
+    assert exported["p95_m"] != exported["full_p95_m"]
 
 
 def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:

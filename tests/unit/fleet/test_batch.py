@@ -16,6 +16,7 @@ import pytest
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import worker
 from icrtool.fleet.batch import BatchOptions, default_jobs, finished, plan, run_batch
+from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import write_fleet
 from icrtool.fleet.one_log import Request
 from icrtool.fleet.row import Row
@@ -49,7 +50,7 @@ def results(request, stage):
     directory = one_log.path_of(request.directory)
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
-    if request.page:
+    if request.report.page:
         (directory / "report.html").touch()
     return replace(request.row, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
@@ -74,7 +75,8 @@ def add(season: Path, *names: str) -> None:
 
 
 def run(season: Path, jobs: int = 2, **options: object) -> dict[str, Row]:
-    asked = BatchOptions(timeout_s=20.0, **options)  # type: ignore[arg-type]
+    report = ReportOptions(page=bool(options.pop("page", True)))
+    asked = BatchOptions(report=report, timeout_s=20.0, **options)  # type: ignore[arg-type]
     requests = plan([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
@@ -218,7 +220,7 @@ def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path)
         plan([season], tmp_path / "out", BatchOptions())
     add(season, "a")
     with pytest.raises(ConfigError, match="gate"):
-        plan([season], tmp_path / "out", BatchOptions(gates=("nonsense",)))
+        plan([season], tmp_path / "out", BatchOptions(report=ReportOptions(gates=("nonsense",))))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a file is there"):
         plan([season], tmp_path / "file", BatchOptions())

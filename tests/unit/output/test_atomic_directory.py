@@ -14,7 +14,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_directory import atomic_directory, check_place
+from icrtool.output.atomic_directory import atomic_directory, check_directory
 
 
 def marked(directory: Path) -> bool:
@@ -75,7 +75,7 @@ def test_a_foreign_directory_is_left_alone(tmp_path: Path) -> None:
 def test_a_file_in_the_way_is_an_error(tmp_path: Path, place: str) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"is a file|a file is there|cannot be written"):
-        check_place(tmp_path / place, marked, kind="report")
+        check_directory(tmp_path / place, marked, kind="report")
     with pytest.raises(OutputError):
         write(tmp_path / place)
     assert (tmp_path / "file").read_text() == ""
@@ -182,7 +182,7 @@ def test_whatever_call_fails_the_old_or_the_new_one_is_there(tmp_path: Path, mon
         if not fault.name:
             break
         failed.add(fault.name)
-        check_place(place, marked, kind="report")
+        check_directory(place, marked, kind="report")
         assert generation(place) in {f"old {number}", f"new {number}"}
         assert (place / "mine.txt").read_text() == "years of work"
     write_generation(place, "last")
@@ -223,7 +223,7 @@ def test_killed_at_any_moment_the_old_or_the_new_one_is_there(tmp_path: Path, me
         process.kill()
         said = [first, *process.communicate()[0].splitlines()]
         whole = [int(line) for line in said if line.strip().isdigit()]
-        check_place(place, marked, kind="report")
+        check_directory(place, marked, kind="report")
         # The last one that was reported, or the next, which was put in place before it could be.
         assert int(generation(place)) in {whole[-1], whole[-1] + 1}
         assert (place / "mine.txt").read_text() == "years of work"

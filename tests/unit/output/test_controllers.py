@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.calibration.controller_numbers import export_numbers, unfit_reasons
+from icrtool.calibration.controller_numbers import factor_to_old, unfit_reasons
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError, DataError
@@ -85,12 +85,13 @@ def test_a_log_with_a_wild_name_stays_a_comment(calibration: Calibration) -> Non
 
 
 def test_error_growth_is_measured(calibration: Calibration) -> None:
-    numbers = export_numbers(calibration)
-    along, across, yaw = numbers.pose_variance
+    errors = calibration.controller
+    assert errors is not None
+    along, across, yaw = errors.pose_variance
     assert 0 < along < 0.1
     assert 0 < across < 0.1
     assert 0 < yaw < 0.01
-    assert 0 < numbers.p95_m < 1.0
+    assert 0 < errors.p95_m < 1.0
 
 
 def test_a_run_without_width_has_no_multiplier(make_run) -> None:
@@ -149,7 +150,6 @@ def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> Non
 
 def test_the_factor_to_the_multiplier_that_made_the_odometry_is_given(calibration: Calibration) -> None:
     made = replace(calibration, robot={**calibration.robot, "twist_width_m": 1.5 * calibration.width_m})
-    numbers = export_numbers(made)
-    assert numbers.factor_to_old == pytest.approx(numbers.separation_multiplier / 1.5)
+    assert factor_to_old(made) == pytest.approx(made.controller_numbers().multiplier / 1.5)
     assert "wheel_separation_multiplier 1.5000" in " ".join(format_export(made, "clearpath").split("\n# "))
-    assert export_numbers(calibration).factor_to_old is None
+    assert factor_to_old(calibration) is None

@@ -20,11 +20,12 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError
+from icrtool.output import disk
 from icrtool.output.dropout_directory import (
     TRIALS_FILE,
     is_dropout_directory,
     report_document,
-    report_writer,
+    write_report,
     write_tables,
 )
 from icrtool.output.json_file import json_bytes
@@ -177,8 +178,7 @@ def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Ru
 
 
 def test_a_report_replaces_an_older_one_and_keeps_files_of_others(content: DropoutReport, tmp_path: Path) -> None:
-    with report_writer(tmp_path / "dropout", (), np.arange(3)) as writer:
-        writer.finish(content)
+    write_report(lambda _: content, tmp_path / "dropout", plots=(), stamp_ns=np.arange(3))
     assert (tmp_path / "dropout" / TRIALS_FILE).exists()
     (tmp_path / "dropout" / "notes.txt").touch()
     content.write(tmp_path / "dropout", plots=())
@@ -188,16 +188,17 @@ def test_a_report_replaces_an_older_one_and_keeps_files_of_others(content: Dropo
     assert (tmp_path / "dropout" / "notes.txt").exists()
 
 
-def test_a_report_that_fails_leaves_the_older_one(written: Path, content: DropoutReport) -> None:
+def test_a_report_that_fails_leaves_the_older_one(
+    written: Path, content: DropoutReport, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = (written / "report.json").read_bytes()
 
-    def fail() -> None:
-        with report_writer(written, ()) as writer:
-            writer.finish(content)
-            raise ZeroDivisionError
+    def fail(directory: Path) -> None:
+        raise ZeroDivisionError
 
+    monkeypatch.setattr(disk, "sync_tree", fail)
     with pytest.raises(ZeroDivisionError):
-        fail()
+        content.write(written, plots=())
     assert (written / "report.json").read_bytes() == before
     assert [path.name for path in written.parent.iterdir()] == ["dropout"]
 

@@ -151,6 +151,6 @@ def test_a_page_of_an_edited_run_is_refused_in_one_line(
     document = json.loads((place / "run.json").read_text())
     document[section][key] = wrong
     write_run(place, document)
-    with pytest.raises(IcrToolError, match="is not as this version of icrtool writes it"):
+    with pytest.raises(IcrToolError, match=rf"at `\$\.{section}"):
         command.main(["report", str(place), "-o", str(tmp_path / "x.html")], standalone_mode=False)
     assert not (tmp_path / "x.html").exists()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from icrtool.calibration.model_comparison import ModelComparison, comparison_table
+from icrtool.calibration.model_comparison import ModelComparison, compare_models
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.output.json_file import json_bytes
 from icrtool.output.tables.model_comparison import (
@@ -23,7 +23,7 @@ from icrtool.output.text_blocks import Text
 @pytest.fixture(scope="module")
 def comparison(make_run) -> ModelComparison:
     run = make_run(duration_s=90.0)
-    return comparison_table(run, measured_headings(run))
+    return compare_models(run, measured_headings(run)).table
 
 
 def test_every_model_has_its_line(comparison: ModelComparison) -> None:

@@ -18,7 +18,7 @@ from icrtool.output.truth_file import log_and_truth, read_speeds, truth_path, wr
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.record import simulate
-from icrtool.simulation.studies import STUDY_NAMES, StudyNumber, StudyResult, default_request, run_study
+from icrtool.simulation.studies import KINDS, StudyNumber, StudyResult, default_request, run_study
 
 WIDEST = 120
 PNG = b"\x89PNG"
@@ -33,7 +33,7 @@ def small(name, robot: str | None = None) -> StudyResult:
     return run_study(replace(request, runs=2, values=settings, paths=request.paths[:2], plan=plan))
 
 
-@pytest.mark.parametrize("name", STUDY_NAMES)
+@pytest.mark.parametrize("name", KINDS)
 def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> None:
     result = small(name)
     write_study(result, tmp_path / "study")

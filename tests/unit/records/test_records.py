@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.align import align, sensors_as_sent
+from icrtool.alignment.align import sensors_as_sent
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 from support.barn import configured, simulate
@@ -35,19 +35,6 @@ def test_names_are_escaped_in_html(run: Run) -> None:
 def test_a_run_is_not_changed(run: Run) -> None:
     with pytest.raises(FrozenInstanceError):
         run.name = "other"  # type: ignore[misc]
-
-
-def test_sensors_earlier_moves_the_reference_and_what_comes_with_it() -> None:
-    sensors = align(simulate(), configured()).sensors
-    moved = sensors.earlier(0.25)
-    assert np.array_equal(
-        sensors.fixes.stamp_ns - moved.fixes.stamp_ns, np.full(len(moved.fixes.stamp_ns), 250_000_000)
-    )
-    assert moved.headings is sensors.headings
-    assert moved.wheels is sensors.wheels
-    together = replace(sensors, heading_from_position=True).earlier(0.25)
-    assert np.array_equal(together.headings.stamp_ns, sensors.headings.stamp_ns - 250_000_000)
-    assert sensors.earlier(0.0) is sensors
 
 
 def test_part_of_the_sensors_holds_the_measurements_of_that_time() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from icrtool.cli.study import STUDIES, VARIES
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.simulation.drives import DrivePlan, Sensors, TrackSpeeds, check_drive, drive_plan, sample_times, sense
-from icrtool.simulation.paths import PATH_KINDS, PathPlan, plan_body, track_speeds
+from icrtool.simulation.paths import PathKind, PathPlan, plan_body, track_speeds
 from icrtool.simulation.record import DATUM, START_NS, record, simulate
 
 ROUNDING = 1e-9
@@ -28,7 +29,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("kind", PATH_KINDS)
+@pytest.mark.parametrize("kind", PATHS)
 def test_track_speeds_give_the_body_what_the_path_asks(kind) -> None:
     t = np.linspace(0, 60, 500)
     icrs = (0.5, -0.75, -0.25)
@@ -220,8 +221,8 @@ def test_what_cannot_be_driven_is_refused_in_words(plan: DrivePlan, words: str) 
 
 
 def test_the_command_knows_the_paths_and_studies_there_are() -> None:
-    from icrtool.simulation.studies import KINDS, STUDY_NAMES
+    from icrtool.simulation.studies import KINDS, StudyName
 
-    assert PATHS == PATH_KINDS
-    assert set(STUDIES) == set(STUDY_NAMES) == set(KINDS)
+    assert get_args(PathKind) == PATHS
+    assert set(STUDIES) == set(get_args(StudyName)) == set(KINDS)
     assert set(VARIES) == {name for name, kind in KINDS.items() if kind.varies} - {"initial"}

@@ -13,7 +13,7 @@ from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError
 from icrtool.simulation import study_runs
 from icrtool.simulation.paths import PathPlan
-from icrtool.simulation.studies import STUDY_NAMES, StudyRequest, StudyResult, default_request, run_study, statistics
+from icrtool.simulation.studies import KINDS, StudyRequest, StudyResult, default_request, run_study, statistics
 from icrtool.simulation.study_consistency import chi2_band, errors_over_std
 from icrtool.simulation.study_measures import convergence_times, settling_times
 
@@ -48,7 +48,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", STUDY_NAMES)
+@pytest.mark.parametrize("name", KINDS)
 def test_every_study_runs_small_and_says_the_same_again(name) -> None:
     asked = request(name, 2, **SMALL[name])
     result, again = run_study(asked), run_study(asked)

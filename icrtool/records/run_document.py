@@ -1,14 +1,17 @@
-"""What run.json must hold to be a run: checked when a run is opened, so that nothing later meets a missing key.
+"""The keys of run.json, which the summary of a run has too: their types, checked when a run is opened.
 
-Keys of the same version that only inform (in ``gnss``, ``wheels``, ``filter`` …) may be missing or added.
+Keys that nothing reads may be added in the same version.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 
+from icrtool.records.samples import Role
+
+IcrColumn = Literal["y_icr_right_m", "y_icr_left_m", "x_icr_m"]
 Spans = list[tuple[int, int]]
 Triple = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Matrix = Annotated[list[Triple], msgspec.Meta(min_length=3, max_length=3)]
@@ -41,7 +44,7 @@ class InputDocument(TypedDict):
 class StreamDocument(TypedDict):
     """A chosen topic."""
 
-    role: str
+    role: Role
     topic: str
     message_type: str
     count: int
@@ -102,6 +105,7 @@ class SegmentDocument(TypedDict):
     """The ICRs between two changes."""
 
     begin_s: float
+    end_s: float
     mean: MaybeByIcr
     std: MaybeByIcr
 
@@ -130,6 +134,13 @@ class ClassDocument(TypedDict):
     sold_as_fixed: int
 
 
+class JumpDocument(TypedDict):
+    """A jump of the position."""
+
+    stamp_ns: int
+    size_m: float
+
+
 class GnssDocument(TypedDict):
     """The position fixes."""
 
@@ -145,6 +156,7 @@ class GnssDocument(TypedDict):
     delay_std_s: float | None
     classes: dict[str, ClassDocument]
     jumps: int
+    jump_list: list[JumpDocument]
 
 
 class HeadingDocument(TypedDict):
@@ -194,6 +206,9 @@ class FilterDocument(TypedDict):
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
     icr_start: IcrStartDocument | None
+    nis_gnss_mean: float | None
+    nis_heading_mean: float | None
+    antenna_is_known: NotRequired[bool]
 
 
 class VerdictsByIcr(TypedDict):
@@ -212,17 +227,29 @@ class ExcitationDocument(TypedDict):
     turned_left_deg: float
     spun_right_deg: float
     spun_left_deg: float
+    sentences: list[str]
+
+
+class FindingDocument(TypedDict):
+    """An estimate of the alignment."""
+
+    value: float | None
+    std: float | None
+    applied: float
+    why: str
 
 
 class RunDocument(TypedDict):
-    """run.json."""
+    """run.json; `recommended`: the motion model, of a run that `icrtool.fit` made."""
 
+    schema: Literal["icrtool/run/1"]
     log: str
     tool_version: str
     inputs: list[InputDocument]
     config: dict[str, Any]
     streams: list[StreamDocument]
     warnings: list[str]
+    alignment: dict[str, FindingDocument]
     usable: bool
     unusable_because: str | None
     drive: DriveDocument
@@ -232,42 +259,11 @@ class RunDocument(TypedDict):
     segments: list[SegmentDocument]
     gnss: GnssDocument
     heading: HeadingDocument
+    wheels: dict[str, Any]
     events: list[EventDocument]
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans
     filter: FilterDocument
     excitation: ExcitationDocument
-
-
-TOGETHER = (
-    ("icr", "separation_multiplier", "separation_multiplier_std"),
-    ("gnss", "mean_difference_m", "max_difference_m"),
-    ("gnss", "delay_s", "delay_std_s"),
-    ("heading", "delay_s", "delay_std_s"),
-    ("heading", "offset_deg", "offset_std_deg"),
-)
-"""Section, and two keys of it that are both known or both null."""
-
-
-def check_run_document(document: dict[str, Any]) -> None:
-    """Refuse plain data that is no run.
-
-    Raises
-    ------
-    ValueError
-        A key is missing, of another type, or null without its companion; its path is named.
-    """
-    try:
-        msgspec.convert(document, RunDocument)
-    except msgspec.ValidationError as err:
-        raise ValueError(str(err)) from err
-    for section, one, other in TOGETHER:
-        if (document[section][one] is None) != (document[section][other] is None):
-            raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")
-    icr = document["icr"]
-    for column in icr["final"]:
-        if len({icr[key][column] is None for key in ("final", "final_std", "mean", "std")}) > 1:
-            raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
-    if document["usable"] != (document["unusable_because"] is None):
-        raise ValueError("usable and unusable_because contradict each other - at `$`")
+    recommended: NotRequired[dict[str, Any] | None]
