@@ -162,7 +162,8 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         sizes = [
             jump["size_m"] for jump in summary["gnss"]["jump_list"] if one["stamp_ns"] <= jump["stamp_ns"] <= end_ns
         ]
-        lost = [out for out in report["outages"] if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
+        real = [out for out in report["outages"] if out["kind"] == "real"]
+        lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
         slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
         notes = [f"the position jumps by {length_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]

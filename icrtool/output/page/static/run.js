@@ -50,10 +50,10 @@ const icrtoolPage = (() => {
     result = icrtoolOpenLoop.drive(data, row, LENGTHS_M);
     map.drawLoop(result);
     const box = document.getElementById("loop"), table = document.createElement("table");
-    text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter`, table);
+    text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter after so many metres`, table);
     const head = text("tr", "", table.createTHead());
     text("th", "model", head, { scope: "col" });
-    for (const metres of LENGTHS_M) text("th", `after ${metres} m`, head, { scope: "col" });
+    for (const metres of LENGTHS_M) text("th", `${metres}\u00a0m`, head, { scope: "col" });
     const body = table.createTBody();
     for (const model of result.models) {
       const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
