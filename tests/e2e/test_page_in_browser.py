@@ -15,12 +15,18 @@ import pytest
 
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.model_comparison import _errors_along, _icrs_of
-from icrtool.calibration.pooled import fitted_path, gyro_recording_of, heading_recording_of, predictor, recording_of
+from icrtool.calibration.pooled import (
+    gyro_recording_of,
+    heading_recording_of,
+    in_recording,
+    predictor,
+    recording_of,
+)
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
-from icrtool.motion.trials import Trials, trial_errors
+from icrtool.motion.trials import Trials, predicted_path
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.json_file import json_bytes
 from icrtool.output.page import drive_data
@@ -33,6 +39,7 @@ from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.browser import Browser, Page, browser, chromium
+from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
 LENGTHS_M = (5.0, 10.0, 20.0)
@@ -175,7 +182,9 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
         ("window_heading", "icr_gyro"),
         ("no_slip_heading", "no_slip_gyro"),
     ):
-        along[row] = trial_errors(turned, trials, fitted_path(compared.fits[of or row], turned))
+        along[row] = table_errors(
+            turned, trials, predicted_path(turned, *in_recording(compared.fits[of or row], turned))
+        )
     for name in ("icr", "icr_final"):
         along[f"{name}_heading"] = _errors_along(run, turned, trials, _icrs_of(run, name))
     final = (table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])

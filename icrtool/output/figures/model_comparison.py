@@ -34,7 +34,7 @@ def model_comparison(report: DropoutReport) -> Figure:
     h = int(np.argmin(np.abs(np.array(table.horizons_m) - CHOICE_HORIZON_M)))
     scores = [score for score in table.scores if score.summary.trials[h]]
     groups = any(score.measured_heading for score in scores)
-    what = f"95 % / expected; {table.blocks} blocks of the drive held out in turn"
+    what = "95 % / expected, on distance they were not fitted to"
     figure = new_figure(
         run_title(report.run_summary), f"Open-loop error after {table.horizons_m[h]:g} m, {what}",
         height_in=1.65 + ROW_IN * (len(scores) + 0.6 * groups), margins_in=(2.75, 1.05, 0.62, 0.9),

@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.calibration.model_comparison import FAMILY, turned_path
-from icrtool.calibration.pooled import calibrated_path, fitted_path, gyro_recording_of, heading_recording_of
+from icrtool.calibration.pooled import calibrated, gyro_recording_of, heading_recording_of, in_recording
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.models import MODELS, FittedModel, MotionModel
+from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.run import ICR_COLUMNS, Run, drive_of, half_width_m
@@ -237,8 +238,8 @@ def _calibrated(run: Run, report: Mapping[str, Any], labels: Mapping[str, str]) 
         if recording is not None and document and not (with_gyro and recording.gyro_radps is None):
             # Too short a drive to find the delay of its wheels has no path.
             with suppress(DataError):
-                path = calibrated_path(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
-                yield Path(name, label, *path(recording.t_s))
+                model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
+                yield Path(name, label, *predicted_path(recording, *model)(recording.t_s))
 
 
 def _compared(run: Run, ladder: Mapping[str, Any], known: set[str]) -> Iterator[Path]:
@@ -255,8 +256,8 @@ def _compared(run: Run, ladder: Mapping[str, Any], known: set[str]) -> Iterator[
             continue
         with suppress(DataError):
             if base in FAMILY:
-                found = fitted_path(_fitted(ladder, base, turned=turned), recording)(recording.t_s)
-                yield Path(name, row["label"], *found)
+                model = in_recording(_fitted(ladder, base, turned=turned), recording)
+                yield Path(name, row["label"], *predicted_path(recording, *model)(recording.t_s))
             else:
                 icrs = None if base == "icr" else _last_icrs(run)
                 yield Path(name, row["label"], *turned_path(run, recording), icrs)
