@@ -55,9 +55,9 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
               help="The stamps of the fixes lag by this.")  # fmt: skip
 @click.option("--heading", "convention", type=click.Choice(["enu", "ned"]), default="enu", show_default=True,
               help="Convention of the Imu: REP-103, or REP-145's NED.")  # fmt: skip
-@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=Degrees(min=0), default=1.0, show_default=True,
-              help="White noise of the heading.")  # fmt: skip
-@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=Degrees(min=0), default=0.05,
+@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=Degrees(NOT_NEGATIVE), default=1.0,
+              show_default=True, help="White noise of the heading.")  # fmt: skip
+@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=Degrees(NOT_NEGATIVE), default=0.05,
               show_default=True, help="Headings are rounded to this.")  # fmt: skip
 @click.option("--heading-rate", "heading_rate_hz", metavar="HZ", type=POSITIVE, default=100.0, show_default=True,
               help="Headings a second.")  # fmt: skip
