@@ -252,8 +252,8 @@ def _errors(run: Run) -> TopicPlan:
 
 
 def _slip_events(run: Run) -> Iterator[dict[str, Any]]:
-    for event in run.sensors.events:
-        yield event._asdict() | {"x_m": event.east_m, "y_m": event.north_m}
+    for event in run.summary["events"]:
+        yield {**event, "x_m": event["east_m"], "y_m": event["north_m"]}
 
 
 def _outages(run: Run) -> Iterator[dict[str, Any]]:
