@@ -69,17 +69,13 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
         raise click.BadParameter(why, param_hint="--change")
 
 
-class Degrees(click.ParamType):
-    """An angle in degrees, of a type of click's; the command gets radians."""
+def degrees(within: click.FloatRange | None = None) -> Callable[[str], float]:
+    """Return what reads an angle in degrees, of a range where one is given, and gives radians."""
 
-    name = "float"
+    def radians(text: str) -> float:
+        return math.radians((within or click.FLOAT).convert(text, None, None))
 
-    def __init__(self, within: click.ParamType = click.FLOAT) -> None:
-        self._within = within
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:  # noqa: ANN401 - click's
-        """Return radians."""
-        return math.radians(self._within.convert(value, param, ctx))
+    return radians
 
 
 OPTIONS: dict[str, tuple[str, str | None, Any, str]] = {
