@@ -69,10 +69,10 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
         raise click.BadParameter(why, param_hint="--change")
 
 
-def degrees(within: click.FloatRange | None = None) -> Callable[[str], float]:
+def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
     """Return what reads an angle in degrees, of a range where one is given, and gives radians."""
 
-    def radians(text: str) -> float:
+    def radians(text: Any) -> float:  # noqa: ANN401 - what click has: a text, or the default
         return math.radians((within or click.FLOAT).convert(text, None, None))
 
     return radians
