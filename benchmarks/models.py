@@ -1,7 +1,8 @@
 """Compare every motion model on recordings that it was not fitted to: ``benchmarks/models.py FOLDER --robot NAME``.
 
 Each recording or run below FOLDER belongs to the ground that its folder is named after; with --ground PATTERN=NAME, to
-NAME where its path holds PATTERN. For each ground every recording is left out in turn; a single one is cut into blocks.
+NAME where its path holds PATTERN. For each ground every recording is left out in turn; in a single one
+each trial is predicted by a fit to the rest of it.
 The table is Markdown.
 """
 
@@ -43,8 +44,11 @@ def main() -> None:
 
 def recordings_below(folder: Path, config: Config) -> Iterator[tuple[Path, Recording]]:
     """Yield runs below a folder, or else recordings, fitted; one that cannot be used is named."""
-    runs = sorted(file.parent for file in folder.rglob(RUN_FILE) if is_run_directory(file.parent))
-    for path in runs or sorted(one.path for one in find_recordings([folder])):
+    # links to folders are not searched: they are named, two levels down
+    links = (one for pattern in ("*", "*/*") for one in folder.glob(pattern) if one.is_symlink() and one.is_dir())
+    places = [folder, *links]
+    runs = sorted({one.parent for place in places for one in place.rglob(RUN_FILE) if is_run_directory(one.parent)})
+    for path in runs or sorted(one.path for one in find_recordings(places)):
         try:
             run = open_run(path) if runs else fit(read_log(path, config), config)
             yield path, gyro_recording_of(run)
@@ -56,8 +60,8 @@ def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
     """Yield the lines of one ground's table."""
     wheels, gyro = hold_out(recordings)
     metres = sum(float(one.drive.distance[-1]) for one in recordings)
-    fold = "log" if wheels.folds[0].whole else "block"
-    yield f"\n**{ground}**: {len(recordings)} recorded, {metres:.0f} m; {len(wheels.folds)} {fold}s left out in turn\n"
+    how = "each left out in turn" if wheels.folds[0].whole else f"{len(wheels.folds)} blocks, each trial left out"
+    yield f"\n**{ground}**: {len(recordings)} recorded, {metres:.0f} m; {how}\n"
     horizons = [f"{horizon:g} m" for horizon in wheels.horizons_m]
     yield "| model | " + " | ".join([*horizons, *(f"{one}, with gyro" for one in horizons)]) + " |"
     yield "|---|" + "---|" * (2 * len(horizons))

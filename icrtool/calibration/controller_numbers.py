@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icrtool.calibration.held_out import Fold, HeldOut
+from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
-from icrtool.motion.fit import PooledFit
-from icrtool.motion.models import CONTROLLER, TERMS, TypicalDrive, controller_model, track_geometry
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.motion.models import CONTROLLER, TERMS, FittedModel
 from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -84,37 +83,30 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
 def _window_errors(recordings: Sequence[Recording], length_m: float, table: HeldOut) -> Floats:
     """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
     rows = [np.empty((0, 6))]
-    windows: dict[int, Windows | None] = {}
-    for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
-        recording = recordings[fold.recording]
-        if fold.recording not in windows:
-            windows[fold.recording] = _windows(recording, length_m)
-        if (found := windows[fold.recording]) is not None:
-            rows.append(_fold_errors(recording, found, fold, fit, own, table.typical))
+    for i, recording in enumerate(recordings):
+        try:
+            windows = cut_windows(recording, (length_m,))
+        except DataError:
+            continue
+        for fold, some in left_out(table.folds, i, windows.start_m, windows.end_m):
+            if (found := table.expressed(fold)) is not None:
+                rows.append(_fold_errors(recording, windows, some, *found))
     return np.concatenate(rows)
 
 
-def _windows(recording: Recording, length_m: float) -> Windows | None:
-    """Return the windows of one length in a recording, None where there is none."""
-    try:
-        return cut_windows(recording, (length_m,))
-    except DataError:
-        return None
-
-
 def _fold_errors(
-    recording: Recording, windows: Windows, fold: Fold, fit: PooledFit, own: LogConstants, typical: TypicalDrive
-) -> Floats:
+    recording: Recording, windows: Windows, some: Ints, fitted: FittedModel, own: LogConstants
+) -> Floats:  # fmt: skip
+    """Return the errors of some windows (m,) by a model that was not fitted to them."""
+    s, e = windows.start[some], windows.end[some]
+    begin, finish = windows.knot_t[s], windows.knot_t[e]
+    path = predicted_path(recording, fitted, own, windows.steps.around(begin, finish))
+    (theta, place), (turned, moved) = path(begin), path(finish)
+    error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
     row = np.searchsorted(recording.t_s, windows.knot_t)
-    mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
-    s, e = windows.start[mine], windows.end[mine]
-    expressed = controller_model(track_geometry(fit.model, fit.parameters, recording.width_m, typical))
-    theta, place = predicted_path(recording, expressed, own, windows.steps)(windows.knot_t)
-    error = np.exp(-1j * theta[s]) * (place[e] - place[s]) - windows.reference[mine]
     turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]
-    turned = theta[e] - theta[s] - turn
-    lasting = windows.knot_t[e] - windows.knot_t[s]
-    return np.column_stack([error.real, error.imag, turned, lasting, turn, windows.length_m[mine]])
+    columns = error.real, error.imag, turned - theta - turn, finish - begin, turn, windows.length_m[some]
+    return np.column_stack(columns)
 
 
 def _variances(errors: Floats) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from icrtool.calibration.held_out import HeldOut
+from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
@@ -36,9 +36,9 @@ FEWEST_WINDOWS = 20
 ANGLES = 48
 DESCENTS = 400
 
-SMALLEST_FACTOR, LARGEST_FACTOR = 0.5, 4.0
-"""Of the quantiles; of p95 never less than 1: a few windows do not show that the errors are smaller than normal."""
-
+NORMAL_STRETCHES = 10
+"""That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
+those of robots differ. A few windows never show that errors are smaller than normal."""
 
 Values = TypeVar("Values", Floats, Complexes)
 
@@ -67,19 +67,6 @@ class Spread(NamedTuple):
         return Spread(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class Ends(NamedTuple):
-    """Starts and ends of windows on a path of steps.
-
-    Attributes
-    ----------
-    knot_t : (m,) times, ascending; start, end : (w,) rows of it
-    """
-
-    knot_t: Floats
-    start: Ints
-    end: Ints
-
-
 class PathErrors(NamedTuple):
     """What a model makes of windows: moved (w,) forward + j right [m], turned (w,) [rad], and moments of its errors.
 
@@ -93,12 +80,13 @@ class PathErrors(NamedTuple):
 
 
 def path_errors(
-    steps: Steps, ends: Ends, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
+    steps: Steps, begin_s: Floats, end_s: Floats, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
 ) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
     Parameters
     ----------
+    begin_s, end_s : (w,) times of the windows' starts and ends
     own : constants of the recording
     """
     gyro = steps.gyro + own.gyro_later_s * steps.gyro_change()
@@ -106,13 +94,14 @@ def path_errors(
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     fixed[OMEGA] += own.gyro_bias_radps
     # the sources act all along the path, not at the ends of windows alone
-    at = np.union1d(ends.knot_t + own.wheels_later_s, steps.t)
+    of_start, of_end = begin_s + own.wheels_later_s, end_s + own.wheels_later_s
+    at = np.unique(np.concatenate([of_start, of_end, steps.t]))
     row, share = steps.locate(at)
     knots, k = len(row), len(fitted.parameters)
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
     sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, row, share, rate, sums, by)
     theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
-    s, e = (np.searchsorted(at, ends.knot_t[rows] + own.wheels_later_s) for rows in (ends.start, ends.end))
+    s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
     back = np.exp(-1j * theta[s])
     went = place[e] - place[s]
     turned_by = by[:, e, 0] - by[:, s, 0]
@@ -203,33 +192,31 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     Notes
     -----
     Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
-    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent.
+    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
+    in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
     """
     stretches: Counter[float] = Counter()
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    for fold, fit, own in zip(table.folds, table.without, table.own, strict=True):
-        recording = recordings[fold.recording]
+    for i, recording in enumerate(recordings):
         try:
             windows = cut_windows(recording, LENGTHS_M, recordings)
         except DataError:
             continue
-        mine = (windows.start_m >= fold.begin_m) & (windows.end_m <= fold.end_m)
-        ends = Ends(windows.knot_t, windows.start[mine], windows.end[mine])
-        errors = path_errors(windows.steps, ends, fit, recording.width_m, own)
-        row = np.searchsorted(recording.t_s, windows.knot_t)
-        heading = recording.drive.heading[row]
-        turned = errors.turned - (heading[ends.end] - heading[ends.start])
+        begin, end = windows.knot_t[windows.start], windows.knot_t[windows.end]
+        turn = np.subtract(*(np.interp(at, recording.t_s, recording.drive.heading) for at in (end, begin)))
+        tested = np.zeros(len(begin), np.bool_)
+        for fold, some in left_out(table.folds, i, windows.start_m, windows.end_m):
+            if (predicted := table.without(fold)) is None:
+                continue
+            fitted, own = predicted
+            steps = windows.steps.around(begin[some], end[some])
+            errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
+            reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
+            found.append((windows.length_m[some], errors, errors.turned - turn[some], errors.moved - reference))
+            tested[some] = True
         for metres in LENGTHS_M:
-            starts = windows.start_m[mine & (windows.length_m == metres)]
+            starts = windows.start_m[tested & (windows.length_m == metres)]
             stretches[metres] += len(np.unique(np.floor(starts / metres)))
-        found.append(
-            (
-                windows.length_m[mine],
-                errors,
-                turned,
-                errors.moved - np.exp(-1j * own.heading_offset_rad) * windows.reference[mine],
-            )
-        )
     measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
     used = length <= measured_to_m
@@ -241,12 +228,13 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
     variances = _fit_variances(length, sources, known, turned, missed)
     spread, far = sources.combined(variances).plus(known), length >= SCALED_FROM_M
-    error = np.abs(missed)
-    level = min(95.0 * (1.0 + 1.0 / stretches[CHOICE_HORIZON_M]), 100.0)
-    share = np.percentile(error[far] / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
-    mean = error[far].mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
-    factors = np.clip([share, mean], [1.0, SMALLEST_FACTOR], LARGEST_FACTOR).tolist()
-    return ErrorSources(*(*variances.tolist(), *factors, measured_to_m))
+    error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
+    level = min(95.0 * (1.0 + 1.0 / count), 100.0)
+    share = np.percentile(error / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
+    mean = error.mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
+    # measured over normal: the fewer stretches show it, the nearer to normal
+    factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
+    return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
 
 
 def _stacked(parts: Sequence[Spread], used: Bools) -> Spread:

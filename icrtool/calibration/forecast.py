@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_growth import SOURCES, Ends, PathErrors, Spread, mean_error, path_errors, radius
+from icrtool.calibration.error_growth import SOURCES, PathErrors, Spread, mean_error, path_errors, radius
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
@@ -143,8 +143,7 @@ def _along(
     if not len(metres):
         raise DataError("path", f"{length[-1]:.2f} m long", "a forecast needs a metre at least")
     rows = np.searchsorted(length, metres)
-    ends = Ends(np.concatenate([t[:1], t[rows]]), np.zeros(len(rows), np.int64), np.arange(1, len(rows) + 1))
-    spread, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
+    spread, expected, p95 = _errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
     c, s = np.cos(heading), np.sin(heading)
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
@@ -155,14 +154,16 @@ def _along(
     )  # fmt: skip
 
 
-def _errors(calibration: Calibration, steps: Steps, ends: Ends, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
-    """Return moments, expected and 95 % error of windows."""
+def _errors(
+    calibration: Calibration, steps: Steps, begin_s: Floats, end_s: Floats, *, with_gyro: bool
+) -> tuple[Spread, Floats, Floats]:
+    """Return moments, expected and 95 % error of windows from and to times (w,)."""
     fitted, sources = calibration.fitted, calibration.sources
     if with_gyro and calibration.gyro is not None:
         fitted, sources = calibration.gyro, calibration.gyro_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    found: PathErrors = path_errors(steps, ends, fitted, calibration.width_m)
+    found: PathErrors = path_errors(steps, begin_s, end_s, fitted, calibration.width_m)
     spread = found.of_sources.combined(np.array(sources[:SOURCES])).plus(found.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

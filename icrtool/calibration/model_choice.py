@@ -14,7 +14,7 @@ FEWEST_TO_CHOOSE = 3
 """With fewer folds, what is left beside the one left out cannot be cut once more to choose a model."""
 
 UNCHOSEN = "icr"
-"""The paper's model stands where there are too few folds to choose."""
+"""With two recordings, the paper's model stands for what is recommended without one of them."""
 
 BASELINE = "multiplier"
 """What is worse than this one is never recommended."""
@@ -31,21 +31,18 @@ class Choice(NamedTuple):
     chosen: tuple[str, ...]
 
 
-def nested_choice(inner: Mapping[str, Floats], sizes: Mapping[str, int], *, one_recording: bool) -> Choice:
+def nested_choice(inner: Mapping[str, Floats], sizes: Mapping[str, int]) -> Choice:
     """Choose with all folds, and without each of them.
 
     Parameters
     ----------
     inner : by model (folds, folds): error [m] of the windows of fold g, fitted without f and g
     sizes : by model, how many parameters it has
-    one_recording : the folds are blocks of one recording
     """
     count = len(next(iter(inner.values())))
     baseline = BASELINE if BASELINE in inner else next(iter(inner))
     recommended, why = choose({name: np.diag(one) for name, one in inner.items()}, sizes, baseline)
     chosen = [UNCHOSEN if UNCHOSEN in inner else baseline] * count
-    if count < FEWEST_TO_CHOOSE and one_recording:
-        return Choice(chosen[0], f"{count} blocks are too few to choose a model", tuple(chosen))
     if count >= FEWEST_TO_CHOOSE:
         for f in range(count):
             others = [g for g in range(count) if g != f]

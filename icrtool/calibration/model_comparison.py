@@ -1,8 +1,7 @@
 """The models of one run, each tested on distance it was not fitted to, all in the same trials.
 
-A run is cut by path length into contiguous blocks. What is fitted is fitted on windows that keep clear of the block
-left out, and tested in the trials that lie within it (`icrtool.calibration.held_out`); the filter's own ICRs, momentary
-and final, stand beside.
+What is fitted is fitted on windows that keep clear of the trials that it is tested in (`icrtool.calibration.held_out`);
+the filter's own ICRs, momentary and final, stand beside.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
-from icrtool.calibration.held_out import HORIZONS_M, HeldOut, block_trials, hold_out, plan_folds
+from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
 from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
@@ -50,7 +49,7 @@ class ModelComparison:
 
     Attributes
     ----------
-    blocks : left out one after the other
+    blocks : of distance, by which a model is chosen
     starts : trials start from so many states
     chosen : name of the model of the family chosen for each block, without it
     fits : of all windows, by name in the family: what to use, not what was tested
@@ -105,12 +104,12 @@ def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> Compar
 
     Notes
     -----
-    Stone (1974), cross-validation, here over contiguous blocks since neighbouring trials share their distance. The
+    Cross-validation (Stone 1974; see `icrtool.calibration.held_out` for what is left out of a trial's fit). The
     filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
     recording, heading, notes = _with_heading(run, headings)
     wheels, turned = hold_out([recording], horizons_m=HORIZONS_M)
-    trials = block_trials(recording, plan_folds([recording]), HORIZONS_M)
+    (trials,) = wheels.trials
     scores = list(_wheels_scores(run, recording, trials, wheels))
     if turned is not None:
         scores += _turned_scores(run, recording, trials, turned, heading)

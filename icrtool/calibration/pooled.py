@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,16 +13,16 @@ import numpy as np
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import measure_error_sources
-from icrtool.calibration.held_out import FEWEST_RESIDUALS, Fold, HeldOut, hold_out, mask_windows
+from icrtool.calibration.held_out import HeldOut, errors_without, hold_out
 from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
-from icrtool.motion.fit import Pool
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import PathAt, Trials, predicted_path, trial_errors
+from icrtool.motion.fit import Fold, Prediction, own_constants
+from icrtool.motion.recording import Recording, cut_windows, joined_steps
+from icrtool.motion.trials import PathAt, Trials, predicted_path
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 
@@ -158,11 +157,11 @@ def calibration_from(
             one.path,
             one.sha256,
             float(one.drive.distance[-1]),
-            math.degrees(own.heading_offset_rad),
-            -own.wheels_later_s,
+            math.degrees(best.constants(i).heading_offset_rad),
+            -best.constants(i).wheels_later_s,
             one.begin_ns,
         )
-        for one, own in zip(recordings, best.constants, strict=True)
+        for i, one in enumerate(recordings)
     )
     scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
     return Calibration(
@@ -204,13 +203,19 @@ ErrorsOf = Callable[[Trials], Floats]
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated_path`."""
-    path = calibrated_path(calibration, recording, with_gyro=with_gyro)
-    return lambda trials: trial_errors(recording, trials, path)
+    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated`."""
+    found, steps = calibrated(calibration, recording, with_gyro=with_gyro), joined_steps(recording, 1)
+    folds = [Fold("", 0, 0, -np.inf, np.inf)]
+    return lambda trials: errors_without(recording, trials, folds, 0, lambda _: found, steps)
 
 
 def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> PathAt:
-    """Return the path that a calibration makes of a recording.
+    """Return the path that a calibration makes of a recording; see `calibrated`."""
+    return predicted_path(recording, *calibrated(calibration, recording, with_gyro=with_gyro))
+
+
+def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Prediction:
+    """Return the model of a calibration for a recording, and the recording's constants.
 
     Parameters
     ----------
@@ -233,8 +238,7 @@ def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
-    pool = Pool([cut_windows(recording)], [recording.width_m], fitted.model, fitted.wheels)
-    return predicted_path(recording, fitted, pool.own_constants(0, fitted.parameters))
+    return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
 
 
 def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
@@ -242,45 +246,7 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
 
     Notes
     -----
-    The parameters are fitted to windows that share no distance with any fold, recording or block, from a trial's start
-    to its end; the model is the one chosen without the fold of the start. Trials for which too little is left to fit to
-    have no error.
+    See `icrtool.calibration.held_out.left_out`. Trials for which too little is left to fit to have no error.
     """
-    recording = recordings[i]
-    mine = [f for f, fold in enumerate(table.folds) if fold.recording == i]
-    edges = np.array([table.folds[f].begin_m for f in mine])
-
-    @cache
-    def path_without(first: int, last: int) -> PathAt | None:
-        fit, own = table.without[mine[first]], table.own[mine[first]]
-        if first != last:
-            windows = [cut_windows(recording)]
-            fold = Fold("", 0, edges[first], table.folds[mine[last]].end_m)
-            (kept,), _ = mask_windows(windows, [fold])
-            if np.count_nonzero(kept) < FEWEST_RESIDUALS:
-                return None
-            fit = Pool(windows, [recording.width_m], fit.model).fit(kept, fit.solution.x)
-            own = fit.constants[0]
-        return predicted_path(recording, fit, own)
-
-    def errors_of(trials: Trials) -> Floats:
-        errors: Floats = np.full(trials.ends.shape, np.nan)
-        distance = recording.drive.distance
-        first = np.searchsorted(edges, distance[trials.starts], side="right") - 1
-        # Block by block of the start: tables of all trials would need more memory than their errors.
-        for a in np.flatnonzero(np.bincount(first)).tolist():
-            begun = np.flatnonzero(first == a)
-            ends = trials.ends[begun]
-            # a trial that ends where a block does touches no more of it
-            last = np.maximum(np.searchsorted(edges, distance[np.maximum(ends, 0)], side="left") - 1, a)
-            last[ends < 0] = -1
-            for b in np.flatnonzero(np.bincount(last[last >= 0])).tolist():
-                if (path := path_without(a, b)) is not None:
-                    of_pair = last == b
-                    kept = of_pair.any(axis=1)
-                    rows, there = begun[kept], of_pair[kept]
-                    part = Trials(trials.starts[rows], np.where(there, ends[kept], -1))
-                    errors[rows] = np.where(there, trial_errors(recording, part, path), errors[rows])
-        return errors
-
-    return errors_of
+    recording, steps = recordings[i], joined_steps(recordings[i], 1)
+    return lambda trials: errors_without(recording, trials, table.folds, i, table.without, steps)

@@ -34,9 +34,9 @@ def command(
 ) -> None:  # fmt: skip
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
 
-    Several logs are pooled; each is left out in turn to test the models and to choose one. Of one log, blocks are left
-    out, and antenna place, heading offset, delays and wheel scales are estimated, too. A RUN is used as it was fitted,
-    with its configuration.
+    Several logs are pooled; each is left out in turn to test the models and to choose one. Of one log, the distance of
+    each trial is left out, and antenna place, heading offset, delays and wheel scales are estimated, too. A RUN is used
+    as it was fitted, with its configuration.
 
     \b
     Example:

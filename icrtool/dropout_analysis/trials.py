@@ -297,15 +297,16 @@ def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Execu
 
 def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
-    states = ends.shape[1]
-    if isinstance(model, ConstantModel):
-        found = model.errors_of(Trials(np.arange(states), ends.T.astype(np.int64)))
-        return np.ascontiguousarray(found.T).T
-    errors, icrs = np.empty(ends.shape), model.icrs
+    states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_A_CALL, states)
-        errors[:, lo:hi] = open_loop_errors(drive, icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+        tried = ends[:, lo:hi].T.astype(np.int64)
+        if isinstance(model, ConstantModel):
+            found = model.errors_of(Trials(np.arange(lo, hi), tried))
+        else:
+            found = open_loop_errors(drive, model.icrs, tried, lo)
+        errors[:, lo:hi] = found.T
 
     list(pool.map(fill, range(0, states, STARTS_A_CALL)))
     return errors.T

@@ -133,11 +133,10 @@ def robust_least_squares(
     Covariance: `sandwich_covariance`.
     """
     x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
-    kinds = np.zeros(0, np.int64) if kind is None else kind
     residuals, jacobian = evaluate(x)
     converged = False
     for _ in range(most_steps):
-        scale = scale_by_kind(residuals, kinds)
+        scale = scale_by_kind(residuals, kind)
         information, gradient = normal_equations(residuals, jacobian, scale, overlap)
         information = information + np.diag(pull)
         gradient = gradient + pull * (x - prior_mean)
@@ -161,16 +160,16 @@ def robust_least_squares(
         if before - after < settled**2:
             converged = True
             break
-    scale = scale_by_kind(residuals, kinds)
+    scale = scale_by_kind(residuals, kind)
     groups = np.arange(len(residuals)) if group is None else group
     covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, pull, overlap)
     weights = soft_l1_weights(residuals / scale)
     return RobustFit(x, covariance, information, residuals, jacobian, scale, weights, count, converged)
 
 
-def scale_by_kind(residuals: Floats, kind: Ints) -> Floats:
-    """Return the robust standard deviation about zero of each residual's kind (m,); an empty `kind` is one kind."""
-    if not len(kind):
+def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
+    """Return the robust standard deviation about zero of each residual's kind (m,); default one kind."""
+    if kind is None:
         return np.full(len(residuals), max(mad_std(residuals, 0.0), SMALLEST_SCALE))
     scale = np.empty(len(residuals))
     # kinds are few, and numbered from zero: counting them is faster than sorting

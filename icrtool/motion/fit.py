@@ -1,7 +1,8 @@
 """Robust fit of motion models to windows of driven distance, pooled over recordings.
 
 Heading and place are sums over the wheel samples, and so are their derivatives: all windows of a recording cost one
-pass over its samples (`icrtool.kernels.window_residuals`).
+pass over its samples (`icrtool.kernels.window_residuals`). What is left out of a fit is taken from its normal
+equations, so one fit serves all folds.
 
 Each recording has constants of its own, which are not part of a calibration (`icrtool.motion.recording.LogConstants`).
 """
@@ -9,12 +10,13 @@ Each recording has constants of its own, which are not part of a calibration (`i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares
+from icrtool.kernels.robust import RobustFit, robust_least_squares, scale_by_kind, soft_l1_weights
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
@@ -28,6 +30,36 @@ SETTLED = 0.1
 OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
 
+REWEIGHTS = 3
+
+FEWEST_RESIDUALS = 20
+"""Fewer that are left beside a fold give no parameters."""
+
+
+class Fold(NamedTuple):
+    """What is left out together: a recording, or some distance of a single one.
+
+    Attributes
+    ----------
+    name : of the recording, or of the block of distance in which it begins; number : the same, counted from 0
+    recording : which one; begin_m, end_m : path lengths [m], infinite for all of it
+    """
+
+    name: str
+    number: int
+    recording: int
+    begin_m: float
+    end_m: float
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of the recording is left out."""
+        return bool(np.isinf(self.begin_m) and np.isinf(self.end_m))
+
+
+Prediction = tuple[FittedModel, LogConstants]
+"""A model that was not fitted to a fold, and the constants of the fold's recording."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledFit(FittedModel):
@@ -35,22 +67,93 @@ class PooledFit(FittedModel):
 
     Attributes
     ----------
-    constants : of each recording
+    wheels : as in `FittedModel`, fitted to the same windows
+    pool : the windows
     solution : of all parameters, those of the model first, then those of each recording
-    residuals, jacobian : of all windows (m,), (m, parameters), at the minimum
-    kept : (m,) the residuals that were fitted
     """
 
-    constants: tuple[LogConstants, ...]
+    wheels: PooledFit | None = None
+    pool: Pool
     solution: RobustFit
-    residuals: Floats
-    jacobian: Floats
-    kept: Bools
+    _left_out: dict[Fold, Prediction | None] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def fitted(self) -> FittedModel:
         """The model and its parameters alone."""
-        return FittedModel(self.model, self.parameters, self.covariance, self.wheels)
+        wheels = None if self.wheels is None else self.wheels.fitted
+        return FittedModel(self.model, self.parameters, self.covariance, wheels)
+
+    def constants(self, recording: int) -> LogConstants:
+        """Return the constants of a recording."""
+        return self._constants(self.solution.x, recording)
+
+    def _constants(self, x: Floats, recording: int) -> LogConstants:
+        own = len(constant_std(self.model))
+        first = len(self.parameters) + own * recording
+        return LogConstants(*x[first : first + own].tolist())
+
+    def without(self, fold: Fold) -> Prediction | None:
+        """Return the model as fitted without a fold, and the constants of the fold's recording for that.
+
+        Returns
+        -------
+        None where too little is left. The constants of a recording that is left out whole are found in it.
+        """
+        if fold not in self._left_out:
+            self._left_out[fold] = self._fit_without(fold)
+        return self._left_out[fold]
+
+    def _fit_without(self, fold: Fold) -> Prediction | None:
+        pool, i, k = self.pool, fold.recording, len(self.parameters)
+        clear = pool.clear_of(fold)
+        if np.count_nonzero(clear) < FEWEST_RESIDUALS:
+            return None
+        x, covariance = self.without_residuals(~clear)
+        of_wheels = None if self.wheels is None else self.wheels.without(fold)
+        fitted = FittedModel(self.model, x[:k], covariance[:k, :k], of_wheels and of_wheels[0])
+        if fold.whole:
+            return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
+        return fitted, self._constants(x, i)
+
+    def without_residuals(self, dropped: Bools) -> tuple[Floats, Floats]:
+        """Return all parameters as fitted without the residuals marked in `dropped` (m,), and their covariance.
+
+        Notes
+        -----
+        Reweighted steps, as of a new fit, with residuals that follow the parameters to first order: over some metres
+        they do so nearly exactly.
+        """
+        at, kept = self.solution, np.flatnonzero(~dropped)
+        residuals, jacobian, x, information = at.residuals[kept], at.jacobian[kept], at.x, at.information
+        mean, std = self.pool.prior(self.model)
+        pull = std**-2.0
+        for _ in range(REWEIGHTS):
+            left = residuals + jacobian @ (x - at.x)
+            scale = scale_by_kind(left)
+            weighted = jacobian * (soft_l1_weights(left / scale) / (self.pool.overlap * scale**2))[:, None]
+            information = weighted.T @ jacobian + np.diag(pull)
+            x = x - np.linalg.solve(information, weighted.T @ left + pull * (x - mean))
+        # a parameter's variance exceeds that of independent residuals by as much as with all of them
+        grown = np.sqrt(np.diag(at.covariance) / np.diag(np.linalg.inv(at.information)))
+        return x, np.linalg.inv(information) * np.outer(grown, grown)
+
+
+def constant_std(model: MotionModel) -> Floats:
+    """Return the prior of the constants of each recording that a model has."""
+    return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
+
+
+def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogConstants:
+    """Return the constants of one recording for given parameters of the model."""
+    part, std = WindowResiduals(windows, fitted.model, width_m, fitted.wheels), constant_std(fitted.model)
+
+    def evaluate(constants: Floats) -> tuple[Floats, Floats]:
+        residuals, by = part(fitted.parameters, constants)
+        return residuals, by[:, len(fitted.parameters) :]
+
+    zero = np.zeros(len(std))
+    overlap = len(windows.start) / 5.0
+    return LogConstants(*robust_least_squares(evaluate, zero, zero, std, overlap=overlap).x.tolist())
 
 
 class WindowResiduals:
@@ -109,117 +212,67 @@ class WindowResiduals:
 
 
 class Pool:
-    """Windows of several recordings, and the fits of one model to parts of them.
+    """Windows of several recordings, and the fits of models to them.
 
     Parameters
     ----------
     windows, widths_m : by recording
-    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+
+    Attributes
+    ----------
+    recording, start_m, end_m, length_m : (m,) of the window of each residual
+    group : (m,) stretches of distance whose residuals depend on one another
+    overlap : how many windows cover a place on average
     """
 
-    def __init__(
-        self,
-        windows: Sequence[Windows],
-        widths_m: Sequence[float],
-        model: MotionModel,
-        wheels: FittedModel | None = None,
-    ) -> None:
-        self.model, self._wheels = model, wheels
-        self._parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(windows, widths_m, strict=True)]
-        self._windows = windows
-        groups, offset = [], 0
-        for w in windows:
-            stretch = np.unique(np.floor(w.start_m / STRETCH_M), return_inverse=True)[1]
-            groups.append(np.tile(stretch + offset, 2))
-            offset += int(stretch.max()) + 1
-        self.group = np.concatenate(groups)
-        self.length_m = np.concatenate([np.tile(w.length_m, 2) for w in windows])
+    def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float]) -> None:
+        self.windows, self.widths_m = windows, widths_m
+        both = [np.tile([w.start_m, w.end_m, w.length_m], 2) for w in windows]
+        self.start_m, self.end_m, self.length_m = np.concatenate(both, axis=1)
+        self.recording = np.repeat(np.arange(len(windows)), [one.shape[1] for one in both])
+        stretch = np.column_stack([self.recording, np.floor(self.start_m / STRETCH_M)])
+        self.group = np.unique(stretch, axis=0, return_inverse=True)[1].reshape(-1)
+        covered_m = STRETCH_M * (int(self.group.max()) + 1)
+        self.overlap = max(float(self.length_m.sum()) / 2.0 / covered_m, 1.0)
 
-    def own_constants(self, recording: int, parameters: Floats) -> LogConstants:
-        """Return the constants of one recording for given parameters of the model."""
-        part, std, k = self._parts[recording], self._constant_std, len(parameters)
+    def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
+        """Return mean and standard deviation of all parameters, model first, then the constants of each recording."""
+        own = np.tile(constant_std(model), len(self.windows))
+        mean = np.concatenate([model.prior_mean, np.zeros(len(own))])
+        return mean, np.concatenate([model.prior_std, own])
 
-        def evaluate(constants: Floats) -> tuple[Floats, Floats]:
-            residuals, by = part(parameters, constants)
-            return residuals, by[:, k:]
+    def clear_of(self, fold: Fold) -> Bools:
+        """Return the residuals (m,) that share no distance with a fold."""
+        apart = (self.end_m <= fold.begin_m) | (self.start_m >= fold.end_m)
+        return np.asarray(apart | (self.recording != fold.recording), np.bool_)
 
-        zero = np.zeros(len(std))
-        overlap = len(self._windows[recording].start) / 5.0
-        return LogConstants(*robust_least_squares(evaluate, zero, zero, std, overlap=overlap).x.tolist())
+    def within(self, fold: Fold) -> Bools:
+        """Return the residuals (m,) that lie in a fold."""
+        inside = (self.start_m >= fold.begin_m) & (self.end_m <= fold.end_m)
+        return np.asarray(inside & (self.recording == fold.recording), np.bool_)
 
-    @property
-    def _constant_std(self) -> Floats:
-        return CONSTANT_STD if self.model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
-
-    @property
-    def prior(self) -> tuple[Floats, Floats]:
-        """Mean and standard deviation of all parameters, model first, then the constants of each recording."""
-        own = np.tile(self._constant_std, len(self._parts))
-        mean = np.concatenate([self.model.prior_mean, np.zeros(len(own))])
-        return mean, np.concatenate([self.model.prior_std, own])
-
-    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return residuals (m,) of all windows of all recordings and their derivatives (m, parameters)."""
-        k, own = len(self.model.terms), len(self._constant_std)
-        residuals, jacobians = [], []
-        for i, part in enumerate(self._parts):
-            columns = slice(k + own * i, k + own * (i + 1))
-            residual, by = part(x[:k], x[columns])
-            jacobian = np.zeros((len(residual), len(x)))
-            jacobian[:, :k], jacobian[:, columns] = by[:, :k], by[:, k:]
-            residuals.append(residual)
-            jacobians.append(jacobian)
-        return np.concatenate(residuals), np.concatenate(jacobians)
-
-    def overlap(self, kept: Bools) -> float:
-        """Return how many windows of those marked in `kept` (m,) cover a place on average."""
-        covered_m = STRETCH_M * max(len(np.unique(self.group[kept])), 1)
-        return max(float(self.length_m[kept].sum()) / 2.0 / covered_m, 1.0)
-
-    def fit(self, kept: Bools | None = None, start: Floats | None = None) -> PooledFit:
-        """Fit the model to the residuals marked in `kept` (m,); default all.
+    def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> PooledFit:
+        """Fit a model.
 
         Parameters
         ----------
-        start : all parameters to start from; default the prior's mean
+        wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
         """
-        mean, std = self.prior
-        rows = np.ones(len(self.group), np.bool_) if kept is None else kept
-        last: list[tuple[Floats, Floats, Floats]] = []
+        parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)]
+        k, own = len(model.terms), len(constant_std(model))
+        mean, std = self.prior(model)
 
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
-            residuals, jacobian = self.evaluate(x)
-            last[:] = [(x, residuals, jacobian)]
-            return residuals[rows], jacobian[rows]
+            residuals, jacobian = np.empty(len(self.group)), np.zeros((len(self.group), len(x)))
+            for i, part in enumerate(parts):
+                rows, columns = self.recording == i, slice(k + own * i, k + own * (i + 1))
+                residuals[rows], by = part(x[:k], x[columns])
+                jacobian[rows, :k], jacobian[rows, columns] = by[:, :k], by[:, k:]
+            return residuals, jacobian
 
         found = robust_least_squares(
-            evaluate,
-            mean if start is None else start,
-            mean,
-            std,
-            group=self.group[rows],
-            overlap=self.overlap(rows),
-            settled=SETTLED,
-        )
-        k, own = len(self.model.terms), len(self._constant_std)
-        constants = (LogConstants(*one) for one in found.x[k:].reshape(-1, own).tolist())
-        at, residuals, jacobian = last[0]
-        return PooledFit(
-            self.model, found.x[:k], found.covariance[:k, :k], self._wheels,
-            constants=tuple(constants), solution=found, residuals=residuals + jacobian @ (found.x - at),
-            jacobian=jacobian, kept=rows,
+            evaluate, mean, mean, std, group=self.group, overlap=self.overlap, settled=SETTLED
         )  # fmt: skip
-
-    def without(self, fit: PooledFit, dropped: Bools) -> Floats:
-        """Return all parameters as they would be without the residuals marked in `dropped` (m,), to first order.
-
-        Notes
-        -----
-        At the minimum the gradients of all residuals and of the prior sum to zero, so what is left without some is
-        minus theirs: one step with the curvature of the rest (a downdate, as for studentised residuals).
-        """
-        out = dropped & fit.kept
-        scale = np.full(int(np.count_nonzero(out)), fit.solution.scale[0])
-        H, g = normal_equations(fit.residuals[out], fit.jacobian[out], scale, self.overlap(fit.kept))
-        changed: Floats = fit.solution.x + np.linalg.solve(fit.solution.information - H, g)
-        return changed
+        return PooledFit(
+            model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found
+        )  # fmt: skip

@@ -58,42 +58,39 @@ class Term:
     Attributes
     ----------
     axis : which of v_x, v_y, omega it adds to
-    column : its value per unit parameter, (n,)
-    nominal : the parameter without slip
+    column : its value per unit parameter, (n,); formula : the same in the symbols of `WheelMotion`, for other programs
     mean, std : prior of the parameter: how real robots differ
     meaning : for a reader, with source
+    nominal : the parameter without slip
     """
 
     name: str
     axis: Axis
     column: Callable[[WheelMotion], Floats]
-    nominal: float
-    mean: float
+    formula: str
     std: float
     meaning: str
+    mean: float = 0.0
+    nominal: float = 0.0
 
 
 TERMS: dict[str, Term] = {
     term.name: term
     for term in (
-        Term("vx_v", VX, lambda m: m.v, 1.0, 1.0, 0.04, "common wheel scale, longitudinal slip"),
-        Term("vx_w", VX, lambda m: m.w * m.b / 2, 0.0, 0.0, 0.3, "ICRs off centre (Martinez 2005)"),
-        Term("omega_w", OMEGA, lambda m: m.w, 1.0, 0.6, 0.4, "b / W, one over the multiplier (Mandow 2007)"),
-        Term("omega_v", OMEGA, lambda m: m.v / m.b, 0.0, 0.0, 0.02, "left/right asymmetry: turns while driving ahead"),
-        Term("vy_w", VY, lambda m: m.w * m.b / 2, 0.0, 0.0, 0.3, "-2 x_icr / W (Martinez 2005)"),
-        Term(
-            "vy_vw", VY, lambda m: m.v * m.w, 0.0, 0.0, 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"
-        ),
-        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, 0.0, 0.0, 0.3, "turn gain that depends on curvature"),
-        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, 0.0, 0.0, 0.2, "turn gain that depends on speed"),
-        Term("vy_v", VY, lambda m: m.v, 0.0, 0.0, 0.02, "sideways while driving ahead (Anousaki 2004)"),
-        Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, 0.0, 0.0, 0.1, "drag in turns (Seegmiller 2014)"),
-        Term("gyro_scale", OMEGA, lambda m: m.gyro, 0.0, 0.0, 0.02, "scale error of the gyro"),
-        Term(
-            "wheels_weight", OMEGA, lambda m: m.turn - m.gyro, 0.0, 0.0, 0.15, "weight of the wheels in the turn rate"
-        ),
+        Term("vx_v", VX, lambda m: m.v, "v", 0.04, "common wheel scale, longitudinal slip", mean=1.0, nominal=1.0),
+        Term("vx_w", VX, lambda m: m.w * m.b / 2, "w * b / 2", 0.3, "ICRs off centre (Martinez 2005)"),
+        Term("omega_w", OMEGA, lambda m: m.w, "w", 0.4, "b / W, 1 / multiplier (Mandow 2007)", mean=0.6, nominal=1.0),
+        Term("omega_v", OMEGA, lambda m: m.v / m.b, "v / b", 0.02, "left/right asymmetry: turns while driving ahead"),
+        Term("vy_w", VY, lambda m: m.w * m.b / 2, "w * b / 2", 0.3, "-2 x_icr / W (Martinez 2005)"),
+        Term("vy_vw", VY, lambda m: m.v * m.w, "v * w", 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"),
+        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, "spin * w", 0.3, "turn gain that depends on curvature"),
+        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.2, "turn gain that depends on speed"),
+        Term("vy_v", VY, lambda m: m.v, "v", 0.02, "sideways while driving ahead (Anousaki 2004)"),
+        Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, "abs(w) * b / 2", 0.1, "drag in turns (Seegmiller 2014)"),
+        Term("gyro_scale", OMEGA, lambda m: m.gyro, "gyro", 0.02, "scale error of the gyro"),
+        Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, "turn - gyro", 0.15, "weight of the wheels' turn rate"),
     )
-}
+}  # fmt: skip
 """Every term by name."""
 
 GYRO_TERMS = ("gyro_scale", "wheels_weight")
@@ -246,17 +243,27 @@ def track_geometry(
     a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
     """
     at = typical if typical is not None else TypicalDrive()
-    value = {name: TERMS[name].nominal for name in TERMS} | dict(zip(model.terms, parameters.tolist(), strict=True))
-    turn_gain = value["omega_w"] + value["omega_sw"] * at.spin + value["omega_vw"] * at.speed_abs_mps
-    vx_left, vx_right = value["vx_v"] / 2 + value["vx_w"] / 2, value["vx_v"] / 2 - value["vx_w"] / 2
-    turn_left = (value["omega_v"] / 2 + turn_gain) / width_m
-    turn_right = (value["omega_v"] / 2 - turn_gain) / width_m
-    y_right, y_left = vx_left / turn_left, vx_right / turn_right
+    ahead = twist(model, parameters, _one_motion(np.array([1.0, -1.0]), np.zeros(2), 0.0, width_m))
+    speeds = at.speed_abs_mps * np.array([1.0, 1.0, -1.0, -1.0])
+    turning = twist(model, parameters, _one_motion(speeds, np.array([1.0, -1.0, 1.0, -1.0]), at.spin, width_m))
+    forward = 0.5 if at.speed_abs_mps == 0.0 else (1.0 + at.speed_mps / at.speed_abs_mps) / 2.0
+    by_v = (ahead[:, 0] - ahead[:, 1]) / 2.0
+    by_w = ((turning[:, [0, 2]] - turning[:, [1, 3]]) / 2.0) @ [forward, 1.0 - forward]
+    # V_l adds half of itself to v and its share of b to w, V_r takes away the latter
+    by_left, by_right = by_v / 2.0 + by_w / width_m, by_v / 2.0 - by_w / width_m
+    y_right, y_left = by_left[VX] / by_left[OMEGA], by_right[VX] / by_right[OMEGA]
     separation = y_right - y_left
-    x = -(value["vy_w"] * width_m / 2 + value["vy_vw"] * at.speed_mps) / turn_gain
-    return TrackGeometry(
-        y_right, y_left, x, separation / width_m, 1.0 / turn_gain, separation * turn_left, -separation * turn_right
-    )
+    numbers = (
+        y_right, y_left, -by_w[VY] / by_w[OMEGA], separation / width_m, 1.0 / by_w[OMEGA],
+        separation * by_left[OMEGA], -separation * by_right[OMEGA],
+    )  # fmt: skip
+    return TrackGeometry(*map(float, numbers))
+
+
+def _one_motion(v: Floats, w: Floats, spin: float, width_m: float) -> WheelMotion:
+    """Return a motion of given speeds and curvature, no gyro."""
+    none = np.zeros(len(v))
+    return WheelMotion(v, w, np.full(len(v), spin), width_m, none, none)
 
 
 def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ WINDOWS_M = (5.0, 10.0)
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
 
-MOST_STARTS, LEAST_OFTEN_M = 1500, 2.5
+MOST_STARTS, LEAST_OFTEN_M = 800, 2.5
 """Windows of long drives start further apart: about so many of a length in all logs, but at least every half window."""
 
 STEP_S = 0.1
@@ -33,6 +33,9 @@ STRETCH_M = 20.0
 """Distance whose errors depend on one another, for the covariance: twice the longest window."""
 
 FEWEST_WINDOWS = 10
+
+LONGEST_DELAY_S = 1.0
+"""Of the wheels against the poses."""
 
 MOVING_MPS = 0.01
 """Slower than this the robot stands: its starts are copies of one another."""
@@ -115,6 +118,12 @@ class Steps(NamedTuple):
     v_right: Floats
     gyro: Floats
     into: Floats
+
+    def around(self, begin_s: Floats, end_s: Floats) -> Steps:
+        """Return the steps of the time in which trials (k,) begin and end, and of a little more for delays."""
+        span = begin_s.min() - LONGEST_DELAY_S, end_s.max() + LONGEST_DELAY_S
+        first, stop = np.searchsorted(self.t, span, side="right").tolist()
+        return Steps._make(column[max(first - 1, 0) : stop] for column in self)
 
     def locate(self, at: Floats) -> tuple[Ints, Floats]:
         """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""

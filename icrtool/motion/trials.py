@@ -36,12 +36,6 @@ class Trials(NamedTuple):
     starts: Ints
     ends: Ints
 
-    def within(self, distance: Floats, begin_m: float, end_m: float) -> Trials:
-        """Return the trials that lie between two path lengths; `distance` (n,) is the recording's."""
-        inside = (distance[self.starts] >= begin_m) & (distance[self.starts] < end_m)
-        ends = self.ends[inside]
-        return Trials(self.starts[inside], np.where((ends >= 0) & (distance[ends] <= end_m), ends, -1))
-
 
 def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts: bool = False) -> Trials:
     """Return the trials of a recording.
@@ -70,28 +64,33 @@ PathAt = Callable[[Floats], tuple[Floats, Complexes]]
 """Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]."""
 
 
-def trial_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
-    """Return the distance (k, h) [m] between open-loop position and reference at each trial's end, NaN for no trial.
+def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> Floats:
+    """Return the distance (m,) [m] between open-loop position and reference at the ends of trials.
+
+    Parameters
+    ----------
+    start, end : (m,) states
 
     Notes
     -----
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
-    drive, t = recording.drive, recording.t_s
-    reference = drive.north + 1j * drive.east
-    if trials.ends.size > len(t):
-        headings, places = path(t)
-        at: Callable[[Ints], tuple[Floats, Complexes]] = lambda rows: (headings[rows], places[rows])  # noqa: E731 - one of two
+    drive, first = recording.drive, int(start.min())
+    near = slice(first, int(end.max()) + 1)
+    north, east, t, heading = drive.north[near], drive.east[near], recording.t_s[near], drive.heading[near]
+
+    def turn_and_place(rows: Ints | slice) -> tuple[Complexes, Complexes]:
+        turned, place = path(t[rows])
+        return np.exp(1j * (heading[rows] - turned)), place
+
+    s, e = start - first, end - first
+    if len(s) > len(t):
+        turns, places = turn_and_place(slice(None))
+        turn, moved = turns[s], places[e] - places[s]
     else:
-        at = lambda rows: path(t[rows])  # noqa: E731 - the other
-    heading, begin = at(trials.starts)
-    turn = np.exp(1j * (drive.heading[trials.starts] - heading))
-    errors: Floats = np.full(trials.ends.shape, np.nan)
-    for h in range(trials.ends.shape[-1]):
-        some = trials.ends[:, h] >= 0
-        e = trials.ends[some, h]
-        moved = turn[some] * (at(e)[1] - begin[some])
-        errors[some, h] = np.abs(moved - (reference[e] - reference[trials.starts[some]]))
+        turn, begin = turn_and_place(s)
+        moved = path(t[e])[1] - begin
+    errors: Floats = np.abs(turn * moved - (north[e] - north[s]) - 1j * (east[e] - east[s]))
     return errors
 
 

@@ -8,6 +8,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.trials import Drive
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import Recording
+from icrtool.motion.trials import PathAt, Trials, trial_errors
 
 WIDTH_M = 0.6
 SLOWEST_TURN = 0.15
@@ -57,3 +58,11 @@ def make_recording(
     )  # fmt: skip
     rate_radps = omega + rng.normal(0.0, 0.005, n) + 0.002 if gyro else None
     return Recording(name, t, drive, rate_radps, WIDTH_M, f"/logs/{name}", name)
+
+
+def table_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
+    """Return the errors (k, h) [m] of trials along one path, NaN where there is none."""
+    errors: Floats = np.full(trials.ends.shape, np.nan)
+    row, column = np.nonzero(trials.ends >= 0)
+    errors[row, column] = trial_errors(recording, trials.starts[row], trials.ends[row, column], path)
+    return errors

@@ -23,17 +23,14 @@ SYMBOLS = {
     "spin": "abs(v_left - v_right) / (abs(v_left) + abs(v_right)), 0 where both are 0",
     "b": "track_width_m",
 }
-FORMULAS = {
-    "vx_v": "v", "vx_w": "w * b / 2", "omega_w": "w", "omega_v": "v / b", "vy_w": "w * b / 2", "vy_vw": "v * w",
-    "omega_sw": "spin * w", "omega_vw": "abs(v) * w", "vy_v": "v", "vx_absw": "abs(w) * b / 2",
-}  # fmt: skip
 
 
 def format_twist(calibration: Calibration) -> str:
     """Return the JSON text, no line end; `v_x`, `v_y` and `yaw_rate` are each the sum of value times formula."""
     fitted = calibration.fitted
-    signs = np.array([sign_in_rep103(TERMS[name]) for name in fitted.model.terms])
-    fixed = [term for term in TERMS.values() if term.nominal and term.name not in fitted.model.terms]
+    free = [TERMS[name] for name in fitted.model.terms]
+    signs = np.array([sign_in_rep103(term) for term in free])
+    fixed = [term for term in TERMS.values() if term.nominal and term not in free]
     geometry, covariance = calibration.geometry()
     stds = np.sqrt(np.diag(covariance)).tolist()
     p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
@@ -49,17 +46,11 @@ def format_twist(calibration: Calibration) -> str:
         "symbols": SYMBOLS,
         "track_width_m": calibration.width_m,
         "terms": [
-            *(
-                {"name": term.name, "output": AXES[term.axis], "formula": FORMULAS[term.name],
-                 "value": sign_in_rep103(term) * term.nominal, "std": 0.0}
-                for term in fixed
-            ),
-            *(
-                {"name": name, "output": AXES[TERMS[name].axis], "formula": FORMULAS[name], "value": value, "std": std}
-                for name, value, std in zip(
-                    fitted.model.terms, (signs * fitted.parameters).tolist(), fitted.std.tolist(), strict=True
-                )
-            ),
+            {"name": term.name, "output": AXES[term.axis], "formula": term.formula, "value": value, "std": std}
+            for term, value, std in [
+                *((term, sign_in_rep103(term) * term.nominal, 0.0) for term in fixed),
+                *zip(free, (signs * fitted.parameters).tolist(), fitted.std.tolist(), strict=True),
+            ]
         ],
         "covariance": {
             "of": list(fitted.model.terms),

@@ -79,7 +79,7 @@ def model_comparison(report: DropoutReport) -> Figure:
     table = report.comparison
     if table is None:
         raise DataError(report.name, "the report holds no model comparison", report.no_comparison)
-    return _drawn(lambda: draw_comparison(run_title(report.run_summary), table.scores, table.horizons_m, table.blocks))
+    return _drawn(lambda: draw_comparison(run_title(report.run_summary), table.scores, table.horizons_m))
 
 
 def _check(report: DropoutReport, content: tuple[object, ...], what: str) -> None:

@@ -54,4 +54,4 @@ def _figures(report: DropoutReport) -> Iterator[tuple[str, Figure]]:
     if any(trials.values()):
         yield "summary", draw_summary(title, report)
     if (table := report.comparison) is not None:
-        yield "ladder", draw_comparison(title, table.scores, table.horizons_m, table.blocks)
+        yield "ladder", draw_comparison(title, table.scores, table.horizons_m)

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 WIDTH_IN, ROW_IN = 7.2, 0.27
 
 
-def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequence[float], blocks: int) -> Figure:
+def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequence[float]) -> Figure:
     """Draw 95 % (filled) and expected error (open) of each model; held-out ones as circles, others as squares.
 
     Parameters
     ----------
-    scores, horizons_m, blocks : of a `icrtool.calibration.model_comparison.ModelComparison`
+    scores, horizons_m : of a `icrtool.calibration.model_comparison.ModelComparison`
     """
     h = int(np.argmin(np.abs(np.array(horizons_m) - CHOICE_HORIZON_M)))
     scores = [score for score in scores if score.summary.trials[h]]
     groups = sum(1 for score in scores if score.measured_heading) > 0
     figure = new_figure(
         title,
-        f"Open-loop error after {horizons_m[h]:g} m, 95 % / expected; {blocks} blocks of the drive held out in turn",
+        f"Open-loop error after {horizons_m[h]:g} m, 95 % / expected, on distance they were not fitted to",
         width_in=WIDTH_IN,
         height_in=1.65 + ROW_IN * (len(scores) + 0.6 * groups),
     )

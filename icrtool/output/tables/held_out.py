@@ -73,8 +73,9 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
         for row in table.scores
     ]
     used = ", ".join(dict.fromkeys(table.chosen))
+    tested = f"each {what} left out in turn" if table.folds[0].whole else "each trial predicted without its distance"
     return [
-        f"each {what} left out in turn ({len(table.folds)}): 95 % / expected error [m], median {what} (worst {what})",
+        f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m], median {what} (worst {what})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),
         f"recommended: chosen without the {what} it is tested on ({used}); of all: {table.recommended}",
     ]

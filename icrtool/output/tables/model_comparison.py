@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE
 from icrtool.calibration.model_comparison import ModelComparison
 from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
@@ -27,9 +26,8 @@ def comparison_blocks(comparison: ModelComparison) -> list[Block]:
         (score.label, FITTED[score.fitted], *map(_pair, score.summary.p95.tolist(), score.summary.expected.tolist()))
         for score in comparison.scores
     ]
-    folds = f"{comparison.blocks} blocks held out in turn"
     return [
-        f"models on distance they were not fitted to, {folds}: 95 % / expected error [m]",
+        "models on distance they were not fitted to: 95 % / expected error [m]",
         Table("llr", rows, ("model", "fitted", *(f"{horizon:g} m" for horizon in comparison.horizons_m))),
         extended_line(comparison),
         *comparison.notes,
@@ -40,10 +38,6 @@ def extended_line(comparison: ModelComparison) -> str:
     """Return which models were chosen for the blocks, and which one for the whole drive."""
     names = {name: fit.model.label for name, fit in comparison.fits.items()}
     whole = f"for the whole drive: {names[comparison.best]}"
-    if comparison.blocks < FEWEST_TO_CHOOSE:
-        return (
-            f"extended: {comparison.blocks} blocks are too few to choose, it is {names[comparison.chosen[0]]}; {whole}"
-        )
     used = dict.fromkeys(names[name] for name in comparison.chosen)
     return f"extended, chosen without the block it is tested on: {'; '.join(used)}; {whole}"
 

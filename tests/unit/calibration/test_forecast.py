@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.calibration.error_growth import SOURCES, Ends, Spread, mean_error, radius
+from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
 from icrtool.calibration.forecast import _errors, forecast_drive, forecast_plan, wheel_speeds
 from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
@@ -44,11 +44,9 @@ def forecast_trials(
 ) -> tuple[Floats, Floats]:
     """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
     steps = joined_steps(recording, samples_a_step(recording))
-    some = trials.ends >= 0
-    start, end = np.broadcast_to(trials.starts[:, None], trials.ends.shape)[some], trials.ends[some]
-    rows, places = np.unique(np.concatenate([start, end]), return_inverse=True)
-    ends = Ends(recording.t_s[rows], places[: len(start)], places[len(start) :])
-    _, expected, p95 = _errors(calibration, steps, ends, with_gyro=with_gyro)
+    some, t = trials.ends >= 0, recording.t_s
+    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
+    _, expected, p95 = _errors(calibration, steps, begin, t[trials.ends[some]], with_gyro=with_gyro)
     found = np.full((2, *trials.ends.shape), np.nan)
     found[0][some], found[1][some] = expected, p95
     return found[0], found[1]

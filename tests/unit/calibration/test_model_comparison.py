@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.held_out import block_trials, plan_folds
 from icrtool.calibration.model_comparison import ModelComparison, _errors_along, compare_models
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import parse_config
@@ -16,6 +15,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.trials import FrozenIcrs
+from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run
 from support.drives import make_log
@@ -35,19 +35,6 @@ def run() -> Run:
     return fit(make_log(0, 180.0, rate=20.0), CONFIG)
 
 
-def test_all_trials_stay_within_their_block(run: Run) -> None:
-    recording = recording_of(run)
-    folds, distance = plan_folds([recording]), recording.drive.distance
-    trials = block_trials(recording, folds, (5.0, 10.0))
-    edges = [fold.end_m for fold in folds[:-1]]
-    row, h = np.nonzero(trials.ends >= 0)
-    assert len(row) > 100
-    of_start, of_end = (
-        np.searchsorted(edges, distance[at], "right") for at in (trials.starts[row], trials.ends[row, h])
-    )
-    assert np.array_equal(of_start, of_end)
-
-
 def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     """A gyro that turns as the wheels do with the ICRs: steps along the middle of each turn."""
     table, width = run.table, 1.1
@@ -56,7 +43,7 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     # the reference turns as the gyro does, so that its scale and bias are one and zero
     run = replace(run, table=replace(table, heading_rad=turned))
     recording = recording_of(run, MeasuredHeading("gyro", turned))
-    trials = block_trials(recording, plan_folds([recording]), (5.0,))
+    trials = cut_trials(recording, (5.0,))
     found = _errors_along(run, recording, trials, FrozenIcrs.constant(0.5, -0.6, 0.1))
     ahead = (0.5 * table.v_left_mps + 0.6 * table.v_right_mps) / width
     aside = -0.1 * (table.v_left_mps - table.v_right_mps) / width

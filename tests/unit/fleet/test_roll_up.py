@@ -45,7 +45,7 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     calibration = open_calibration(place / grass.file)
     assert (len(calibration.logs), calibration.recommended) == (2, grass.recommended)
     assert grass.multiplier == pytest.approx(calibration.controller_numbers().multiplier)
-    assert "each log left out in turn (2)" in grass.table
+    assert "each log left out in turn (2 logs)" in grass.table
     assert (ice.file, ice.logs) == ("", ("c",))
     assert "usable" in ice.reason
     assert grass.table in calibrations_text(found)

@@ -94,6 +94,13 @@ def test_a_gyro_turns_the_robot_where_the_wheels_have_no_weight() -> None:
     np.testing.assert_allclose(twist(model, np.array([value.get(term, 0.0) for term in model.terms]), motion)[2], 5.0)
 
 
+def test_the_formula_of_a_term_is_its_column() -> None:
+    motion = MOTION._replace(gyro=np.linspace(-1.0, 1.0, len(V_LEFT)), turn=np.full(len(V_LEFT), 5.0))
+    for term in TERMS.values():
+        value = eval(term.formula, {"__builtins__": {}, "abs": abs}, motion._asdict())
+        np.testing.assert_allclose(term.column(motion), value, atol=EXACT, err_msg=term.name)
+
+
 def test_every_term_has_a_prior_and_is_used() -> None:
     used = {term for model in MODELS.values() for term in model.terms} | set(GYRO_TERMS)
     assert used == set(TERMS)
