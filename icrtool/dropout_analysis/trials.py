@@ -124,7 +124,7 @@ def dropout(
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
-    horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
+    horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
     drive = drive_of(run)
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
@@ -210,11 +210,6 @@ def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     return {model.name: open_loop_errors(drive, model.icrs, ends)[:, 0] for model in models_of(run)}
-
-
-def configured_horizons_m(run: Run) -> tuple[float, ...]:
-    """Return the horizons [m] of the configuration a run was made with."""
-    return run.config.dropout.horizons_m
 
 
 def check_horizons(horizons_m: Iterable[float]) -> Floats:
