@@ -45,7 +45,7 @@ def dropout_report(
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
 ) -> DropoutReport:
-    """Return how far a robot can go without GNSS, with all that ``icrtool dropout-report`` gives.
+    """Return how far a robot can drive without GNSS, with all that ``icrtool dropout-report`` gives.
 
     Parameters
     ----------

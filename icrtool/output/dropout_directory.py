@@ -19,7 +19,6 @@ from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.csv_file import csv_bytes
-from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
@@ -70,11 +69,9 @@ def write_report(
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
-            (partial / "plots").mkdir()
-            with quiet_matplotlib():
-                from icrtool.output.figures.dropout_figures import draw_figures
+            from icrtool.output.figure_catalogue import draw_figures
 
-                draw_figures(report, partial / "plots", plots)
+            draw_figures("report", report, partial / "plots", plots)
         write_tables(report, partial)
     return report
 
