@@ -120,7 +120,7 @@ def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> Compar
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         scores=tuple(scores),
         chosen=wheels.chosen,
-        fits={name: fit.fitted for name, fit in wheels.fits.items()},
+        fits={name: fit.fitted for name, fit in (wheels.fits | (turned.fits if turned else {})).items()},
         best=wheels.recommended,
         width_m=recording.width_m,
         heading=heading,
@@ -190,7 +190,7 @@ def _turned_scores(
     run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
 ) -> Iterator[ModelScore]:  # fmt: skip
     """Yield the models that turn by wheels and a measured heading; a multiplier alone gives no path."""
-    path = _turned_path(run, recording)
+    path = turned_path(run, recording)
     for name in MODELS:
         if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
             continue
@@ -202,8 +202,8 @@ def _turned_scores(
         yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 
-def _turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
-    """Return heading (n,) [rad] and place (n,) [m] by the measured turn rate and the mean track speed."""
+def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
+    """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
     held, last = recording.held_s, len(recording.t_s) - 1
     psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
     moved = held * (run.table.v_left_mps + run.table.v_right_mps) / 2.0
@@ -215,7 +215,7 @@ def _turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
 
 
 def _errors_along(path: tuple[Floats, Complexes], drive: Drive, trials: Trials, icrs: FrozenIcrs) -> Floats:
-    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the path of `_turned_path`.
+    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the path of `turned_path`.
 
     Notes
     -----
