@@ -89,7 +89,7 @@ def change_records(records: list[tuple[int, bytearray]], rng: Random) -> str:
         records.insert(int(rng.integers(len(records) + 1)), (code, bytearray(body)))
         return f"record {code} repeated"
     if code == SCHEMA and kind < 0.7:
-        name = b"sensor_msgs/msg/Imu" if rng.random() < 0.5 else body[6 : 6 + body[2]]
+        name = b"sensor_msgs/msg/Imu" if rng.random() < 0.5 else body[6 : 6 + int.from_bytes(body[2:3], "little")]
         new = DEFINITIONS[int(rng.integers(len(DEFINITIONS)))]
         body[:] = body[:2] + text(bytes(name)) + text(b"ros2msg") + text(new)
     elif code == CHANNEL and kind < 0.7:

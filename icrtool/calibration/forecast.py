@@ -24,6 +24,9 @@ SLOWEST_MPS = 0.02
 
 INVERSIONS = 8
 
+FURTHEST_M, FASTEST_MPS = 1e8, 100.0
+"""Of a point from the origin, which may be that of UTM; of any robot with tracks."""
+
 LONGEST_PATH_M = 100_000.0
 
 
@@ -64,13 +67,14 @@ def forecast_plan(
     DataError
         A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
     """
-    if not (np.isfinite(north_m).all() and np.isfinite(east_m).all()):
-        raise DataError("plan", "a point that is not a number", "give east_m and north_m in metres")
+    if not (np.abs([north_m, east_m]) <= FURTHEST_M).all():
+        raise DataError("plan", f"a point that is no number, or beyond {FURTHEST_M:g} m", "give metres")
     path, line = _resampled(np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64))
     step = np.diff(path)
     speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
-    if not (np.isfinite(speed).all() and np.abs(speed).min() > 0.0):
-        raise DataError("plan", "a speed that is zero or no number", "give speed_mps in m/s, negative in reverse")
+    if not ((np.abs(speed) > 0.0) & (np.abs(speed) <= FASTEST_MPS)).all():
+        why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
+        raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_MPS)
     # a corner of the plan is turned over the steps around it, not on the spot
     width = max(round(calibration.width_m / STEP_M), 1)

@@ -15,6 +15,8 @@ def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
     # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # No figure is shown, and matplotlib cannot be imported where this names no backend.
+    os.environ["MPLBACKEND"] = "agg"
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)

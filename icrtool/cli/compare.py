@@ -81,7 +81,7 @@ def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
     ------
     ConfigError
         There is only one group.
-    LogError
+    RunError
         The table of the batch cannot be read.
     """
     from icrtool.errors import ConfigError

@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from icrtool.config import parse_toml
 from icrtool.errors import ConfigError
@@ -42,6 +45,16 @@ class About:
             group=other.group or self.group,
             tags=tuple(dict.fromkeys((*self.tags, *other.tags))),
         )
+
+
+class _Line(msgspec.Struct, forbid_unknown_fields=True):
+    """A line as it is written."""
+
+    log: Annotated[str, msgspec.Meta(min_length=1)]
+    robot: str = ""
+    config: str = ""
+    group: str = ""
+    tags: list[str] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +98,16 @@ def about(path: Path, entries: Sequence[Entry]) -> About:
     """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
     found = About()
     whole = path.resolve()
+    around = {whole, *whole.parents}
     for entry in entries:
-        if any(whole.is_relative_to(place.resolve()) for place in entry.places):
+        if not around.isdisjoint(map(_resolved, entry.places)):
             found = found.updated(entry.about)
     return found
+
+
+@cache
+def _resolved(place: Path) -> Path:
+    return place.resolve()
 
 
 def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
@@ -112,17 +131,13 @@ def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
 
 
 def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
-    if unknown := set(row) - set(COLUMNS):
-        raise ConfigError(f"{path}: {min(unknown)}", "unknown column", f"a manifest has {', '.join(COLUMNS)}")
-    pattern, tags = row.get("log", ""), row.get("tags", [])
-    texts = [row.get(key, "") for key in ("robot", "config", "group")]
-    if not isinstance(pattern, str) or not pattern or not all(isinstance(text, str) for text in [*texts, *tags]):
-        raise ConfigError(f"{path}: log", "each line needs a log or a pattern, and texts", f"found {dict(row)!r}"[:200])
-    robot, config, group = texts
-    return Entry(
-        _matching(path, pattern),
-        About(robot.strip(), path.parent / config.strip() if config.strip() else None, group.strip(), tuple(tags)),
-    )
+    try:
+        line = msgspec.convert(row, _Line)
+    except msgspec.ValidationError as err:
+        what = f"each line has a log or a pattern, and texts; of {', '.join(COLUMNS)}"
+        raise ConfigError(f"{path}: log", what, str(err)) from err
+    config = path.parent / line.config.strip() if line.config.strip() else None
+    return Entry(_matching(path, line.log), About(line.robot.strip(), config, line.group.strip(), tuple(line.tags)))
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import NamedTuple
 from icrtool.errors import LogError
 from icrtool.fleet.row import as_text
 from icrtool.logs.containers.mcap_file import is_mcap
-from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, storage_files
+from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, natural_order, storage_files
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.ros1_bag import is_ros1_bag
 from icrtool.logs.containers.split_files import NumberedFile, numbered_file, split_files, split_path
@@ -71,7 +70,7 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
     root = common_parent(places)
-    return _named(sorted(found.values(), key=_natural), root)
+    return _named(sorted(found.values(), key=natural_order), root)
 
 
 def joined(found: Mapping[str, Path]) -> dict[str, Path]:
@@ -150,7 +149,7 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     found: dict[str, Path] = {}
     for place in places:
         searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
-        below = {os.path.realpath(path): path for path in sorted(_search(place), key=_natural)} if searched else {}
+        below = {os.path.realpath(path): path for path in sorted(_search(place), key=natural_order)} if searched else {}
         for real, path in (joined(below) or {os.path.realpath(place): place}).items():
             found.setdefault(real, path)
     logs = list(found.values())
@@ -273,9 +272,3 @@ def unique_name(name: str, taken: set[str]) -> str:
 
 def _absolute(path: Path) -> Path:
     return Path(os.path.normpath(path.absolute()))
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort ``drive_10`` after ``drive_9``."""
-    parts = re.split(r"(\d+)", str(path))
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

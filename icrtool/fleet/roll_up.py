@@ -12,11 +12,11 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
-from icrtool.errors import IcrToolError, LogError
+from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.fleet.row import Row
 from icrtool.output.atomic_file import write_file
-from icrtool.output.json_file import FLEET_FILE, json_bytes
+from icrtool.output.json_file import FLEET_FILE, json_bytes, logs_of_fleet
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
@@ -87,19 +87,15 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
 
     Raises
     ------
-    LogError
+    RunError
         The folder does not hold the result of a batch.
     """
-    try:
-        logs = json.loads((directory / FLEET_FILE).read_bytes())["logs"]
-        used = [(str(one["robot"]), str(one["group"]), str(one["run"])) for one in logs if one["status"] != "failed"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
-        raise LogError(directory, f"its {FLEET_FILE} cannot be read", "name the folder of a batch") from err
-    robots = {robot for robot, _, _ in used}
+    logs = logs_of_fleet(directory)
+    robots = {one.robot for one in logs}
     found: dict[str, list[Path]] = {}
-    for robot, group, run in used:
-        name = group if group and len(robots) == 1 else f"{robot} {group}".strip() or directory.name
-        found.setdefault(name, []).append(directory / run)
+    for one in logs:
+        name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
+        found.setdefault(name, []).append(directory / one.run)
     return found
 
 

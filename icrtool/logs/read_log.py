@@ -290,26 +290,20 @@ def _collect(
         for number in np.unique(block.channel).tolist():
             if number not in wanted:
                 continue
-            if number not in collectors:
-                # A definition is compiled when its first message comes: a log may declare any number of topics.
-                collectors[number] = _collector(by_id[number], wanted[number], unread)
-            if (collector := collectors[number]) is not None:
-                collector.feed(block, block.channel == number)
+            try:
+                if number not in collectors:
+                    # A definition is compiled when its first message comes: a log may declare any number of topics.
+                    collectors[number] = collector_for(by_id[number], wanted[number])
+                if (collector := collectors[number]) is not None:
+                    collector.feed(block, block.channel == number)
+            except DefinitionError as err:
+                unread[by_id[number].topic], collectors[number] = str(err), None
         if progress is not None:
             progress(container.share_read())
     tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
     silent = [by_id[number] for number in wanted if number not in collectors]
     tables += [_empty_table(channel) for channel in silent]
     return merge_tables(tables), unread
-
-
-def _collector(channel: Channel, paths: tuple[str, ...], unread: dict[str, str]) -> Collector | None:
-    """Return a collector of a channel's columns; None, with the reason in `unread`, where its definition is refused."""
-    try:
-        return collector_for(channel, paths)
-    except DefinitionError as err:
-        unread[channel.topic] = str(err)
-        return None
 
 
 def _empty_table(channel: Channel) -> TopicTable:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -16,9 +17,13 @@ from icrtool.dropout_analysis.baseline import BaselineReport, BaselineRow
 from icrtool.errors import ConfigError
 from icrtool.kernels.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
-from icrtool.output.json_file import FLEET_FILE
+from icrtool.output.json_file import FLEET_FILE, logs_of_fleet
+from icrtool.records.text import escaped
 
 METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
+
+LARGEST = 1e12
+"""Of a number in a report [m]: beyond it is damage, whose squares overflow."""
 
 ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
 
@@ -70,44 +75,48 @@ def open_baseline(path: Path) -> Baseline:
     ConfigError
         There is none, or one cannot be read.
     """
-    if path.is_file():
-        reports = {str(_document(path)["run"]["log"]): path}
-    elif (path / FLEET_FILE).is_file():
+    if not path.is_file() and (path / FLEET_FILE).is_file():
         return _fleet_baseline(path)
-    else:
-        reports = {}
-        for file in _report_files(path):
-            log = str(_document(file)["run"]["log"])
-            if log in reports:
-                raise ConfigError(
-                    f"--baseline {path}", f"two reports of logs named {log}", f"{reports[log]} and {file}"
-                )
-            reports[log] = file
+    reports: dict[str, Path] = {}
+    files: dict[str, tuple[str, ...]] = {}
+    for file in [path] if path.is_file() else _report_files(path):
+        one = read_report(file)
+        if one.log in reports:
+            why = f"two reports of logs named {one.log}"
+            raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
+        reports[one.log], files[one.log] = file, one.sha256
     if not reports:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
-    files = {
-        log: tuple(str(one["sha256"]) for one in _document(file)["run"]["inputs"]) for log, file in reports.items()
-    }
     digest = sha256(b"".join(file.read_bytes() for file in reports.values())).hexdigest()
     return Baseline(path, reports, files, digest)
 
 
-def read_report(path: Path, log: str) -> BaselineReport:
+def read_report(path: Path, log: str = "") -> BaselineReport:
     """Read a report.json as a baseline.
+
+    Parameters
+    ----------
+    log : its name in a batch; default: that in the report
 
     Raises
     ------
     ConfigError
         It is not a dropout report.
     """
-    document = _document(path)
     try:
+        document = json.loads(path.read_bytes())
         run = document["run"]
-        rows = dict(_rows(document))
+        if not document["schema"].startswith(SCHEMA_FAMILY):
+            raise ValueError(document["schema"])
         content = tuple(str(one["sha256"]) for one in run["inputs"])
-        return BaselineReport(log, str(path), content, str(document["tool_version"]), dict(run["config"]), rows)
-    except (LookupError, TypeError, ValueError, AttributeError) as err:
-        raise ConfigError(f"--baseline {path}", "not a whole dropout report", "make it again") from err
+        return BaselineReport(
+            escaped(log or run["log"]), str(path), content, escaped(document["tool_version"]), dict(run["config"]),
+            dict(_rows(document)),
+        )  # fmt: skip
+    except OSError as err:
+        raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as err:
+        raise ConfigError(f"--baseline {path}", "not a whole dropout report", ADVICE) from err
 
 
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:
@@ -126,29 +135,30 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], Base
 
 def _sums(one: Mapping[str, Any]) -> BlockSums:
     trials, p50, p95 = (np.array(one[name], np.int64) for name in ("trials", "above_p50", "above_p95"))
-    errors = np.array(one["errors_m"], np.float64)
-    if not trials.shape == p50.shape == p95.shape == errors.shape or errors.ndim != 1 or len(errors) < 2:
+    errors = np.array([_number(error) for error in one["errors_m"]])
+    if not trials.shape == p50.shape == p95.shape == errors.shape or len(errors) < 2:
         raise ValueError("blocks of unequal number")
-    return BlockSums(trials, errors, p50, p95, float(one["p50_slope_m"]), float(one["p95_slope_m"]))
+    if min(column.min() for column in (trials, p50, p95)) < 0 or trials.max() > LARGEST:
+        raise ValueError("a number of trials")
+    return BlockSums(trials, errors, p50, p95, _number(one["p50_slope_m"]), _number(one["p95_slope_m"]))
 
 
 def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+    number = math.nan if value is None else float(value)
+    if abs(number) > LARGEST:
+        raise ValueError("a length")
+    return number
 
 
 def _fleet_baseline(path: Path) -> Baseline:
     """Return the baseline of a batch: its fleet.json names logs, content and runs."""
-    try:
-        content = (path / FLEET_FILE).read_bytes()
-        logs = [one for one in json.loads(content)["logs"] if one["status"] != "failed"]
-        reports = {str(one["log"]): path / one["run"] / DROPOUT_DIRECTORY / REPORT_FILE for one in logs}
-        files = {str(one["log"]): tuple(str(file["sha256"]) for file in one["inputs"]) for one in logs}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
-        raise ConfigError(f"--baseline {path}", f"its {FLEET_FILE} cannot be read", ADVICE) from err
-    present = {log: file for log, file in reports.items() if file.is_file()}
+    logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
+    present = {log: found for log, found in logs.items() if os.path.isfile(found[0])}  # noqa: PTH113 - any text may be a path here
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
-    return Baseline(path, present, {log: files[log] for log in present}, sha256(content).hexdigest())
+    files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+    digest = sha256((path / FLEET_FILE).read_bytes()).hexdigest()
+    return Baseline(path, {log: file for log, (file, _) in present.items()}, files, digest)
 
 
 def _report_files(path: Path) -> list[Path]:
@@ -157,14 +167,3 @@ def _report_files(path: Path) -> list[Path]:
     if (path / REPORT_FILE).is_file():
         return [path / REPORT_FILE]
     return sorted(path.glob(f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"))
-
-
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_bytes())
-        schema = document["schema"]
-        if isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY) and document["run"]["log"]:
-            return dict(document)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as err:
-        raise ConfigError(f"--baseline {path}", "cannot be read", ADVICE) from err
-    raise ConfigError(f"--baseline {path}", "not a dropout report", ADVICE)

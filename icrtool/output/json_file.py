@@ -7,11 +7,50 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from icrtool.errors import RunError
 from icrtool.records.plain_data import plain
 from icrtool.records.text import LogText
 
 FLEET_FILE = "fleet.json"
 """What a batch found, in its folder."""
+
+
+class InputFile(msgspec.Struct, frozen=True):
+    """A file that was read: what identifies its content."""
+
+    sha256: str
+
+
+class FleetLog(msgspec.Struct, frozen=True):
+    """What fleet.json holds of a log, as others need it; `run`: its directory below that of the batch."""
+
+    log: str
+    run: str
+    status: str
+    robot: str
+    group: str
+    inputs: list[InputFile]
+
+
+class _Fleet(msgspec.Struct, frozen=True):
+    logs: list[FleetLog]
+
+
+def logs_of_fleet(directory: Path) -> list[FleetLog]:
+    """Return the logs of a batch that could be used.
+
+    Raises
+    ------
+    RunError
+        The folder does not hold the result of a batch.
+    """
+    try:
+        found = msgspec.json.decode((directory / FLEET_FILE).read_bytes(), type=_Fleet).logs
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as err:
+        raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
+    return [one for one in found if one.status != "failed"]
 
 
 def schema_of(file: Path) -> str:

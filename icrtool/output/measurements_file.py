@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, cast
-from zipfile import BadZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
-from icrtool.records.tables import States
+from icrtool.records.tables import LARGEST, States
 
 MEASUREMENTS_FILE = "measurements.npz"
 
@@ -83,8 +84,10 @@ def read_measurements(
     facts, events = document["filter"], cast("list[dict[str, Any]]", document["events"])
     start = facts["icr_start"]
     try:
-        with np.load(path) as stored:
-            columns = {name: stored[name] for name in stored.files}
+        with ZipFile(path) as stored:
+            if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
+                raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
+            columns = {member.filename.removesuffix(".npy"): _array(stored, member) for member in stored.infolist()}
         before = _columns(columns, "wheels", WHEEL_COLUMNS)
         stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
@@ -110,9 +113,14 @@ def read_measurements(
             _outcome(columns, group, stamps_ns, table)
             for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns))
         ]
-    except (BadZipFile, KeyError, EOFError) as err:
+    except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     return sensors, outcomes[0], outcomes[1]
+
+
+def _array(stored: ZipFile, member: ZipInfo) -> NDArray[Any]:
+    with stored.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def spans_of(pairs: object) -> Ints:
@@ -141,6 +149,8 @@ def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[A
     column, kind = columns[key], KINDS.get(name, np.float64)
     if column.ndim != 1 or column.dtype != kind:
         raise ValueError(f"{key} is no column of {np.dtype(kind)}")
+    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST).any():
+        raise ValueError(f"{key} holds a number beyond {LARGEST:g}")
     return column
 
 

@@ -16,6 +16,7 @@ import orjson
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.logs.containers.decompress import LARGEST_RATIO
 from icrtool.records.tables import States
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ CHUNKS_A_PIECE = 16
 
 PARQUET_ROWS = 1 << 17
 """Rows of a row group: a group is held in memory until it is written."""
+
+FREE_BYTES = 1 << 29
+"""States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
 
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
@@ -109,6 +113,9 @@ def read_states(path: Path, states: StatesFormat) -> States:
         if states == "parquet":
             import pyarrow.parquet as pq
 
+            numbers = pq.read_metadata(path).num_rows * len(COLUMNS)
+            if 8 * numbers > FREE_BYTES + LARGEST_RATIO * path.stat().st_size:
+                raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
             stored = pq.read_table(path, columns=list(COLUMNS))
         else:
             import pyarrow.csv as pc
@@ -121,7 +128,7 @@ def read_states(path: Path, states: StatesFormat) -> States:
         del stored
         # Each column's memory goes back before the next is copied.
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as err:
+    except pa.ArrowException as err:
         raise StatesFileError(" ".join(str(err).split())) from err
 
 

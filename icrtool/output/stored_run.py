@@ -172,7 +172,7 @@ def _config(document: Mapping[str, Any], directory: Path) -> Config:
 def _read_document(directory: Path) -> dict[str, Any]:
     try:
         raw = (directory / RUN_FILE).read_bytes()
-    except OSError as err:
+    except (OSError, ValueError) as err:
         why = "not a run directory" if directory.is_dir() else "no such run directory"
         raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
     try:

@@ -1,7 +1,11 @@
-"""Ctrl-C and SIGTERM at any moment: a command ends within a second, and leaves no process and no partial file."""
+"""Ctrl-C and SIGTERM at any moment: a command ends within a second, and leaves no process and no partial file.
+
+Killed, it leaves the old or the new result.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import shutil
@@ -16,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+import icrtool
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
@@ -137,3 +143,66 @@ def test_each_command_ends_at_once(places: dict[str, Path], tmp_path: Path) -> N
 @pytest.mark.parametrize("name", COMMANDS)
 def test_at_many_moments(places: dict[str, Path], tmp_path: Path, name: str) -> None:
     check([name], places, tmp_path, 40, 8.0)
+
+
+SHORT = LOG.with_name("tracked_curved.bag")
+TRACKED = ("--robot", "pentzer-tracked", "--plots", "none", "-q")
+REPLACING = {
+    "fit": ("fit", "log.bag", *TRACKED, "-o", "run", "--overwrite"),
+    "dropout-report": ("dropout-report", "run", "--plots", "none", "-q"),
+    "calibrate": ("calibrate", "run", "-o", "calibration.json", "-q"),
+    "batch": ("batch", "logs", *TRACKED, "-o", "season", "-j", "2", "--redo"),
+}
+KILLS = 25
+
+
+def start(arguments: Sequence[str], work: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-P", "-m", "icrtool", *arguments]
+    environment = {**os.environ, "TMPDIR": str(work)}
+    return subprocess.Popen(
+        command, cwd=work, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+
+
+def results(work: Path) -> set[str]:
+    """Open all that was written; return the names of the results."""
+    visible = [path for path in work.rglob("*") if not any(".partial" in part for part in path.parts)]
+    for file in visible:
+        if file.name == "run.json":
+            icrtool.open_run(file.parent)
+        elif file.name == ".icrtool-files":
+            assert all((file.parent / name).exists() for name in json.loads(file.read_bytes())["files"])
+        elif file.suffix == ".json":
+            json.loads(file.read_bytes())
+    return {
+        file.relative_to(work).as_posix() for file in visible if file.suffix == ".json" and "rows" not in file.parts
+    }
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("name", REPLACING)
+def test_killed_at_any_moment_the_old_or_the_new_result_is_there(tmp_path: Path, name: str) -> None:
+    rng = np.random.default_rng(1)
+    (tmp_path / "logs").mkdir()
+    for place in ("log.bag", "logs/one.bag", "logs/two.bag"):
+        shutil.copy(SHORT, tmp_path / place)
+    assert start(REPLACING["fit"], tmp_path).wait() == 0
+    began = time.monotonic()
+    assert start(REPLACING[name], tmp_path).wait() == 0
+    took_s = time.monotonic() - began
+    before = results(tmp_path)
+    killed = 0
+    for number in range(KILLS):
+        process = start(REPLACING[name], tmp_path)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(took_s * rng.uniform(0.1, 1.1))
+        killed += process.poll() is None
+        process.send_signal((signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT)[number % 4])
+        process.wait(60)
+        assert results(tmp_path) >= before
+        if number % 5 == 4:
+            assert start(REPLACING[name], tmp_path).wait() == 0
+            assert results(tmp_path) == before
+            assert [path for path in tmp_path.rglob("*") if ".partial" in path.name] == [], "leftovers stay"
+    assert killed > KILLS / 2
+    print(f"{name}: {killed} of {KILLS} killed")

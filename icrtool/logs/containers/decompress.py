@@ -4,107 +4,107 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from icrtool.logs.containers.channel import Block
 
-LARGEST_CHUNK_BYTES = 1 << 28
-"""A quarter of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; a chunk that states more is damaged."""
+Buffer = bytes | bytearray
+
+LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; two are in memory at a time."""
 
 LARGEST_RATIO = 100
-"""A log may take this many times its size when decompressed, and one chunk of the largest size more."""
+"""A log may take this many times its size when decompressed, and `FREE_BYTES` more.
+
+Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
+"""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_BLOCK_BYTES = 1 << 24
-_UNKNOWN_SIZE_BYTES = 1 << 24
-
-
-class Inflation:
-    """Counts the bytes decompressed from a log, and limits them to a multiple of their size in the file.
-
-    Recorded chunks shrink by a factor of 2 to 20. A crafted chunk can grow by 1,000 times; a thousand such chunks would
-    take minutes.
-    """
-
-    def __init__(self) -> None:
-        self._left = LARGEST_CHUNK_BYTES
-
-    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
-        """Decompress a chunk as `decompress` does.
-
-        Raises
-        ------
-        DecompressionError
-            Damaged data; or the chunks before this one inflated more than `LARGEST_RATIO` times and one chunk.
-        """
-        self.check()
-        out = decompress(data, compression, size, partial=partial)
-        self.add(len(data), len(out))
-        return out
-
-    def check(self) -> None:
-        """Refuse to decompress more, where what was decompressed is too much.
-
-        Raises
-        ------
-        DecompressionError
-            As `decompress`.
-        """
-        if self._left < 0:
-            raise DecompressionError(f"the log inflates more than {LARGEST_RATIO} times")
-
-    def add(self, packed: int, unpacked: int) -> None:
-        """Count what was decompressed [bytes]."""
-        self._left += LARGEST_RATIO * packed - unpacked
+_PIECE_BYTES = 1 << 24
+"""Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
 
 
 class DecompressionError(Exception):
     """A chunk that cannot be decompressed; `args[0]` is the reason."""
 
 
-def decompress(data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> bytes:
-    """Decompress a chunk.
+class Inflation:
+    """Decompresses the chunks of a log, and limits them all to a multiple of their size in the file."""
 
-    Parameters
-    ----------
-    compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : decompressed size stated in the log [bytes]
-    partial : the data is cut off; return the part that can be decompressed
+    def __init__(self) -> None:
+        self._left = FREE_BYTES
 
-    Raises
-    ------
-    DecompressionError
-        Damaged data, a size other than `size`, or an unknown compression.
-    """
-    if compression in ("", "none"):
-        return bytes(data)
-    if size > LARGEST_CHUNK_BYTES:
-        raise DecompressionError(f"it claims {size} bytes")
-    decoder = _DECODERS.get(compression)
-    if decoder is None:
-        raise DecompressionError(f"compression {compression!r} is not known")
-    try:
-        out = decoder(data, size, partial)
-    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
-        raise DecompressionError(str(err) or "not enough memory") from err
-    if len(out) != size and not partial:
-        raise DecompressionError(f"{len(out)} bytes instead of {size}")
+    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> Buffer:
+        """Decompress a chunk.
+
+        Parameters
+        ----------
+        compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
+        size : decompressed size stated in the log [bytes]
+        partial : the data is cut off; return the part that can be decompressed
+
+        Raises
+        ------
+        DecompressionError
+            Damaged data, a size other than `size`, an unknown compression, or more than the log may take.
+        """
+        if compression in ("", "none"):
+            self.count(len(data), len(data))
+            return bytes(data)
+        decoder = _DECODERS.get(compression)
+        if decoder is None:
+            raise DecompressionError(f"compression {compression!r} is not known")
+        self.count(len(data), size)
+        try:
+            out = decoder(data, size, partial)
+        except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
+            raise DecompressionError(str(err) or "not enough memory") from err
+        if len(out) != size and not partial:
+            raise DecompressionError(f"{len(out)} bytes instead of {size}")
+        return out
+
+    def count(self, packed: int, unpacked: int) -> None:
+        """Count what is decompressed [bytes].
+
+        Raises
+        ------
+        DecompressionError
+            It is more than one chunk, or the log, may take.
+        """
+        if unpacked > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {unpacked} bytes")
+        left = self._left + LARGEST_RATIO * packed - unpacked
+        if left < 0:
+            raise DecompressionError(
+                f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
+            )
+        self._left = left
+
+
+def _lz4(data: bytes | memoryview, size: int, _: bool) -> Buffer:
+    import lz4.frame
+
+    return _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
+
+
+def _bz2(data: bytes | memoryview, size: int, _: bool) -> Buffer:
+    return _in_pieces(bz2.BZ2Decompressor(), data, size)
+
+
+def _in_pieces(decoder: Any, data: bytes | memoryview, size: int) -> Buffer:  # noqa: ANN401 - of two libraries
+    """Decompress up to `size` bytes and one more, a piece at a time."""
+    out = decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES))
+    if len(out) < _PIECE_BYTES:
+        return bytes(out)
+    out = bytearray(out)
+    while not decoder.eof and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES))):
+        out += piece
     return out
 
 
-def _lz4(data: bytes | memoryview, size: int, _: bool) -> bytes:
-    import lz4.frame
-
-    decoder = lz4.frame.LZ4FrameDecompressor()
-    return bytes(decoder.decompress(data, max_length=size + 1))
-
-
-def _bz2(data: bytes | memoryview, size: int, _: bool) -> bytes:
-    return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
-
-
-def _zstd(data: bytes | memoryview, size: int, partial: bool) -> bytes:
+def _zstd(data: bytes | memoryview, size: int, partial: bool) -> Buffer:
     import zstandard
 
     decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
@@ -145,7 +145,7 @@ def unpack_messages(
             rows.append(row)
             messages.append(message)
             held += len(message)
-            if held > _BLOCK_BYTES:
+            if held > _PIECE_BYTES:
                 yield _repacked(block, rows, messages)
                 rows, messages, held = [], [], 0
         yield _repacked(block, rows, messages)
@@ -167,13 +167,13 @@ def _unpack(data: bytes, compression: str, inflation: Inflation) -> bytes:
 
     if compression != "zstd":
         raise DecompressionError(f"compression {compression!r} is not known")
-    inflation.check()
     try:
         size = zstandard.frame_content_size(data)
-        if size > LARGEST_CHUNK_BYTES:
-            raise DecompressionError(f"one claims {size} bytes")
-        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=_UNKNOWN_SIZE_BYTES if size < 0 else 0)
+        if size >= 0:
+            inflation.count(len(data), size)
+        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=_PIECE_BYTES)
+        if size < 0:
+            inflation.count(len(data), len(out))
     except (zstandard.ZstdError, MemoryError) as err:
         raise DecompressionError(str(err)) from err
-    inflation.add(len(data), len(out))
     return out

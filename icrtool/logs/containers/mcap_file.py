@@ -17,6 +17,7 @@ from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type
 from icrtool.logs.containers.chunked_file import ChunkedFile
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
+    Buffer,
     DecompressionError,
     Inflation,
     unpack_messages,
@@ -382,7 +383,7 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     return record
 
 
-def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> bytes:
+def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Buffer:
     """Return the records of a chunk record's content, decompressed and checked against its checksum.
 
     Parameters

@@ -36,8 +36,8 @@ def storage_files(directory: Path) -> list[Path]:
     LogError
         There is none, or there are recordings of several kinds: the user must name one.
     """
-    found = sorted((file for file in directory.iterdir() if _is_storage(file)), key=_natural_key)
-    others = sorted((entry for entry in directory.iterdir() if _is_other_log(entry)), key=_natural_key)
+    found = sorted((file for file in directory.iterdir() if _is_storage(file)), key=natural_order)
+    others = sorted((entry for entry in directory.iterdir() if _is_other_log(entry)), key=natural_order)
     kinds = {match[1] for file in found if (match := STORAGE.search(file.name))}
     if not found and len(others) == 1:
         raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
@@ -93,5 +93,6 @@ def _is_other_log(entry: Path) -> bool:
     return entry.suffix == ".bag" and entry.is_file()
 
 
-def _natural_key(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts ``drive_10`` after ``drive_9``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(path))]

@@ -15,12 +15,12 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, Problems, ros_type_name, with_possible_times
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, ZSTD_MAGIC, unpack_messages
+from icrtool.logs.containers.decompress import ZSTD_MAGIC, unpack_messages
 from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
-_FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "sum"})
+_FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count"})
 """The tables, columns and functions that our queries use; SQLite refuses everything else."""
 
 _MOST_TOPICS = 1 << 17
@@ -29,13 +29,15 @@ _STEPS, _LEAST_STEPS, _STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
 more per byte of the file. The pages of a damaged table may refer to one another without end."""
 
 _FIRST_ROWS, _MOST_ROWS = 64, 4096
-_BLOCK_BYTES = 1 << 24
+_BLOCK_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
+"""Of several messages together, and of one: those that icrtool uses have some kilobytes."""
+
 _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The errors of sqlite3; the latter where its message contains a damaged name."""
 
 Row = tuple[Any, Any, Any, Any, int, int]
-"""Topic ids, log times [ns], sizes, messages; last row number, count of messages that are bytes.
+"""Topic ids, log times [ns], sizes, messages; last row number, count of sound messages.
 
 SQLite does not enforce the type of a column.
 """
@@ -90,19 +92,18 @@ class SqliteBag:
 
     def begin_ns(self) -> int | None:
         """Return the time of the first message, None where it cannot be read."""
-        try:
-            begin = self._query("SELECT min(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
-        except _DAMAGE:
-            return None
-        return begin if isinstance(begin, int) else None
+        return self._time("min")
 
     def end_ns(self) -> int | None:
         """Return the time of the last message, None where it cannot be read."""
+        return self._time("max")
+
+    def _time(self, which: str) -> int | None:
         try:
-            end = self._query("SELECT max(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]
+            time = self._query(f"SELECT {which}(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]  # noqa: S608
         except _DAMAGE:
             return None
-        return end if isinstance(end, int) else None
+        return time if isinstance(time, int) else None
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
@@ -138,7 +139,7 @@ class SqliteBag:
     def _open(self, mode: str) -> sqlite3.Connection:
         name = quote(os.fsencode(self._path.resolve()))
         database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK_BYTES)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * _BLOCK_BYTES)
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         return database
 
@@ -148,7 +149,7 @@ class SqliteBag:
         Raises
         ------
         sqlite3.DatabaseError
-            A table of a recorder is a view, a virtual table, or has computed columns.
+            A table of a recorder is a view, a virtual table, or has computed columns; or texts are not UTF-8.
         """
         query = "SELECT name, type FROM pragma_table_list WHERE schema = 'main' AND NOT wr"
         kinds = {name: kind for name, kind in self._database.execute(query).fetchmany(_MOST_TOPICS) if name in _TABLES}
@@ -156,6 +157,8 @@ class SqliteBag:
             columns = self._database.execute(f"PRAGMA table_xinfo({name})").fetchall()
             if kind != "table" or any(column[-1] for column in columns):
                 raise sqlite3.DatabaseError(f"{name} is not a plain table")
+        if (encoding := self._database.execute("PRAGMA encoding").fetchone()[0]) != "UTF-8":
+            raise sqlite3.DatabaseError(f"its texts are {encoding}")  # messages are joined as texts
         self._tables = frozenset(kinds)
         self._database.set_authorizer(_allow)
         self._database.set_progress_handler(self._look_up, _STEPS)
@@ -260,7 +263,9 @@ class SqliteBag:
                 continue
             self._last_row = after = max(after + 1, last)
             if block is None:
-                self.problems.add("rows without a time or a message left out")
+                self.problems.add(
+                    f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out"
+                )
                 continue
             yield with_possible_times(block, self.problems)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
@@ -302,18 +307,23 @@ class SqliteBag:
             within = (
                 f"AND (timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns} OR topic_id IN ({_numbers(cut.whole)}))"
             )
+        # The type and the length of a message are known without reading it.
+        sound = f"typeof(data) = 'blob' AND length(data) <= {_LARGEST_MESSAGE_BYTES}"
         rows = (
-            "SELECT topic_id AS topic, timestamp AS time, length(data) AS size, data, rowid AS number, "  # noqa: S608
-            "typeof(data) = 'blob' AS sound FROM messages "
-            f"WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) {within} AND rowid > ? ORDER BY rowid LIMIT ?"
+            f"SELECT topic_id AS topic, timestamp AS time, CASE WHEN {sound} THEN data END AS sound, rowid AS number "  # noqa: S608
+            f"FROM messages WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) {within} AND rowid > ? "
+            "ORDER BY rowid LIMIT ?"
         )
         joined = (
-            "SELECT group_concat(topic), group_concat(time), group_concat(size), CAST(group_concat(data, '') AS BLOB), "  # noqa: S608
-            f"max(number), sum(sound) FROM ({rows})"
+            "SELECT group_concat(topic), group_concat(time), group_concat(length(sound)), "  # noqa: S608
+            f"CAST(group_concat(sound, '') AS BLOB), max(number), count(sound) FROM ({rows})"
         )
 
         def batch(after: int, count: int) -> tuple[Block | None, int | None]:
             row = self._query(joined if count > 1 else rows, (after, count)).fetchone()
+            if row is not None and count == 1:
+                topic, time, data, number = row
+                row = (topic, time, len(data or b""), data, number, 1)
             return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
 
         return batch
@@ -333,6 +343,8 @@ def _allow(action: int, first: str | None, second: str | None, _: str | None, vi
 def _packed(row: Row) -> Block | None:
     """Return the messages of a joined row, None where some of them are not bytes or have no time."""
     *texts, data, _, count = row
+    if data is None:
+        return None
     try:
         topics, times, sizes = (np.fromstring(str(text), np.int64, sep=",") for text in texts)
     except ValueError:

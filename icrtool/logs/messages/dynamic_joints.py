@@ -14,17 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
-from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables
+from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables, set_back
 from icrtool.records.text import LogText
 
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
 MOST_JOINTS = 100
 MOST_INTERFACES = 32
 """A message with more joints is treated as damaged; of more interfaces per joint only the first ones are read."""
+
+MOST_LAYOUTS = 16
+"""Different numbers of joints in the messages of a topic; each takes about 0.1 s. Messages with others are not read."""
 
 _LISTS = "interface_values"
 _JOINTS = "number of joints"
@@ -65,6 +69,7 @@ class DynamicJointCollector:
         self._definitions, self._source = definitions_of(channel)
         self._collectors: dict[int, TopicCollector] = {}
         self._tables: list[TopicTable] = []
+        self._times: list[Ints] = []
         self._unreadable = 0
         layout = self._collector(1).layout
         kinds = {path: slot.kind for path, slot in layout.slots.items()}
@@ -78,11 +83,15 @@ class DynamicJointCollector:
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
         """Add the chosen messages of a block."""
         places = np.flatnonzero(chosen)
+        self._times.append(block.log_time_ns[places])
         table, readable = decode_messages(self._counter, block.data, block.start[places], block.end[places])
         joints = self._counter.numbers(table, _JOINTS)
         readable &= joints <= MOST_JOINTS
         self._unreadable += len(readable) - int(np.count_nonzero(readable))
-        for number in np.unique(joints[readable]):
+        for number, count in zip(*np.unique(joints[readable], return_counts=True), strict=True):
+            if int(number) not in self._collectors and len(self._collectors) > MOST_LAYOUTS:
+                self._unreadable += int(count)
+                continue
             alike = np.zeros(len(chosen), np.bool_)
             alike[places[readable & (joints == number)]] = True
             collector = self._collector(int(number))
@@ -94,7 +103,8 @@ class DynamicJointCollector:
         """Return what was gathered, sorted by log time."""
         topic, message_type = self._channel.topic, self._channel.message_type
         nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
-        return merge_tables([nothing, *self._tables])[0]
+        merged = merge_tables([nothing, *self._tables])[0]
+        return replace(merged, set_back=set_back(np.concatenate(self._times or [nothing.log_time_ns])))
 
     def _collector(self, joints: int) -> TopicCollector:
         if joints not in self._collectors:

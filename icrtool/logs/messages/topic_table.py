@@ -14,6 +14,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_into, empty_table
 from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
@@ -23,11 +24,11 @@ _LARGEST_CAPACITY = 256
 _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
-_FIRST_ROWS = 64
-"""Rows of a topic's first table; the next ones have twice as many: a log may hold thousands of topics."""
+_FIRST_ROWS, _FIRST_NUMBERS = 64, 4096
+"""Of a topic's first table, at most; the next ones have twice as many rows: a log may hold thousands of topics."""
 
-_MOST_EXPECTED = 1 << 22
-"""Numbers of a column that memory is set aside for on the log's word alone."""
+MOST_TEXTS = 1 << 16
+"""Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
 
 _LARGEST_TABLE = 1 << 22
 _MOST_BYTES_AT_ONCE = 1 << 24
@@ -82,8 +83,13 @@ class TopicTable:
         return len(self.log_time_ns)
 
     def find(self, *paths: str) -> NDArray[Any] | None:
-        """Return the first of these columns that the type has: drivers spell a field ``hAcc`` or ``h_acc``."""
-        return next((self.columns[path] for path in paths if path in self.columns), None)
+        """Return the first of these columns of numbers that the type has: drivers spell ``hAcc`` or ``h_acc``."""
+        return next((self.columns[path] for path in paths if path in self.columns and path not in self.texts), None)
+
+    def integers(self, *paths: str) -> Ints | None:
+        """Return what `find` does; None where the log's own definition has no whole numbers there."""
+        values = self.find(*paths)
+        return values if values is not None and values.dtype.kind == "i" else None
 
     def column(self, *paths: str) -> NDArray[Any]:
         """Return the first of these columns of numbers that the type has.
@@ -93,7 +99,7 @@ class TopicTable:
         DefinitionError
             The type, as the log defines it, has none of them.
         """
-        values = self.find(*(path for path in paths if path not in self.texts))
+        values = self.find(*paths)
         if values is None:
             raise DefinitionError(self.topic, f"its {self.message_type} has no numbers {' or '.join(paths)}")
         return values
@@ -150,55 +156,6 @@ class _Rows:
         )
 
 
-class _Column:
-    """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
-
-    Parameters
-    ----------
-    lacking : what integers are where a row has fewer elements than others; floats are NaN there
-    """
-
-    def __init__(self, lacking: int) -> None:
-        self._lacking = lacking
-        self._rows = 0
-        self._values: NDArray[Any] = np.empty(0, np.int64)
-
-    def add(self, part: NDArray[Any], expected: int) -> None:
-        """Add rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
-        before, held = self._rows, self._values
-        self._rows += len(part)
-        one = _single_row(part)
-        if before == 0:
-            self._values = part if one is None else one
-        elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
-            width = max(part.shape[1:], held.shape[1:])
-            if len(held) < self._rows or width > held.shape[1:]:
-                likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
-                self._values = np.empty((*width, max(2 * before, self._rows, likely)), held.dtype).T
-                self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
-            self._put(before, part)
-
-    def _put(self, begin: int, part: NDArray[Any]) -> None:
-        rows = self._values[begin : begin + len(part)]
-        if part.ndim == 2 and part.shape[1] < rows.shape[1]:
-            rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
-            rows = rows[:, : part.shape[1]]
-        rows[...] = part
-
-    def taken(self) -> NDArray[Any]:
-        """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
-        values = self._values
-        return values[: self._rows] if len(values) > 1 else np.broadcast_to(values, (self._rows, *values.shape[1:]))
-
-
-def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
-    """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
-    bits = rows.view(np.int64)
-    if len(rows) == 0 or np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]):
-        return None
-    return rows[:1].copy()
-
-
 @dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
@@ -217,8 +174,8 @@ class TopicCollector:
     _layout: Layout | None = None
     _source: str = ""
     _rows: _Rows = field(default_factory=_Rows)
-    _times: _Column = field(default_factory=lambda: _Column(0))
-    _columns: dict[str, _Column] = field(default_factory=dict)
+    _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
+    _columns: dict[str, GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
     _unreadable: int = 0
 
@@ -243,7 +200,13 @@ class TopicCollector:
         return self._layout
 
     def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
-        """Add the chosen messages of a block."""
+        """Add the chosen messages of a block.
+
+        Raises
+        ------
+        DefinitionError
+            They take too many columns, or have too many different texts.
+        """
         start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
         for rows in _pieces(end - start, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1)):
             self._feed(block, start[rows], end[rows], times[rows])
@@ -276,21 +239,25 @@ class TopicCollector:
 
     def _more_rows(self) -> int:
         """Return the rows of the next table: twice those of the present one, within bounds."""
-        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1))
-        return min(max(2 * len(self._rows.table), _FIRST_ROWS), most)
+        columns = max(self.layout.columns, 1)
+        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // columns, 1))
+        return min(max(2 * len(self._rows.table), min(_FIRST_ROWS, _FIRST_NUMBERS // columns), 1), most)
 
     def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
         """Learn the texts of a text field that are in some rows and were not seen before."""
         slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
         counts = self.layout.counts(new, path)
-        for i in range(min(slot.repeat, int(counts.max(initial=0)))):
-            entries = new[counts > i, slot.column + i * slot.stride :]
-            codes, first = np.unique(entries[:, 2], return_index=True)
-            for code, row in zip(codes.tolist(), first.tolist(), strict=True):
-                if code not in texts:
-                    place, length = int(entries[row, 0]), int(entries[row, 1])
-                    raw = block.data[place : place + length].tobytes()
-                    texts[code] = LogText(raw.decode("utf-8", "replace"))
+        repeat = min(slot.repeat, int(counts.max(initial=0)))
+        held = np.arange(repeat)[:, None] < counts
+        fields = new[:, slot.column : slot.column + (repeat - 1) * slot.stride + 3].T
+        places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
+        _, first = np.unique(codes, return_index=True)
+        for i in np.sort(first).tolist():
+            if (code := int(codes[i])) not in texts:
+                raw = block.data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
+                texts[code] = LogText(raw.decode("utf-8", "replace"))
+        if len(texts) > MOST_TEXTS:
+            raise DefinitionError(self.channel.topic, f"its {path} has over {MOST_TEXTS} different texts", "not read")
 
     def _settle(self) -> None:
         """Turn the filled rows into columns, and free the rows."""
@@ -306,7 +273,7 @@ class TopicCollector:
         for path, slot in self.layout.slots.items():
             is_text = slot.kind == "string"
             values = (self._text_numbers if is_text else self.layout.numbers)(table, path)
-            self._columns.setdefault(path, _Column(-1 if is_text else 0)).add(values, expected)
+            self._columns.setdefault(path, GrowingColumn(-1 if is_text else 0)).add(values, expected)
         rows.filled = 0
 
     def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
@@ -330,8 +297,9 @@ class TopicCollector:
         """Return what was gathered since the last call, sorted by log time."""
         self._settle()
         times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
-        self._times, self._columns, self._unreadable = _Column(0), {}, 0
-        order = np.argsort(times, kind="stable") if np.any(np.diff(times) < 0) else None
+        self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
+        back = set_back(times)
+        order = np.argsort(times, kind="stable") if back.step_ns > 0 else None
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path in [*gathered]:
@@ -347,13 +315,16 @@ class TopicCollector:
             texts,
             unreadable,
             self._source,
-            NOT_SET_BACK if order is None else _set_back(times, order),
+            back,
         )
 
 
-def _set_back(times: Ints, order: Ints) -> SetBack:
-    """Return how stored log times (n,) go back, and what sorting by `order` (n,) does to the stretches between."""
+def set_back(times: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting them does to the stretches between."""
     steps = np.diff(times)
+    if not (steps < 0).any():
+        return NOT_SET_BACK
+    order = np.argsort(times, kind="stable")
     stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
     return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))

@@ -34,10 +34,9 @@ def class_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -
 
     Many drivers of NavSatFix write 0 for every fix: a log without a single GBAS (2) states no class.
     """
-    values = table.find("status.status")
-    if values is None:
+    status = table.integers("status.status")
+    if status is None:
         return None
-    status = values.astype(np.int64)
     if codes is None:
         if not (status == GBAS).any():
             return None
@@ -63,8 +62,8 @@ def class_by_type(table: TopicTable, path: str) -> Bytes | None:
         codes, texts = table.words(path)
         by_word = [_of_word(text) for text in texts]
         return np.array([*by_word, NOT_STATED], np.uint8)[codes]
-    values = table.find(path)
-    return None if values is None else _looked_up(values.astype(np.int64), NOVATEL_TYPES, OTHER_FIX)
+    values = table.integers(path)
+    return None if values is None else _looked_up(values, NOVATEL_TYPES, OTHER_FIX)
 
 
 def _of_word(text: str) -> int:

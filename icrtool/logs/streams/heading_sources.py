@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.orientation import nose_yaw
@@ -170,7 +171,9 @@ def _azimuth(table: TopicTable) -> HeadingSource:
 
 def _relposned(table: TopicTable) -> HeadingSource:
     """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED9 (or the older NavRELPOSNED)."""
-    flags = table.column("flags")
+    flags = table.integers("flags")
+    if flags is None:
+        raise DefinitionError(table.topic, f"its {table.message_type} has no flags")
     if table.find(*_HEADING) is not None:
         needed = _RELPOS_VALID | _HEADING_VALID
         heading = np.radians(table.column(*_HEADING) * 1e-5)

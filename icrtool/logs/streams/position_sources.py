@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.fix_class import (
     GPSFIX_STATUS,
@@ -196,19 +196,13 @@ def _deviations(north: Floats, east: Floats) -> Floats:
         return np.where(positive[:, None], np.column_stack([north**2, east**2, np.zeros(len(north))]), np.nan)
 
 
-def _bits(table: TopicTable, *paths: str) -> Ints | None:
-    """Return a field of flags (n,), None where the type has none."""
-    values = table.find(*paths)
-    return None if values is None else values.astype(np.int64)
-
-
 def _nowhere(table: TopicTable) -> Bools:
     return np.zeros(len(table), np.bool_)
 
 
 def _navpvt(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
-    flags = _bits(table, "flags")
+    flags = table.integers("flags")
     no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
     variance, fix_class = _accuracy(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
     return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
@@ -218,7 +212,7 @@ def _navhpposllh(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     for column, (names, unit) in enumerate(((LAT_HP, 1e-9), (LON_HP, 1e-9), (HEIGHT_HP, 1e-4))):
         geodetic[:, column] += np.nan_to_num(table.floats(*names)) * unit
-    flags = _bits(table, "invalid_llh", "invalidLlh", "flags")
+    flags = table.integers("invalid_llh", "invalidLlh", "flags")
     invalid = _nowhere(table) if flags is None else (flags & 1) == 1
     variance = _accuracy(table.floats(*H_ACC) * 1e-4)
     return _geodetic(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
@@ -230,7 +224,7 @@ def _septentrio(mode: str, what: str, score: float) -> Reader:
     def read(table: TopicTable) -> PositionSource:
         geodetic = _place(table, "latitude", "longitude", "height")
         geodetic[:, :2] *= DEGREES
-        modes, error = _bits(table, mode), _bits(table, "error")
+        modes, error = table.integers(mode), table.integers("error")
         no_fix = _nowhere(table) if modes is None else (modes & 0x0F) == 0
         if error is not None:
             no_fix = no_fix | (error != 0)

@@ -53,9 +53,10 @@ def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
 
 def _usable(table: TopicTable, path: str) -> StampedRows:
     log_ns = table.log_time_ns
-    if not {f"{path}.sec", f"{path}.nanosec"} <= table.columns.keys() or not len(log_ns):
+    seconds, nanoseconds = table.integers(f"{path}.sec"), table.integers(f"{path}.nanosec")
+    if seconds is None or nanoseconds is None or not len(log_ns):
         return StampedRows(None, log_ns, "no header", 0)
-    header = table.columns[f"{path}.sec"] * 1_000_000_000 + table.columns[f"{path}.nanosec"]
+    header = seconds * 1_000_000_000 + nanoseconds
     zeros = np.count_nonzero(header == 0)
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
         return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)

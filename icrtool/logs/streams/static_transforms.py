@@ -15,6 +15,9 @@ BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
 LARGEST_LEVER_ARM_M = 5.0
 """No antenna is further from the body origin than this [m]: such a transform is ignored."""
 
+LARGEST_TRANSLATION_M = 1e9
+"""Beyond it a transform is damaged; UTM coordinates reach 1e7."""
+
 _PREFIX = "transforms[*]."
 _TRANSLATION = tuple(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz")
 _ROTATION = tuple(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw")
@@ -40,11 +43,12 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     transforms = _transforms([t for t in tables if t.message_type in TYPES])
     if not frame or frame not in transforms:
         return None
-    root, place, _ = _to_root(frame, transforms)
-    names = sorted({name for child, (parent, _, _) in transforms.items() for name in (child, parent)})
+    placed = _in_roots(transforms)
+    root, place, _ = placed[frame]
+    names = sorted(placed)
     bases = [name for last in BASE_FRAMES for name in names if name.rsplit("/", 1)[-1] == last]
     for base in bases:
-        base_root, origin, rotation = _to_root(base, transforms)
+        base_root, origin, rotation = placed[base]
         if base_root == root:
             forward, left, _up = rotation.T @ (place - origin)
             if np.hypot(forward, left) <= LARGEST_LEVER_ARM_M:
@@ -66,12 +70,13 @@ def _transforms(tables: Sequence[TopicTable]) -> Transforms:
         children, child_names = table.words(FIELDS[1])
         translation = np.stack([table.floats(path) for path in _TRANSLATION], axis=-1)
         rotation = np.stack([table.floats(path) for path in _ROTATION], axis=-1)
-        for row, place in zip(*np.nonzero(children >= 0), strict=True):
-            q = rotation[row, place]
-            if np.isfinite(q).all() and np.isfinite(translation[row, place]).all() and np.linalg.norm(q) > 0:
-                child = _plain(child_names[children[row, place]])
-                parent = _plain(parent_names[parents[row, place]])
-                found[child] = (parent, translation[row, place], _matrix(q))
+        length, size = np.abs(translation).max(axis=-1), np.abs(rotation).max(axis=-1)
+        sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
+        rows, places = np.nonzero((children >= 0) & sound)
+        last = dict(zip(children[rows, places].tolist(), zip(rows.tolist(), places.tolist(), strict=True), strict=True))
+        for child, at in last.items():
+            parent = _plain(parent_names[parents[at]])
+            found[_plain(child_names[child])] = (parent, translation[at], _matrix(rotation[at]))
     return found
 
 
@@ -87,14 +92,18 @@ def _matrix(q: Floats) -> Floats:
     )
 
 
-def _to_root(frame: str, transforms: Transforms) -> tuple[str, Floats, Floats]:
-    """Return the root of a frame's tree, and the frame's origin and axes in it."""
-    origin, rotation, seen = np.zeros(3), np.eye(3), {frame}
-    while frame in transforms:
-        parent, translation, turn = transforms[frame]
-        origin, rotation = turn @ origin + translation, turn @ rotation
-        if parent in seen:
-            break
-        seen.add(parent)
-        frame = parent
-    return frame, origin, rotation
+def _in_roots(transforms: Transforms) -> Transforms:
+    """Return each frame's root, and its origin and axes in it; in a circle of frames one of them is the root."""
+    placed: Transforms = {}
+    for name in transforms:
+        chain: dict[str, None] = {}
+        frame = name
+        while frame in transforms and frame not in placed and frame not in chain:
+            chain[frame] = None
+            frame = transforms[frame][0]
+        root, origin, rotation = placed.setdefault(frame, (frame, np.zeros(3), np.eye(3)))
+        for one in reversed(chain):
+            _, translation, turn = transforms[one]
+            origin, rotation = rotation @ translation + origin, rotation @ turn
+            placed[one] = (root, origin, rotation)
+    return placed

@@ -76,7 +76,7 @@ def _while_both(left: TopicTable, right: TopicTable) -> Bools:
 
 
 def _unwrapped(values: NDArray[Any], bits: int | None) -> Floats:
-    if bits is None or bits == 64 or not len(values):
+    if bits is None or bits == 64 or values.dtype.kind == "f" or not len(values):
         return values.astype(np.float64)
     span = 1 << bits
     steps = np.mod(np.diff(values.astype(np.int64)) + span // 2, span) - span // 2

@@ -38,14 +38,15 @@ def read_plan(file: Path) -> tuple[Floats, Floats, Floats | None]:
         if file.stat().st_size > LARGEST_PLAN_BYTES:
             raise RunError(file, f"larger than {LARGEST_PLAN_BYTES / 1e6:g} MB", "thin out its points")
         table = csv_frame(file)
+        if missing := [name for name in PLAN_COLUMNS if name not in table]:
+            raise RunError(file, f"no column {missing[0]}", advice)
+        columns = [
+            pd.to_numeric(table[name], errors="coerce") for name in (*PLAN_COLUMNS, "speed_mps") if name in table
+        ]
     except OSError as err:
         raise RunError(file, "cannot be read", err.strerror or str(err)) from err
-    except ValueError as err:
-        raise RunError(file, "not a CSV table", advice) from err
-    missing = [name for name in PLAN_COLUMNS if name not in table]
-    if missing:
-        raise RunError(file, f"no column {missing[0]}", advice)
-    columns = [pd.to_numeric(table[name], errors="coerce") for name in (*PLAN_COLUMNS, "speed_mps") if name in table]
+    except (ValueError, OverflowError) as err:
+        raise RunError(file, "not a CSV table of numbers", advice) from err
     east, north, *speed = (column.to_numpy(np.float64) for column in columns)
     if len(east) < 2:
         raise RunError(file, f"{len(east)} points", "a path has two at least")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from icrtool.calibration.forecast import _errors, forecast_drive, forecast_plan,
 from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
-from icrtool.errors import DataError, RunError
+from icrtool.errors import DataError, IcrToolError, RunError
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import MODELS, FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, joined_steps, samples_a_step
@@ -164,12 +165,33 @@ def test_a_table_that_is_no_plan_is_one_error(tmp_path: Path, text: str) -> None
         read_plan(file)
 
 
-@pytest.mark.parametrize(("north", "speed"), [([0.0, 0.3], None), ([0.0, np.nan], None), ([0.0, 9.0], [0.0, 0.0])])
+@pytest.mark.parametrize(
+    ("north", "speed"),
+    [
+        ([0.0, 0.3], None),
+        ([0.0, 9.0], [0.0, 0.0]),
+        *[([0.0, wrong], None) for wrong in (np.nan, np.inf, -np.inf, 1e300, -1e155)],
+        *[([0.0, 9.0], [wrong, 0.5]) for wrong in (np.nan, np.inf, -np.inf, 1e300)],
+    ],
+)
 def test_a_plan_that_cannot_be_driven_is_one_error(
     calibration: Calibration, north: list[float], speed: list[float] | None
 ) -> None:
     with pytest.raises(DataError, match="plan"):
         forecast_plan(calibration, np.zeros(2), np.array(north), None if speed is None else np.array(speed))
+
+
+@pytest.mark.parametrize("cell", ["inf", "-inf", "1e400", "nan", "", "x", "1e300", "0x10", "True", "9" * 400, '"'])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_a_plan_with_an_edited_cell_is_one_error_or_a_forecast(
+    tmp_path: Path, calibration: Calibration, cell: str, column: int
+) -> None:
+    row = ["6", "5", "0.8"]
+    row[column] = cell
+    file = tmp_path / "plan.csv"
+    file.write_text(f"east_m,north_m,speed_mps\n0,0,0.4\n{','.join(row)}\n12,0,0.4\n")
+    with suppress(IcrToolError):
+        assert np.isfinite(forecast_plan(calibration, *read_plan(file)).p95_m).all()
 
 
 def test_reverse_along_a_path_is_as_uncertain_as_forward(calibration: Calibration) -> None:

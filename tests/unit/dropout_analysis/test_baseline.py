@@ -14,11 +14,15 @@ from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
 from icrtool.dropout_analysis.baseline import difference_half_width
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.errors import ConfigError
+from icrtool.errors import ConfigError, IcrToolError
+from icrtool.fleet.fleet_files import fleet_document
+from icrtool.fleet.roll_up import runs_of_fleet
+from icrtool.fleet.row import File, Row
 from icrtool.kernels.block_sums import BlockSums, block_sums
 from icrtool.kernels.error_statistics import cut_blocks, sort_trials, summarise
 from icrtool.output.baseline_file import open_baseline, read_report
 from icrtool.records.run import Run
+from support.edits import edited
 
 HORIZON = 100
 """Starts per horizon of the made errors."""
@@ -190,3 +194,37 @@ def test_what_is_no_report_is_refused(written: Path, old: str, new: str) -> None
         read_report(written, "x")
     with pytest.raises(ConfigError, match="baseline"):
         open_baseline(written.parent / "nothing")
+
+
+def test_an_edited_baseline_is_refused_in_one_line_or_compared(report: DropoutReport, written: Path) -> None:
+    document = json.loads(written.read_text(encoding="utf-8"))
+    compared, refusals = 0, []
+    for _, changed in edited({key: document[key] for key in ("schema", "tool_version", "run", "models", "ladder")}, 4):
+        written.write_text(json.dumps(changed), encoding="utf-8")
+        try:
+            baseline = open_baseline(written).find("any", [])
+            assert baseline is not None
+            for metric in ("p50", "p95", "expected", "max"):
+                check_gate(parse_gate(f"icr.{metric}@2m <= 1.1 * baseline"), report, baseline).line()
+            compared += bool(str(baseline.changes(report.run_summary)))
+        except ConfigError as err:
+            refusals.append(str(err))
+    assert compared
+    assert refusals
+    assert not [text for text in refusals if not text.isprintable()]
+
+
+def test_an_edited_fleet_is_refused_in_one_line_or_used(report: DropoutReport, tmp_path: Path) -> None:
+    report.write(tmp_path / "runs" / "a" / "dropout", plots=())
+    document = fleet_document([Row("a", "runs/a", "done", robot="r", inputs=(File("a", 1, 1, "sum-a"),))])
+    found, refusals = 0, []
+    for _, changed in edited(json.loads(json.dumps(document))):
+        for place in (changed, {**changed, "logs": [{**changed["logs"][0], "run": "n" * 300}]} if found == 1 else {}):
+            (tmp_path / "fleet.json").write_text(json.dumps(place), encoding="utf-8")
+            try:
+                found += open_baseline(tmp_path).find("a", [{"sha256": "sum-a"}]) is not None
+                runs_of_fleet(tmp_path)
+            except IcrToolError as err:
+                refusals.append(str(err))
+    assert found > 1
+    assert not [text for text in refusals if not text.isprintable()]

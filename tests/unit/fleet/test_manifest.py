@@ -82,3 +82,23 @@ def test_a_manifest_made_to_exhaust_is_refused(tmp_path: Path, name: str, text: 
     with pytest.raises(ConfigError) as err:
         read_manifest(tmp_path / name)
     assert len(str(err.value).splitlines()) == 1
+
+
+def test_an_edited_manifest_is_refused_in_one_line_or_read(logs: Path) -> None:
+    line = {"log": "mon", "robot": "jackal", "config": "t.toml", "group": "grass", "tags": ["wet"]}
+    wrong = ["1", "1.5", "true", "1979-05-27", "[[]]", "{a = 1}", '"\\u001b[2J"', '""', "[1]", "inf", '"a\\u0000b"']
+    read, refusals = 0, []
+    for key in line:
+        for value in wrong:
+            texts = {name: value if name == key else str(text) for name, text in line.items()}
+            rows = [f"{name} = {text if name in (key, 'tags') else repr(text)}" for name, text in texts.items()]
+            (logs / "m.toml").write_text("\n".join(["[[logs]]", *rows]))
+            (logs / "m.csv").write_text(f"{','.join(line)}\n{','.join(str(text) for text in texts.values())}\n")
+            for name in ("m.toml", "m.csv"):
+                try:
+                    about(logs / "mon" / "a.mcap", read_manifest(logs / name))
+                    read += 1
+                except ConfigError as err:
+                    refusals.append(str(err))
+    assert read
+    assert not [text for text in refusals if not text.isprintable()]

@@ -634,7 +634,7 @@ def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
     )
     database.close()
     expected = [*messages, ("/huge", 8, b"\1"), ("/\ufffd\\n", 9, b"\2")]
-    problems = ["log.db3: rows without a time or a message left out"]
+    problems = ["log.db3: rows without a time, or without a message of up to 16777216 bytes, left out"]
     for log in (path, path.parent):
         assert read_log(log) == (expected, problems)
 
@@ -649,7 +649,10 @@ def test_one_db3_row_without_a_message_costs_no_other(tmp_path):
     database.commit()
     database.close()
     expected = [message for place, message in enumerate(messages) if place not in (0, 700, 701, len(rows) - 1)]
-    assert read_log(path) == (expected, ["log.db3: rows without a time or a message left out"])
+    assert read_log(path) == (
+        expected,
+        ["log.db3: rows without a time, or without a message of up to 16777216 bytes, left out"],
+    )
 
 
 @pytest.mark.parametrize(

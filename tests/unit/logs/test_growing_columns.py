@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from icrtool.logs.messages.topic_table import _Column
+from icrtool.logs.messages.growing_column import GrowingColumn
 
 
 def joined(parts: list[NDArray[Any]], lacking: float) -> NDArray[Any]:
@@ -33,7 +33,7 @@ def test_a_column_is_its_parts_joined(seed: int, expected: int) -> None:
         if floats and rng.random() < 0.3:
             values[:] = np.nan
         parts.append(values[:, 0] if flat else values)
-    column = _Column(-1)
+    column = GrowingColumn(-1)
     for part in parts:
         column.add(part.copy(), expected)
     found = column.taken()
@@ -46,7 +46,7 @@ def test_a_column_is_its_parts_joined(seed: int, expected: int) -> None:
 
 
 def test_equal_rows_take_the_memory_of_one() -> None:
-    column = _Column(0)
+    column = GrowingColumn(0)
     for _ in range(3):
         column.add(np.full((1000, 9), np.nan), 3000)
     assert column.taken().shape == (3000, 9)
@@ -54,7 +54,7 @@ def test_equal_rows_take_the_memory_of_one() -> None:
 
 
 def test_zero_and_minus_zero_are_kept_apart() -> None:
-    column = _Column(0)
+    column = GrowingColumn(0)
     column.add(np.zeros(5), 10)
     column.add(-np.zeros(5), 10)
     assert np.signbit(column.taken()).tolist() == [False] * 5 + [True] * 5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
+import struct
 import time
 import tracemalloc
 from contextlib import suppress
@@ -23,7 +24,9 @@ from icrtool.logs.cut import moment
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.dynamic_joints import collector_for
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
+from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log, survey_log
+from icrtool.logs.streams.stamps import stamp_rows
 from icrtool.records.text import LogText
 
 SEPARATOR = "=" * 80 + "\n"
@@ -62,6 +65,27 @@ def test_a_definition_without_end_is_refused_and_costs_only_its_topic(definition
     assert time.process_time() - begin < LONGEST_S
 
 
+IDL = "module sensor_msgs {{ module msg {{ {} struct Imu {{ {} x; }}; }}; }};"
+SLOW_IDL = {
+    "parentheses": IDL.format("const long A = " + "(" * 6 + "1" + ")" * 6 + ";", "double"),
+    "parentheses of a bound": IDL.format("", "sequence<double, " + "(" * 6 + "1" + ")" * 6 + ">"),
+    "sequences": IDL.format("", "sequence<" * 40 + "double" + ">" * 40),
+    "strings": IDL.format("const string A = " + '"a" ' * 60_000 + ";", "double"),
+    "annotations": IDL.format('@verbatim (text="' * 3000, "double"),
+    "comments": IDL.format("/*" * 100_000, "double"),
+    "arrays": IDL.format("", "double a[1];" * 20_000 + "double"),
+}
+
+
+@pytest.mark.parametrize("definition", SLOW_IDL.values(), ids=SLOW_IDL)
+def test_a_definition_in_idl_is_parsed_in_time_or_refused(definition: str) -> None:
+    channel = Channel(0, LogText("/imu"), LogText(IMU), LogText("cdr"), definition, "idl")
+    begin = time.process_time()
+    with suppress(DefinitionError):
+        collector_for(channel, ("x",))
+    assert time.process_time() - begin < LONGEST_S
+
+
 @pytest.mark.parametrize("kind", [SEQUENCE, ARRAY])
 def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     inner = {"x/msg/E": ([], [])}
@@ -72,7 +96,7 @@ def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     fields = [("l", (NAME, "x/msg/L5")), ("v", (BASE, ("float64", 0)))]
     layout = compile_layout({**inner, "x/msg/Top": ([], fields)}, "x/Top", ("v",), "ros1")
     data = np.tile(np.array([200, 0, 0, 0], np.uint8), 250)
-    decode_messages(layout, data[:0], np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
+    decode_messages(layout, data, np.zeros(1, np.int64), np.zeros(1, np.int64))  # compiles
     begin = time.process_time()
     _, readable = decode_messages(layout, data, np.array([0]), np.array([len(data)]))
     assert not readable.any()
@@ -125,6 +149,8 @@ SCHEMAS = {
     "SELECT 1 AS topic_id, i AS timestamp, x'00' AS data FROM r",
     "computed columns": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, "
     "data BLOB AS (zeroblob(250000000)))",
+    "texts in UTF-16": "PRAGMA encoding = 'UTF-16le'; CREATE TABLE messages(id INTEGER PRIMARY KEY, "
+    "topic_id, timestamp, data)",
     "no row numbers": "CREATE TABLE messages(id TEXT PRIMARY KEY, topic_id, timestamp, data) WITHOUT ROWID",
 }
 
@@ -134,8 +160,8 @@ def test_only_plain_tables_are_read(tmp_path: Path, schema: str) -> None:
     path = tmp_path / "log.db3"
     database = sqlite3.connect(path)
     database.executescript(
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
-        f"INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr'); {schema};"
+        f"{schema}; CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr');"
     )
     if "rowid TEXT" in schema:
         database.execute("INSERT INTO messages VALUES ('x', 1, 2, x'00')")
@@ -356,14 +382,151 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.fleet import manifest
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, sqlite_bag
-    from icrtool.logs.messages import schema
+    from icrtool.logs.messages import schema, topic_table
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
     rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"\d[\d,]*(?= |;)", row)]
     assert stated == [
-        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, schema.DEEPEST, schema.MOST_FIELDS,
-        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
+        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
+        sqlite_bag._LARGEST_MESSAGE_BYTES, schema.DEEPEST, schema.MOST_FIELDS,
+        sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, topic_table.MOST_TEXTS,
+        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
+
+
+HEADER = f"\n{SEPARATOR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
+JOINTS = "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort" + HEADER
+DYNAMIC_JOINTS = (
+    f"std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values{HEADER}\n"
+    f"{SEPARATOR}MSG: control_msgs/InterfaceValue\nstring[] interface_names\nfloat64[] values"
+)
+WHEELS = ["left_wheel", "right_wheel"]
+
+
+class Cdr:
+    """Serializes numbers and texts as CDR does."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+
+    def add(self, kinds: str, *values: float) -> Cdr:
+        for kind, value in zip(kinds, values, strict=True):
+            size = struct.calcsize(f"<{kind}")
+            self.content += bytes(-len(self.content) % size) + struct.pack(f"<{kind}", value)
+        return self
+
+    def texts(self, texts: list[str]) -> Cdr:
+        self.add("I", len(texts))
+        for text in texts:
+            self.text(text)
+        return self
+
+    def text(self, text: str) -> Cdr:
+        self.add("I", len(text) + 1).content.extend(text.encode() + b"\0")
+        return self
+
+    def numbers(self, values: list[float]) -> Cdr:
+        return self.add("I", len(values)).add("d" * len(values), *values)
+
+    def done(self) -> bytes:
+        return b"\0\1\0\0" + bytes(self.content)
+
+
+def header(stamp_ns: int) -> Cdr:
+    return Cdr().add("iI", stamp_ns // 10**9, stamp_ns % 10**9).text("base")
+
+
+def joints(stamp_ns: int, names: list[str], positions: list[float]) -> bytes:
+    return header(stamp_ns).texts(names).numbers(positions).numbers([]).numbers([]).done()
+
+
+def dynamic_joints(stamp_ns: int, names: list[str], interfaces: list[str]) -> bytes:
+    message = header(stamp_ns).texts(names).add("I", len(names))
+    for _ in names:
+        message.texts(interfaces).numbers([1.0] * len(interfaces))
+    return message.done()
+
+
+def block_of(messages: list[tuple[int, bytes]]) -> Block:
+    sizes = np.array([len(data) for _, data in messages])
+    times, end = np.array([stamp for stamp, _ in messages]), np.cumsum(sizes)
+    data = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
+    return Block(data, np.zeros(len(messages), np.int64), times, end - sizes, end)
+
+
+def collected(kind: str, definition: str, wanted: tuple[str, ...], *blocks: list[tuple[int, bytes]]) -> TopicTable:
+    collector = collector_for(Channel(0, LogText("/t"), LogText(kind), LogText("cdr"), definition), wanted)
+    for messages in blocks:
+        collector.feed(block_of(messages), np.ones(len(messages), np.bool_))
+    return collector.table()
+
+
+DYNAMIC = "control_msgs/DynamicJointState"
+
+
+def test_a_clock_of_dynamic_joint_states_that_is_set_back_is_seen_within_and_between_blocks() -> None:
+    stamps = START_NS + 10**9 * np.array([0, 1, 2, 3, -3600, -3599, -3598, -3597])
+    messages = [(int(stamp), dynamic_joints(int(stamp), WHEELS, ["velocity"])) for stamp in stamps]
+    for blocks in ([messages], [messages[:4], messages[4:]], [messages[:2], messages[2:6], messages[6:]]):
+        table = collected(DYNAMIC, DYNAMIC_JOINTS, (), *blocks)
+        assert table.set_back.step_ns == 3603 * 10**9
+        assert (np.diff(table.log_time_ns) > 0).all()
+    assert collected(DYNAMIC, DYNAMIC_JOINTS, (), messages[:4]).set_back.step_ns == 0
+
+
+def test_another_number_of_joints_in_each_message_costs_no_time() -> None:
+    messages = [(START_NS + i, dynamic_joints(START_NS, [f"j{k}" for k in range(i)], ["velocity"])) for i in range(100)]
+    begin = time.process_time()
+    table = collected(DYNAMIC, DYNAMIC_JOINTS, (), messages)
+    assert len(table) + table.unreadable == 100
+    assert time.process_time() - begin < LONGEST_S
+
+
+JOINT_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "name[*]", "position[*]", "velocity[*]")
+
+
+def test_topics_of_many_joints_take_memory_for_their_messages_only() -> None:
+    wide = joints(START_NS, [f"j{k}" for k in range(256)], [1.0] * 256)
+    collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, [(START_NS, wide)])
+    tracemalloc.start()
+    channel = Channel(0, LogText("/t"), LogText("sensor_msgs/JointState"), LogText("cdr"), JOINTS)
+    kept = [collector_for(channel, JOINT_FIELDS) for _ in range(20)]
+    for collector in kept:
+        collector.feed(block_of([(START_NS, wide)]), np.ones(1, np.bool_))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 20 * 40 * len(wide)
+
+
+def test_a_topic_of_ever_new_names_is_refused() -> None:
+    many = [(START_NS + i, joints(START_NS + i, [f"w{i}_{k}" for k in range(200)], [])) for i in range(400)]
+    with pytest.raises(DefinitionError, match="different texts"):
+        collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, many)
+
+
+def test_joints_at_infinity_are_left_out() -> None:
+    from icrtool.config import Config
+    from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
+    from icrtool.logs.streams.wheel_speeds import wheel_samples
+
+    rows = [(START_NS + i * 10**8, [0.1 * i, 0.1 * i if i % 4 else np.inf * (-1) ** i]) for i in range(100)]
+    messages = [(stamp, joints(stamp, WHEELS, positions)) for stamp, positions in rows]
+    table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages)
+    config = load_config(sets=["robot.track_width_m=0.5", "robot.wheel_radius_m=0.1"])
+    motion = WHEEL_TYPES["sensor_msgs/JointState"][1](table, Config())
+    samples, warnings = wheel_samples(motion, motion.stamps.on("log"), config, "x")
+    assert np.isfinite(samples.right).all()
+    assert any("25 of 100 wheel samples are not finite numbers" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("kind", ["float64", "string"])
+def test_stamps_that_are_no_whole_numbers_are_none(kind: str) -> None:
+    definition = JOINTS.replace("builtin_interfaces/Time", "x/T") + f"\n{SEPARATOR}MSG: x/T\n{kind} sec\n{kind} nanosec"
+    stamp = Cdr().add("dd", np.nan, np.inf) if kind == "float64" else Cdr().text("1").text("2")
+    message = stamp.text("base").texts(WHEELS).numbers([1.0, 2.0]).numbers([]).numbers([]).done()
+    table = collected("sensor_msgs/JointState", definition, JOINT_FIELDS, [(START_NS, message)] * 3)
+    assert stamp_rows(table).header_ns is None
+    assert table.column("position[*]").tolist() == [[1.0, 2.0]] * 3

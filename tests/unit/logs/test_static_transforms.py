@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.static_transforms import antenna_place
+from icrtool.logs.streams.static_transforms import _in_roots, antenna_place
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HALF = np.sqrt(0.5)
@@ -97,3 +98,20 @@ def test_transforms_in_a_circle_give_nothing(tmp_path: Path) -> None:
         ],
     )
     assert place(log) is None
+
+
+def test_a_long_chain_of_frames_is_followed_once() -> None:
+    step, turn = np.array([1.0, 0.0, 0.0]), np.eye(3)
+    chain = {f"f{k}/base_link": (f"f{k + 1}/base_link", step, turn) for k in range(20_000)}
+    begin = time.process_time()
+    placed = _in_roots(chain)
+    assert time.process_time() - begin < 3.0
+    assert placed["f0/base_link"][0] == "f20000/base_link"
+    assert placed["f0/base_link"][1].tolist() == [20_000.0, 0.0, 0.0]
+    assert _in_roots({"a": ("b", step, turn), "b": ("a", step, turn)}).keys() == {"a", "b"}
+
+
+@pytest.mark.parametrize("number", [np.inf, np.nan, 1e300, 1e-300])
+def test_transforms_of_impossible_numbers_are_left_out(tmp_path: Path, number: float) -> None:
+    rows = [("base_link", "gps", (number, 0.0, 0.0), (0, 0, 0, 1)), ("base_link", "gps", (1, 0, 0), (number, 0, 0, 0))]
+    assert place(write(tmp_path / "log", rows)) in (None, (0.0, 0.0), (1e-300, 0.0))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+import time
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
+import numpy as np
 import pytest
 
 import icrtool
@@ -17,12 +18,14 @@ from icrtool.errors import IcrToolError
 from icrtool.output.calibration_file import open_calibration
 from icrtool.output.json_file import json_bytes
 from icrtool.output.run_directory import events_csv
+from icrtool.output.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.stored_run import log_of
 from icrtool.output.tables.run import format_run
+from support.edits import edited
 
 LOG = Path(__file__).parents[3] / "sample_logs" / "tracked_curved.bag"
-WRONG: list[Any] = [None, -1, 1e300, float("nan"), 10**30, "\x1b[2J", [], {"a": 1}, [[None]]]
 LONGEST_LINE = 1000
+LONGEST_S = 5.0
 
 
 @pytest.fixture(scope="module")
@@ -31,30 +34,6 @@ def run_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("edited") / "run"
     icrtool.fit(icrtool.read_log(LOG, config), config).write(place, plots=())
     return place
-
-
-def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Every place in plain data; of a list its first element."""
-    if here:
-        yield here
-    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
-    for key, item in items:
-        yield from places(item, (*here, key))
-
-
-def edited(document: dict[str, Any], every: int = 1) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The document with one place removed or replaced; which of both, and by what, differs from place to place."""
-    for number, place in list(enumerate(places(document)))[::every]:
-        for wrong in (WRONG[number % len(WRONG)], ("removed", WRONG[(7 * number + 3) % len(WRONG)])[number % 2]):
-            changed = copy.deepcopy(document)
-            outer: Any = changed
-            for key in place[:-1]:
-                outer = outer[key]
-            if wrong == "removed":
-                del outer[place[-1]]
-            else:
-                outer[place[-1]] = copy.deepcopy(wrong)
-            yield f"{place}: {wrong!r}", changed
 
 
 def write_run(place: Path, document: object) -> None:
@@ -154,3 +133,69 @@ def test_a_page_of_an_edited_run_is_refused_in_one_line(
     with pytest.raises(IcrToolError, match=rf"at `\$\.{section}"):
         command.main(["report", str(place), "-o", str(tmp_path / "x.html")], standalone_mode=False)
     assert not (tmp_path / "x.html").exists()
+
+
+def as_npy(file: Path, columns: dict[str, np.ndarray]) -> None:
+    with file.open("wb") as stream:
+        np.save(stream, columns["fixes_stamp_ns"])
+
+
+def compressed(file: Path, columns: dict[str, np.ndarray]) -> None:
+    np.savez_compressed(file, **{**columns, "fixes_stamp_ns": np.zeros(1_000_000, np.int64)})
+
+
+def with_header(file: Path, columns: dict[str, np.ndarray], header: bytes) -> None:
+    """Write the columns, one of which states another shape or type."""
+    np.savez(file, **columns)
+    with ZipFile(file) as stored:
+        members = {name: stored.read(name) for name in stored.namelist()}
+    members["fixes_stamp_ns.npy"] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with ZipFile(file, "w") as stored:
+        for name, content in members.items():
+            stored.writestr(name, content)
+
+
+MEASUREMENTS = {
+    "an array": as_npy,
+    "text": lambda file, _: file.write_text("PK"),
+    "compressed": compressed,
+    "a shape": lambda file, columns: with_header(
+        file, columns, b"{'descr': '<i8', 'fortran_order': False, 'shape': (10000000000000,)}\n"
+    ),
+    "nested": lambda file, columns: with_header(file, columns, b"[" * 5000 + b"\n"),
+    "pickled": lambda file, columns: np.savez(file, **{**columns, "fixes_stamp_ns": np.array([{}], object)}),
+    "a huge number": lambda file, columns: np.savez(
+        file, **{**columns, "headings_heading_rad": columns["headings_heading_rad"] + 1e300}
+    ),
+    "two axes": lambda file, columns: np.savez(file, **{**columns, "fixes_north_m": np.zeros((3, 3))}),
+}
+
+
+@pytest.mark.parametrize("write", MEASUREMENTS.values(), ids=MEASUREMENTS)
+def test_measurements_that_were_replaced_are_refused(run_place: Path, tmp_path: Path, write: Any) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    write(place / "measurements.npz", dict(np.load(place / "measurements.npz")))
+    write_run(place, (place / "run.json").read_bytes())
+    begin = time.process_time()
+    with pytest.raises(IcrToolError) as err:
+        icrtool.open_run(place)
+    assert str(err.value).isprintable()
+    assert time.process_time() - begin < LONGEST_S
+
+
+@pytest.mark.parametrize("rows", [0, 5_000_000])
+def test_states_of_no_row_or_far_too_many_are_refused(run_place: Path, tmp_path: Path, rows: int) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    (place / "states.csv").unlink()
+    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
+    part = pa.table({name: pa.repeat(pa.scalar(0, kind), rows // 5) for name, kind in types.items()})
+    with pq.ParquetWriter(place / "states.parquet", part.schema) as writer:
+        for _ in range(5 if rows else 0):
+            writer.write_table(part)
+    (place / "B2SUMS").write_text((place / "B2SUMS").read_text().replace("states.csv", "states.parquet"))
+    write_run(place, (place / "run.json").read_bytes())
+    with pytest.raises(IcrToolError, match="too many for its size" if rows else "cannot be read"):
+        icrtool.open_run(place)
