@@ -12,15 +12,20 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from icrtool.calibration.held_out import HeldOut, hold_out
-from icrtool.calibration.pooled import gyro_recording_of
+import numpy as np
+
+from icrtool.calibration.forecast import forecast_trials
+from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
+from icrtool.calibration.pooled import calibrate, gyro_recording_of, predictor
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.estimation.fit import fit
 from icrtool.fleet.recordings import find_recordings
+from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
 from icrtool.motion.models import CONTROLLER, MODELS
 from icrtool.motion.recording import Recording
+from icrtool.motion.trials import cut_trials
 from icrtool.output.run_directory import RUN_FILE, is_run_directory
 from icrtool.output.stored_run import open_run
 
@@ -70,6 +75,24 @@ def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
         row = [*cells(wheels, name), *cells(gyro, with_gyro)]
         yield f"| `{name}` | " + " | ".join(row) + " |"
     yield f"\nRecommended for all of it: `{wheels.recommended}`."
+    if wheels.folds[0].whole:
+        yield "\nShare of trials within the 95 % forecast of the calibration by the other logs:"
+        for words, share in forecast_shares(recordings).items():
+            yield f"{words} " + ", ".join(f"{one:.2f} after {h:g} m" for h, one in zip(HORIZONS_M, share, strict=True))
+
+
+def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
+    """Return the share of the trials of all left-out logs within their 95 % forecast, by wheels, and with the gyro."""
+    inside: dict[str, list[Floats]] = {}
+    for i, one in enumerate(recordings):
+        calibration = calibrate(recordings[:i] + recordings[i + 1 :]).calibration
+        trials = cut_trials(one, HORIZONS_M)
+        for with_gyro in (False, True)[: 1 + (calibration.gyro is not None and one.gyro_radps is not None)]:
+            errors = predictor(calibration, one, with_gyro=with_gyro)(trials)
+            _, p95 = forecast_trials(calibration, one, trials, with_gyro=with_gyro)
+            share = np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0)
+            inside.setdefault("with gyro:" if with_gyro else "wheels:", []).append(share)
+    return {words: np.mean(shares, axis=0) for words, shares in inside.items()}
 
 
 def cells(table: HeldOut | None, name: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Learn the track ICRs of a skid-steer robot from its field logs, and how far it can go without GNSS.
+"""Learn the track ICRs of a skid-steer robot from its field logs, and how far it can drive without GNSS.
 
 Every name, frame, sign and unit in this package means what stands here.
 

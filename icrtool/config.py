@@ -163,10 +163,16 @@ class DropoutConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All settings of a run. Frozen; run.json records `effective`.
+    """All settings of a run; a frozen record. `icrtool config` explains each key, run.json holds the effective values.
 
     Attributes
     ----------
+    robot : name, track width [m], wheel radius [m], encoder counts
+    topics : where wheels, position and heading are read from; None: found by type and content
+    wheels : joints, quantity and scales of the sides
+    frames : heading convention and offset [deg], delays [s], antenna position [m], datum [deg, deg, m]
+    filter : preset, start, noise, gates
+    dropout : distances without GNSS [m], forced outages [s]
     given : the keys that were set, by robot, file or ``--set``, as ``section.key``; the rest has its default
     """
 

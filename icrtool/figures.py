@@ -1,17 +1,11 @@
 """Figures of runs and reports, each returned as a matplotlib Figure; imported when first used."""
 
-from icrtool.output.figures.catalogue import (
-    dropout_examples,
-    dropout_histogram,
-    dropout_outages,
-    dropout_summary,
-    dropout_worst,
-    gnss_difference,
-    icr_clusters,
-    icr_estimates,
-    model_comparison,
-    trajectory,
-)
+from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
+from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
+from icrtool.output.figures.gnss_difference import gnss_difference
+from icrtool.output.figures.icrs import icr_clusters, icr_estimates
+from icrtool.output.figures.model_comparison import model_comparison
+from icrtool.output.figures.trajectory import trajectory
 
 __all__ = [
     "dropout_examples",

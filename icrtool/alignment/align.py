@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.gnss_quality import CLASSES, GnssQuality, grade_fixes
+from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
-from icrtool.records.measurements import Fixes, FixStatistics, Measurements, SensorData
+from icrtool.records.measurements import Fixes, Measurements, SensorData
 from icrtool.records.run import half_width_m
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
@@ -45,7 +44,6 @@ def align(log: RobotLog, config: Config) -> Measurements:
     wheels, heading, delays = found.wheels, found.heading, found.delays
     quality = grade_fixes(found.log, config, found.fix_steps)
     aligned = sensors_as_sent(quality.log, config)
-    sense, offset = heading.remaining
     sensors = replace(
         aligned,
         fixes=replace(
@@ -56,7 +54,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         ),
         headings=replace(
             aligned.headings,
-            heading_rad=sense * aligned.headings.heading_rad - offset,
+            heading_rad=aligned.headings.heading_rad - heading.remaining_offset_rad,
             var_rad2=quality.log.heading.var_rad2
             if heading.is_estimated
             else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
@@ -83,12 +81,12 @@ def align(log: RobotLog, config: Config) -> Measurements:
             "gnss": delays.gnss_summary(),
         },
         streams=found.log.streams,
-        fix_statistics=_fix_statistics(quality),
+        fix_statistics=quality.statistics,
         position_delay_s=delays.applied_gnss_s,
         clock_std_s=delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
         warnings=(
-            *(warning for part in (quality.log, wheels, heading, delays, quality) for warning in part.warnings),
+            *(warning for part in (quality.log, found, quality) for warning in part.warnings),
             *notes,
         ),
     )
@@ -103,14 +101,13 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
         Streams that cannot be used together.
     """
     check_streams(log)
-    topics = {stream.role: stream.topic for stream in log.streams}
     return SensorData(
         name=log.name,
         wheels=log.wheels,
         fixes=_fixes(log.gnss, config),
         headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
         gyro=log.gyro,
-        heading_from_position="heading" in topics and topics["heading"] == topics.get("gnss"),
+        heading_from_position=log.heading_is_of_position,
         heading_correlation_s=config.filter.heading_correlation_s,
         antenna_m=_antenna_m(log, config),
         losses_ns=np.empty((0, 2), np.int64),
@@ -140,12 +137,3 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
         forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
         right if given.antenna_right_m == "auto" else given.antenna_right_m,
     )
-
-
-def _fix_statistics(quality: GnssQuality) -> FixStatistics:
-    gnss, std_m = quality.log.gnss, {}
-    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    for code, name in CLASSES.items():
-        given = std[(quality.fix_class == code) & np.isfinite(std)]
-        std_m[name] = float(np.median(given)) if len(given) else math.nan
-    return FixStatistics(std_m, quality.step_std_m, quality.jump_stamp_ns, quality.jump_m)

@@ -15,12 +15,13 @@ forward count as one each.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
 from icrtool.records.tables import RobotLog
@@ -42,8 +43,8 @@ ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
-CHORD_S, LEAST_CHORD_M, CHORD_IN_POSITION_STD = 2.0, 0.3, 4.0
-"""Without a heading, distances are compared over this time, where the robot moves clearly."""
+LEAST_CHORD_M, CHORD_IN_POSITION_STD = 0.3, 4.0
+"""Without a heading, distances are compared where the robot moves clearly."""
 
 
 class Convention(NamedTuple):
@@ -87,12 +88,10 @@ class Decision(NamedTuple):
 
     Attributes
     ----------
-    margin : by how much twice its log-likelihood exceeds that of everything being as named
     as_likely : another convention with the same likelihood and no more than half a fault more, None without one
     """
 
     convention: Convention
-    margin: float
     as_likely: Convention | None
 
 
@@ -121,12 +120,12 @@ def decide_conventions(
     mirror_allowed : whether the heading's handedness is free
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     try:
         shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
     except np.linalg.LinAlgError:
         # Exact data on one circle: nothing separates the hypotheses.
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     losses = _losses(shown, 0.5 * drive.fix_std_m / windows.length_m)
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
@@ -138,12 +137,12 @@ def decide_conventions(
     named = costs[AS_NAMED][0]
     best = min(cost for cost, _ in costs.values())
     if named - best < DECISIVE:
-        return Decision(AS_NAMED, 0.0, None)
+        return Decision(AS_NAMED, None)
     likely = {one: one.faults(offset, drive, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
     ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
-    return Decision(chosen, named - costs[chosen][0], ranked[1] if close else None)
+    return Decision(chosen, ranked[1] if close else None)
 
 
 def senses_by_distance(drive: DriveArrays) -> Convention:
@@ -151,10 +150,8 @@ def senses_by_distance(drive: DriveArrays) -> Convention:
 
     Of two such sides, that one is reversed with which the robot drives forward.
     """
-    t = drive.fix_t
-    rows = np.unique(np.floor(t / CHORD_S), return_index=True)[1]
-    chord = np.abs(np.diff(drive.fix[rows]))
-    left, right = (np.diff(drive.until_fixes(speed)[rows]) for speed in (drive.v_left, drive.v_right))
+    _, step, left, right = cut_chords(drive)
+    chord = np.abs(step)
     moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
     if np.count_nonzero(moved) < FEWEST_WINDOWS:
         return AS_NAMED
@@ -282,12 +279,16 @@ def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
     return int(np.sign(correlation)) if abs(correlation) > 0.5 else 0
 
 
-def apply_to_drive(drive: DriveArrays, convention: Convention) -> DriveArrays:
-    """Return the drive with sides, heading and position as the convention has them."""
-    left, right = convention.sign_left * drive.v_left, convention.sign_right * drive.v_right
-    return drive._replace(
-        v_left=right if convention.swapped else left,
-        v_right=left if convention.swapped else right,
-        heading=convention.heading * drive.heading,
-        fix=drive.fix if convention.position > 0 else np.conj(drive.fix),
-    )
+def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:
+    """Return the log with sides, heading and position as the convention has them; the same log as named."""
+    if convention == AS_NAMED:
+        return log
+    wheels, heading, gnss = log.wheels, log.heading, log.gnss
+    left, right = convention.sign_left * wheels.v_left_mps, convention.sign_right * wheels.v_right_mps
+    if convention.swapped:
+        left, right = right, left
+    if convention.heading < 0:
+        heading = replace(heading, heading_rad=-heading.heading_rad)
+    if convention.position < 0:
+        gnss = replace(gnss, east_m=-gnss.east_m, cov_north_east_m2=-gnss.cov_north_east_m2)
+    return replace(log, wheels=replace(wheels, left=left, right=right), heading=heading, gnss=gnss)

@@ -6,15 +6,13 @@ reported. Preset ``paper`` corrects nothing.
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import NamedTuple
 
 from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,
     Decision,
-    apply_to_drive,
+    apply_convention,
     convention_notes,
     decide_conventions,
     gyro_sense,
@@ -38,12 +36,9 @@ from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import StreamDelays, find_delays
 from icrtool.alignment.wheel_alignment import (
     WheelAlignment,
+    align_wheels,
     configured_scales,
     dead_or_copied,
-    find_scales,
-    fused_note,
-    held_note,
-    held_share,
     refuse_standing,
     scaled,
 )
@@ -62,7 +57,7 @@ class AlignedStreams(NamedTuple):
 
     Attributes
     ----------
-    log : corrected; the heading's offset and handedness stand in `heading`, which the filter applies
+    log : corrected; the heading's offset stands in `heading`, which the filter applies
     drive : what the estimate was made of; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
     """
@@ -74,7 +69,11 @@ class AlignedStreams(NamedTuple):
     drive: DriveArrays
     fit: AlignmentFit | None
     derived: DerivedHeading | None
-    warnings: tuple[str, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was found, in sentences."""
+        return (*self.wheels.warnings, *self.heading.warnings, *self.delays.warnings)
 
     @property
     def geometry(self) -> Geometry | None:
@@ -87,13 +86,27 @@ class AlignedStreams(NamedTuple):
         expected = self.drive.laid_until_fixes() if self.fit is None else self.fit.expected_motion()[0]
         return measure_steps(self.drive.fix_t, self.drive.fix, expected)
 
-    @property
-    def as_named(self) -> RobotLog:
-        """The log with sides, handedness and scale corrected, offset and delays not."""
-        return _turned_over(self.wheels.log) if self.heading.applied_mirror else self.wheels.log
+
+class _NamedStreams(NamedTuple):
+    """A log whose sides and senses are named.
+
+    Attributes
+    ----------
+    log : with the chosen convention; as sent in preset ``paper``
+    drive : with the chosen convention in any preset; windows : of it
+    notes : what to report; sound : no side is dead or a copy of the other
+    """
+
+    log: RobotLog
+    derived: DerivedHeading | None
+    decision: Decision
+    drive: DriveArrays
+    windows: DriveWindows
+    notes: list[str]
+    sound: bool
 
 
-def align_streams(log: RobotLog, config: Config) -> AlignedStreams:  # noqa: PLR0915 - the order of the steps, in one place
+def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     """Estimate what relates wheels, heading and positions, and correct what is significant.
 
     Raises
@@ -102,70 +115,72 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:  # noqa: PLR
         Streams that cannot be used together, a heading that nothing explains, wheels that turn while the robot stands.
     """
     corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
-    as_sent, derived, senses = log, None, AS_NAMED
-    configured = configured_scales(config)
-    log = scaled(log, *configured)
-    if not len(log.heading.stamp_ns) and corrects:
-        senses = _senses_without_heading(log)
-        derived = _derived_heading(_apply(log, senses), width)
-        log = derived.apply(_apply(log, senses))
-    check_streams(log)
-    notes = list(dead_or_copied(log))
-    sound = not notes
-    notes += convention_notes(Decision(senses, 0.0, None), corrects=True)
-    drive = drive_arrays(log, None if derived is None else derived.smoothed)
-    windows = cut_windows(drive)
-    decision = _decide(log, config, drive, windows, derived)
-    if corrects:
-        log = _apply(log, decision.convention)
-    drive = apply_to_drive(drive, decision.convention)
-    notes += convention_notes(decision, corrects=corrects)
-    mirrored = decision.convention.heading < 0
-    pose_mirrored = mirrored and decision.convention.position < 0 and drive.same_clock
-    if derived is None and config.frames.heading != "auto":
-        free_hand = decide_conventions(drive, windows, metric=False)
-        if free_hand.convention.heading < 0:
-            notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+    as_sent = log
+    log, derived, decision, drive, windows, notes, sound = _name_streams(log, config, width)
     refuse_standing(log, drive, windows)
     course = compare_with_course(drive, windows)
-    free = config.frames.heading_offset_deg == "auto" and corrects
+    free, convention = config.frames.heading_offset_deg == "auto" and corrects, decision.convention
     fit = estimate_alignment(drive, windows, width)
-    if free and derived is None:
-        refuse_stuck(log)
-        scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
-        if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
-            return align_streams(bare, config)
-        refuse_unexplained(log, course)
-    if derived is None:
-        heading = align_heading(
-            log, config, fit, course, stated_source(log), mirrored=mirrored, pose_mirrored=pose_mirrored
-        )
+    if derived is not None:
+        heading = align_estimated_heading(log, derived, None)
+    else:
+        if free:
+            refuse_stuck(log)
+            scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
+            if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
+                return align_streams(bare, config)
+            refuse_unexplained(log, course)
+        heading = align_heading(log, config, fit, course, stated_source(log), convention)
         if free and config.frames.heading == "auto":
-            derived = fuse_heading(log, drive, mirrored=mirrored)
+            derived = fuse_heading(log, drive)
         if derived is not None:
             log = derived.apply(log)
             drive = drive_arrays(log, derived.smoothed)
             fit = estimate_alignment(drive, cut_windows(drive), width)
             heading = align_estimated_heading(log, derived, heading)
-    else:
-        heading = align_estimated_heading(log, derived, None)
-    applied, scale_notes = find_scales(fit, config, sound=sound, corrects=corrects)
-    notes += scale_notes
-    log = scaled(log, *applied)
-    share = held_share(log.wheels)
-    notes += held_note(log.wheels, share) + fused_note(log)
-    a, a_std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
-    if decision.convention.swapped and corrects:
+    configured = configured_scales(config)
+    if convention.swapped and corrects:
         configured = configured[::-1]
-    wheels = WheelAlignment(
-        log, a, a_std, applied, (abs(configured[0]), abs(configured[1])), share,
-        tuple(f"{log.name}: {note}" for note in notes),
-    )  # fmt: skip
+    wheels = align_wheels(log, config, fit, configured, notes, sound=sound)
     delays = find_delays(log, config, fit)
-    return AlignedStreams(
-        delays.log, wheels, heading, delays, drive, fit, derived,
-        (*wheels.warnings, *heading.warnings, *delays.warnings),
-    )  # fmt: skip
+    return AlignedStreams(delays.apply(scaled(log, *wheels.applied)), wheels, heading, delays, drive, fit, derived)
+
+
+def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStreams:
+    """Find the heading of a log without one, then which side is which, and in which sense streams turn."""
+    corrects, derived, senses = config.filter.preset == "field", None, AS_NAMED
+    log = scaled(log, *configured_scales(config))
+    if not len(log.heading.stamp_ns) and corrects:
+        senses = _senses_without_heading(log)
+        log = apply_convention(log, senses)
+        derived = _derived_heading(log, width_m)
+        log = derived.apply(log)
+    check_streams(log)
+    faults = dead_or_copied(log)
+    drive = drive_arrays(log, None if derived is None else derived.smoothed)
+    windows = cut_windows(drive)
+    free = config.frames.heading == "auto" and derived is None
+    decision = decide_conventions(
+        drive, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, drive), mirror_allowed=free
+    )
+    named = apply_convention(log, decision.convention)
+    if derived is not None and named is not log:
+        # it was made with wheels whose sides are exchanged, or run backwards
+        derived = _derived_heading(named, width_m)
+        named = derived.apply(named)
+    if named is not log:
+        drive = drive_arrays(named, None if derived is None else derived.smoothed)
+        windows = cut_windows(drive)
+    notes = [
+        *faults,
+        *convention_notes(Decision(senses, None), corrects=True),
+        *convention_notes(decision, corrects=corrects),
+    ]
+    if derived is None and config.frames.heading != "auto":
+        free_hand = decide_conventions(drive, windows, metric=False)
+        if free_hand.convention.heading < 0:
+            notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+    return _NamedStreams(named if corrects else log, derived, decision, drive, windows, notes, not faults)
 
 
 def _senses_without_heading(log: RobotLog) -> Convention:
@@ -190,31 +205,3 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             f"({drive.travel[-1]:.0f} m)",
             "record an orientation (AHRS), use RTK, or drive several times as far",
         ) from error
-
-
-def _decide(
-    log: RobotLog, config: Config, drive: DriveArrays, windows: DriveWindows, derived: DerivedHeading | None
-) -> Decision:
-    free = config.frames.heading == "auto" and derived is None
-    return decide_conventions(
-        drive, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, drive),
-        mirror_allowed=free,
-    )  # fmt: skip
-
-
-def _apply(log: RobotLog, convention: Convention) -> RobotLog:
-    """Return the log with sides and position of a convention; the heading's handedness is left to the filter."""
-    if convention == AS_NAMED:
-        return log
-    wheels, gnss = log.wheels, log.gnss
-    left, right = convention.sign_left * wheels.v_left_mps, convention.sign_right * wheels.v_right_mps
-    if convention.swapped:
-        left, right = right, left
-    if convention.position < 0:
-        cov = -gnss.cov_north_east_m2
-        gnss = replace(gnss, east_m=-gnss.east_m, cov_north_east_m2=cov)
-    return replace(log, wheels=replace(wheels, left=left, right=right), gnss=gnss)
-
-
-def _turned_over(log: RobotLog) -> RobotLog:
-    return replace(log, heading=replace(log.heading, heading_rad=-log.heading.heading_rad))

@@ -25,10 +25,10 @@ from icrtool.kernels.robust import huber_weights, mad_std
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
 ENOUGH_COURSES = 24.0
-"""A course is as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
+"""Windows are as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
 
 LARGEST_TURN_ERROR_RAD = 2.0
-"""A course is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
+"""A window is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
 
 FEWEST_FIXES = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
@@ -86,7 +86,7 @@ class Guess(NamedTuple):
     Attributes
     ----------
     bias : (n,) of the turn rate at its samples [rad/s]
-    x : ICR ahead of the antenna [m]; late : delay of the positions [s]
+    x : ICR ahead of the antenna [m]; delay_s : of the positions
     middle : how much the antenna's speed grows with half the speed difference of the sides (left - right)
     bias_std, scale_std : what is not known of bias [rad/s] and scale
     """
@@ -95,7 +95,7 @@ class Guess(NamedTuple):
     bias_std: float
     scale_std: float
     x: float = 0.0
-    late: float = 0.0
+    delay_s: float = 0.0
     middle: float = 0.0
 
 
@@ -124,7 +124,7 @@ class Courses(NamedTuple):
 
 
 def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses:
-    """Cut the drive into windows of distance that follow one another, and measure the course in each."""
+    """Cut the drive into windows of distance that follow one another, and measure the course over ground in each."""
     corrected = turn._replace(rate=turn.rate - guess.bias).integrated()
     v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
     middle = drive.wheel_t + drive.wheel_dt / 2
@@ -134,7 +134,7 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     gone = np.concatenate([[0.0], np.cumsum((np.abs(v) * drive.wheel_dt)[:-1])])
     length = _course_length(drive)
     t, place = _without_spikes(
-        drive._replace(fix_t=drive.fix_t - guess.late),
+        drive._replace(fix_t=drive.fix_t - guess.delay_s),
         max(drive.wheel_t[0], turn.t[0]), min(drive.wheel_t[-1], turn.t[-1]),
     )  # fmt: skip
     edge = _edges(np.interp(t, drive.wheel_t, gone), length)
@@ -174,7 +174,7 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     # about no bias, no x and no delay
     bias_at = np.interp(t[end], turn.t, guess.bias)
-    angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.late * of_delay
+    angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
     found = Courses(
         t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, drive.fix_std_m / np.sqrt(square),
         np.abs(seen), product(centred(laid(u * nose))).real / square,
@@ -196,7 +196,7 @@ def fit_middle(courses: Courses, guess: Guess) -> float:
 
 
 def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
-    """Return middles (m,) [s] of windows and of those that follow, and the change of course between them [rad].
+    """Return middles (m,) [s] of windows and of those that follow, and how far the course over ground turns [rad].
 
     Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
     """

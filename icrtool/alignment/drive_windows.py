@@ -31,6 +31,9 @@ UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be used instead."""
 
 
+CHORD_S = 2.0
+"""Without a heading, distances are compared over this time."""
+
 MOST_WHEEL_SAMPLES = 100_000
 """The samples of a longer drive are joined to about so many: 1 h at 28 Hz, where windows last seconds."""
 
@@ -89,6 +92,20 @@ class DriveArrays(NamedTuple):
         return self.until_fixes(self.mean_speed * self.nose)
 
 
+class Chords(NamedTuple):
+    """Displacements of the fixes over spans of time, and the distance of each side in them.
+
+    Attributes
+    ----------
+    duration : (w,) [s]; step : complex (w,) north + j east [m]; left, right : (w,) with their signs [m]
+    """
+
+    duration: Floats
+    step: Complexes
+    left: Floats
+    right: Floats
+
+
 class DriveWindows(NamedTuple):
     """Windows of a drive.
 
@@ -119,9 +136,8 @@ class DriveWindows(NamedTuple):
 
 def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
     """Return a log as arrays; `heading` in place of its own."""
-    topics = {stream.role: stream.topic for stream in log.streams}
-    same_clock = "gnss" in topics and topics["gnss"] == topics.get("heading", "")
-    return join_streams(log.wheels, log.gnss, log.heading if heading is None else heading, same_clock=same_clock)
+    stated = log.heading if heading is None else heading
+    return join_streams(log.wheels, log.gnss, stated, same_clock=log.heading_is_of_position)
 
 
 def join_streams(
@@ -213,6 +229,13 @@ def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindo
         begin, end, length, turn_begin, turn_end,
         np.floor(at_fix[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
+
+
+def cut_chords(drive: DriveArrays) -> Chords:
+    """Cut a drive into spans of `CHORD_S` from fix to fix, without a heading."""
+    rows = np.unique(np.floor(drive.fix_t / CHORD_S), return_index=True)[1]
+    left, right = (np.diff(drive.until_fixes(speed)[rows]).real for speed in (drive.v_left, drive.v_right))
+    return Chords(np.diff(drive.fix_t[rows]), np.diff(drive.fix[rows]), left, right)
 
 
 def _value_length(drive: DriveArrays) -> float:

@@ -65,9 +65,10 @@ OVERLAP = 1.0
 RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
 """A robot lags its wheels by up to 0.1 s, which no drive separates from a delay of the streams."""
 
-CLOCK_STD_S = 0.05
-"""A body follows a change of speed later or earlier than a turn, which looks as if its position lagged its heading: by
-0.05 s rms on 50 rigid-body drives without any delay, by 0.04 s on five recorded ones."""
+CLOCK_S_PER_M = 0.1
+"""A body follows a change of speed later than a turn, which looks as if its position lagged its heading: in parts of b,
+0.1 s/m rms on 19 rigid-body drives without any delay (0.03 s rms where b is 0.5 to 0.8 m, 0.11 s where it is 1.1 m),
+0.04 s rms on five recorded ones of 1.1 m."""
 
 SCALE_STD = 0.003
 """Slip that varies with speed and turns looks like a scale: by so much rms on the same drives."""
@@ -75,6 +76,11 @@ SCALE_STD = 0.003
 SLIPPING = 0.08
 """Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show
 neither a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 to 18 %."""
+
+TURNS_SLIPPING, LEAST_TURN_RAD = 0.14, 0.2
+"""The same for turns within a second, a share of their size: a body that slides follows its wheels by half a second
+later, which is no clock. On firm ground 4 to 13 %, on fast simulated ice 15 to 22 %. Smaller turns than the second
+are mostly noise."""
 
 ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 """An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
@@ -144,20 +150,31 @@ class AlignmentFit(NamedTuple):
     @property
     def heading_scatter(self) -> float:
         """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
-        noise = math.sqrt(2.0) * self.drive.fix_std_m / self.windows.length_m
-        across = math.sqrt(max(self.across_std**2 - noise**2, 0.0))
-        return max(across, float(self.fit.scale[-1]) / math.sqrt(2.0))
+        return max(self.across_scatter, float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
-    def across_std(self) -> float:
-        """Robust scatter of the displacements across the heading, over the window's length [rad]."""
-        return float(self.fit.scale[len(self.windows.begin)]) / self.windows.length_m
+    def across_scatter(self) -> float:
+        """Robust scatter of the displacements across the heading beyond the fixes' noise, over the length [rad]."""
+        return self._beyond_noise(float(self.fit.scale[len(self.windows.begin)]))
 
     @property
     def slip_std(self) -> float:
         """Robust scatter of the displacements along the path beyond the fixes' noise, over the window's length."""
-        noise = math.sqrt(2.0) * self.drive.fix_std_m
-        return math.sqrt(max(float(self.fit.scale[0]) ** 2 - noise**2, 0.0)) / self.windows.length_m
+        return self._beyond_noise(float(self.fit.scale[0]))
+
+    def _beyond_noise(self, scatter_m: float) -> float:
+        return math.sqrt(max(scatter_m**2 - 2.0 * self.drive.fix_std_m**2, 0.0)) / self.windows.length_m
+
+    @property
+    def turn_slip(self) -> float:
+        """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
+        turned = _Model(self.drive, self.windows, self.width_m).turned
+        return float(self.fit.scale[-1]) / max(math.sqrt(float(np.mean(turned**2))), LEAST_TURN_RAD)
+
+    @property
+    def slips(self) -> bool:
+        """Whether the wheels slip too much to show a scale or a delay."""
+        return self.slip_std > SLIPPING or self.turn_slip > TURNS_SLIPPING
 
     def expected_motion(self) -> tuple[Complexes, Floats]:
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
@@ -175,7 +192,7 @@ class AlignmentFit(NamedTuple):
         values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
         covariance = jacobian @ self.fit.covariance @ jacobian.T
         # at one speed, positions that lag look like an antenna further back
-        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.drive)) ** 2
+        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.drive, self.width_m)) ** 2
         return Geometry(values, covariance)
 
 
@@ -192,9 +209,9 @@ def window_residuals(found: AlignmentFit) -> WindowResiduals:
     return WindowResiduals(before, after, turn_before, turn_after, model.turned)
 
 
-def _clock_std_s(drive: DriveArrays) -> float:
+def _clock_std_s(drive: DriveArrays, width_m: float) -> float:
     """Return what no drive shows of the time between position and heading, or of a robot's response."""
-    return RESPONSE_STD_S if drive.same_clock else CLOCK_STD_S
+    return RESPONSE_STD_S if drive.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
 
 
 def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
@@ -246,7 +263,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     covariance[TH, TH] += RESPONSE_STD_S**2
     covariance[A, A] += SCALE_STD**2
     if not drive.same_clock:
-        covariance[TP, TP] += CLOCK_STD_S**2
+        covariance[TP, TP] += _clock_std_s(drive, width_m) ** 2
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
     weight = drive.wheel_dt * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))

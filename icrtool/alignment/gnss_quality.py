@@ -15,7 +15,8 @@ from icrtool.alignment.gnss_steps import FixSteps
 from icrtool.alignment.misreported_fixes import find_misreported
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
+from icrtool.records.measurements import FixStatistics
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, PositionFixes
 from icrtool.records.tables import RobotLog
 
 LARGEST_SANE_GNSS_STD_M = 100.0
@@ -56,8 +57,7 @@ class GnssQuality:
     fix_class : uint8 (m,), keys of `CLASSES`
     misreported : bool (m,), fixes that claim to be fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
-    step_std_m : by class name, white noise from step to step [m]; NaN where there are too few steps
-    jump_stamp_ns : (j,) first fix after a jump; jump_m : (j,) its size
+    statistics : of the classes, and the jumps
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
     """
 
@@ -65,9 +65,7 @@ class GnssQuality:
     fix_class: Bytes
     misreported: Bools
     down_weighted: Bools
-    step_std_m: dict[str, float]
-    jump_stamp_ns: Ints
-    jump_m: Floats
+    statistics: FixStatistics
     losses_ns: Ints
     warnings: tuple[str, ...]
 
@@ -99,9 +97,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
         fix_class=kinds,
         misreported=misreported,
         down_weighted=down,
-        step_std_m=white,
-        jump_stamp_ns=gnss.stamp_ns[steps.jump_row],
-        jump_m=steps.jump_m,
+        statistics=FixStatistics(_class_std(gnss, kinds), white, gnss.stamp_ns[steps.jump_row], steps.jump_m),
         losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
         warnings=(),
     )
@@ -202,9 +198,16 @@ def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: 
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
             notes.append(
                 f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
-                f"{quality.step_std_m[name]:.2g} m: that is used"
+                f"{quality.statistics.step_std_m[name]:.2g} m: that is used"
             )
     return notes
+
+
+def _class_std(gnss: PositionFixes, kinds: Bytes) -> dict[str, float]:
+    """Return the median standard deviation of the fixes of each class [m], by its name; NaN for no such fixes."""
+    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    given = {name: std[(kinds == code) & np.isfinite(std)] for code, name in CLASSES.items()}
+    return {name: float(np.median(one)) if len(one) else math.nan for name, one in given.items()}
 
 
 def _counted(rows: Bools) -> str:

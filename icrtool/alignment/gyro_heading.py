@@ -1,10 +1,11 @@
 """Heading from turn rates, courses over ground and absolute headings, in a Kalman filter and smoother.
 
 Each source has an error model whose sizes the likelihood of the log chooses: a turn rate has a random walk of its
-integral and of its bias; a course has the noise of the fixes and an ICR that varies from window to window; an absolute
-heading (attitude sensor, bearing between two antennas) has a constant offset, an error that wanders slowly, white
-noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale, delays, ICR) come from
-the whole log; what varies in time has a causal estimate (the past alone, constants excepted) and a smoothed one.
+integral and of its bias; a course over ground has the noise of the fixes and an ICR that varies from window to
+window; an absolute heading (attitude sensor, bearing between two antennas) has a constant offset, an error that
+wanders slowly, white noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale,
+delays, ICR) come from the whole log; what varies in time has a causal estimate (the past alone, constants excepted)
+and a smoothed one.
 """
 
 from __future__ import annotations
@@ -54,11 +55,11 @@ MOST_EVENTS = 2000
 NOISES = {
     "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
     "bias": np.radians([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0]),
-    "course": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
+    "fixes": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
     "slip": np.array([0.003, 0.01, 0.02, 0.04, 0.08, 0.16]),
 }
-"""Random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)]; noise of a course in that of the
-fixes; standard deviation of the ICR from window to window [m]."""
+"""Random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)]; noise of the fixes in the stated
+one; standard deviation of the ICR from window to window [m]."""
 
 NOISES_OF_A_SOURCE = {
     "white": np.array([0.25, 0.5, 1.0, 2.0, 4.0]),
@@ -145,7 +146,7 @@ def estimate_heading(
         noises = problem.choose(NOISES, noises)
         better = problem.guess(noises)
         turned = float(np.abs(better.bias - guess.bias).max()) * problem.window_s
-        if turned < LARGE_BIAS_RAD and abs(better.late - guess.late) < LONG_DELAY_S:
+        if turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S:
             break
         guess = better
     if absolute:
@@ -234,7 +235,7 @@ class _Problem:
         r = self.std**2
         course = self.kind == COURSE
         r[course] = alike * (
-            (noises["course"] * self.std[course]) ** 2
+            (noises["fixes"] * self.std[course]) ** 2
             + (noises["slip"] * self.of_x[course]) ** 2
             + LEAST_COURSE_STD_RAD**2
         )
@@ -281,8 +282,8 @@ class _Problem:
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
         bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
-        x, late = float(states[-1, X]), float(states[-1, DELAY])
-        return Guess(bias, float(bias_std), float(scale_std), x, late, self.middle)
+        x, delay_s = float(states[-1, X]), float(states[-1, DELAY])
+        return Guess(bias, float(bias_std), float(scale_std), x, delay_s, self.middle)
 
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate with some noises."""

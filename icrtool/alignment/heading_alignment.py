@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.conventions import Convention
 from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.gnss_steps import unbroken
@@ -47,14 +48,12 @@ class CourseAngles(NamedTuple):
     angle : (w,) heading minus course over ground [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading of the other handedness
     scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
-    noise_rad : standard deviation of `angle` by the noise of the fixes
     duration_s : median duration of a window
     """
 
     angle: Floats
     mirrored: Floats
     scattered: int
-    noise_rad: float
     duration_s: float
 
     @property
@@ -86,7 +85,6 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
         int(np.count_nonzero(went & ~led)),
-        drive.fix_std_m * math.sqrt(2.0) / windows.length_m,
         float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
     )
 
@@ -109,20 +107,20 @@ class HeadingAlignment:
     """
 
     source: str
-    parts: str
-    windows: int
-    offset_rad: float
-    offset_std_rad: float
-    scatter_rad: float
-    agreement: float
-    mirrored_agreement: float
-    applied_mirror: bool
-    applied_offset_rad: float
-    applied_std_rad: float
-    applied_correlation_s: float
-    std_rad: float
-    name: OffsetName
-    warnings: tuple[str, ...]
+    parts: str = ""
+    windows: int = 0
+    offset_rad: float = math.nan
+    offset_std_rad: float = math.nan
+    scatter_rad: float = math.nan
+    agreement: float = math.nan
+    mirrored_agreement: float = math.nan
+    applied_mirror: bool = False
+    applied_offset_rad: float = 0.0
+    applied_std_rad: float = 0.0
+    applied_correlation_s: float = 0.0
+    std_rad: float = math.nan
+    name: OffsetName = NO_NAME
+    warnings: tuple[str, ...] = ()
 
     @property
     def is_estimated(self) -> bool:
@@ -130,11 +128,9 @@ class HeadingAlignment:
         return math.isfinite(self.std_rad)
 
     @property
-    def remaining(self) -> tuple[float, float]:
-        """Sense (+1 or -1) and offset [rad] of the log's heading that are still to be corrected."""
-        if self.is_estimated:
-            return 1.0, 0.0
-        return -1.0 if self.applied_mirror else 1.0, self.applied_offset_rad
+    def remaining_offset_rad(self) -> float:
+        """Offset of the log's heading that is still to be corrected."""
+        return 0.0 if self.is_estimated else self.applied_offset_rad
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers for run.json, angles in degrees, None for what is not known."""
@@ -160,8 +156,7 @@ class HeadingAlignment:
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str,
-    *, mirrored: bool, pose_mirrored: bool = False,
+    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str, convention: Convention
 ) -> HeadingAlignment:  # fmt: skip
     """Return offset and noise of a stated heading, and what is applied.
 
@@ -169,21 +164,21 @@ def align_heading(
     ----------
     fit : of this heading; None where the drive is too short
     source : kind of sensor
-    mirrored : its handedness is the other one; pose_mirrored : it is of the position's poses, and so is theirs
+    convention : that the streams were found to have
     """
+    mirrored = convention.heading < 0
     given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
     fixed = -math.radians(given) if given != "auto" and corrects else 0.0
     nothing = HeadingAlignment(
-        source=source, parts="", windows=len(course.angle), offset_rad=math.nan, offset_std_rad=math.nan,
-        scatter_rad=math.nan, agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
-        applied_mirror=mirrored and corrects, applied_offset_rad=fixed, applied_std_rad=0.0, applied_correlation_s=0.0,
-        std_rad=math.nan, name=NO_NAME, warnings=(),
+        source, windows=len(course.angle), agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
+        applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
     )  # fmt: skip
     if fit is None:
         return nothing
+    pose_mirrored = mirrored and convention.position < 0 and fit.drive.same_clock
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
-    scatter = math.sqrt(max(fit.across_std**2 - course.noise_rad**2, 0.0))
+    scatter = fit.across_scatter
     text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
     significant = _significant(offset - fixed, std)
     applied, notes = fixed, []
@@ -221,13 +216,8 @@ def align_estimated_heading(
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
     std = derived.estimate.median_std
-    own = HeadingAlignment(
-        source=derived.source, parts=derived.why, windows=0, offset_rad=math.nan, offset_std_rad=math.nan,
-        scatter_rad=math.nan,
-        agreement=math.nan, mirrored_agreement=math.nan, applied_mirror=False, applied_offset_rad=0.0,
-        applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std, name=NO_NAME,
-        warnings=(f"{log.name}: the heading is estimated: {derived.why}",),
-    )  # fmt: skip
+    estimated = f"{log.name}: the heading is estimated: {derived.why}"
+    own = HeadingAlignment(derived.source, derived.why, std_rad=std, warnings=(estimated,))
     if stated is None or derived.attitude_offset is None:
         return own
     offset, offset_std = derived.attitude_offset
@@ -308,9 +298,8 @@ def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
-    topic = next((f" {stream.topic}" for stream in log.streams if stream.role == "heading"), "")
     advice = "choose another with topics.heading, or go on with --set frames.heading_offset_deg=0"
-    return DataError(log.name, f"the heading{topic} {why}", f"{found}; {advice}")
+    return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
 
 
 def _near_share(angle: Floats) -> float:

@@ -106,7 +106,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     return found
 
 
-def fuse_heading(log: RobotLog, drive: DriveArrays, *, mirrored: bool = False) -> DerivedHeading | None:
+def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
     None without a gyro, where the gyro contradicts the courses over ground, where the stated heading alone is as good,
@@ -114,14 +114,11 @@ def fuse_heading(log: RobotLog, drive: DriveArrays, *, mirrored: bool = False) -
 
     Parameters
     ----------
-    drive : of the log, its heading of the right handedness
-    mirrored : that of the log is of the other one
+    drive : of the log
     """
     if drive.same_clock:
         return None
-    sense = -1.0 if mirrored else 1.0
-    stated = HeadingSamples(log.heading.stamp_ns, sense * log.heading.heading_rad, log.heading.var_rad2)
-    found = _with_gyro(log, drive, stated)
+    found = _with_gyro(log, drive, log.heading)
     if found is None or found.estimate.median_std > math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD):
         return None
     return found
@@ -155,14 +152,6 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
     return best
 
 
-def _offset(estimate: HeadingEstimate) -> float:
-    return math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
-
-
-def _offset_std(estimate: HeadingEstimate) -> float:
-    return float(estimate.constants_std[OFFSET])
-
-
 def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
     """Return the bearing of the longest baseline between two antennas, and its length [m]."""
     found = [one for one in (antenna_heading(log, other.fixes, turn) for other in log.other_receivers) if one]
@@ -175,10 +164,9 @@ def _derived(
 ) -> DerivedHeading:  # fmt: skip
     """Return the record of an estimate."""
     epoch = int(log.wheels.stamp_ns[0])
-    topics = {stream.role: stream.topic for stream in log.streams}
     bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
     parts = [bias if gyro_topic else "wheels (no usable turn rate in the log)", "course over ground"]
-    names = [gyro_topic or "wheels", topics.get("gnss", "positions")]
+    names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
     source: Source = "gyro_course" if gyro_topic else "wheels_course"
     if baseline_m > 0.0:
         source = "antenna_pair"
@@ -188,8 +176,9 @@ def _derived(
     if stated is not None:
         source = "fused"
         parts.insert(0, f"orientation (errs by {math.degrees(attitude_error(estimate)):.1f}°)")
-        names.insert(0, topics.get("heading", "orientation"))
-        attitude_offset = _offset(estimate), _offset_std(estimate)
+        names.insert(0, log.topic("heading", "orientation"))
+        offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
+        attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = replace(stated, stamp_ns=stated.stamp_ns - lag, heading_rad=stated.heading_rad - attitude_offset[0])
     std = math.degrees(estimate.median_std)
@@ -265,5 +254,8 @@ def rate_of_heading(log: RobotLog) -> GyroAxes | None:
         return None
     turned = np.diff(np.unwrap(heading.heading_rad)[rows])
     rate = -turned / (np.diff(stamps) / 1e9)
-    topic = next((stream.topic for stream in log.streams if stream.role == "heading"), "heading")
-    return GyroAxes(topic, stamps[:-1] + np.diff(stamps) // 2, np.column_stack([0.0 * rate, 0.0 * rate, rate]))
+    return GyroAxes(
+        log.topic("heading", "heading"),
+        stamps[:-1] + np.diff(stamps) // 2,
+        np.column_stack([0.0 * rate, 0.0 * rate, rate]),
+    )

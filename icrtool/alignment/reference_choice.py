@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.conventions import apply_to_drive, decide_conventions
+from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.drive_windows import cut_windows, drive_arrays
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.stream_checks import check_streams
@@ -60,7 +60,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
     if not residual < min(BETTER * chosen.residual_m, POOR_M):
         return log
-    topics = [next(stream.topic for stream in one.streams if stream.role == "gnss") for one in (best, log)]
+    topics = [one.topic("gnss") for one in (best, log)]
     against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "no relation"
     why = f"agrees with wheels and heading to {residual:.2f} m over {LENGTH_M:.0f} m, {topics[1]}: {against}"
     streams = tuple(
@@ -82,7 +82,7 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     windows = cut_windows(drive, LENGTH_M)
     free = config.frames.heading == "auto"
     decision = decide_conventions(drive, windows, metric=log.datum is None and free, mirror_allowed=free)
-    found = estimate_alignment(apply_to_drive(drive, decision.convention), windows, width)
+    found = estimate_alignment(drive_arrays(apply_convention(log, decision.convention)), windows, width)
     if found is None:
         return NONE
     count = len(windows.begin)

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from icrtool.alignment.estimator import PRIOR_STD, SLIPPING, TP, AlignmentFit
+from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit
 from icrtool.config import Config
-from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
 SIGNIFICANT_SIGMAS = 2.5
@@ -23,6 +22,11 @@ class Delay(NamedTuple):
 
     value_s: float
     std_s: float
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers for run.json."""
+        known = math.isfinite(self.value_s)
+        return {"delay_s": self.value_s if known else None, "delay_std_s": self.std_s if known else None}
 
     @property
     def is_significant(self) -> bool:
@@ -40,7 +44,7 @@ UNKNOWN = Delay(math.nan, math.nan)
 
 @dataclass(frozen=True, slots=True)
 class StreamDelays:
-    """What was found, and the log with what was clear, or configured, corrected.
+    """What was found, and what is corrected: what was clear, or is configured.
 
     Attributes
     ----------
@@ -49,7 +53,6 @@ class StreamDelays:
     applied_heading_s, applied_gnss_s : corrected
     """
 
-    log: RobotLog
     heading: Delay
     gnss: Delay
     apart: Delay
@@ -73,26 +76,27 @@ class StreamDelays:
         agree = PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
         return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
+    def apply(self, log: RobotLog) -> RobotLog:
+        """Return the log with heading and position reference taken earlier; the same log where nothing is applied."""
+        heading_s = self.applied_gnss_s if self.together else self.applied_heading_s
+        moved: dict[str, Any] = {
+            name: replace(stream, stamp_ns=stream.stamp_ns - round(delay_s * 1e9))
+            for name, stream, delay_s in (("gnss", log.gnss, self.applied_gnss_s), ("heading", log.heading, heading_s))
+            if delay_s != 0.0
+        }
+        return replace(log, **moved) if moved else log
+
     def heading_summary(self) -> dict[str, Any]:
         """Return the heading's numbers for run.json."""
-        known = math.isfinite(self.heading.value_s)
-        return {
-            "delay_s": self.heading.value_s if known else None,
-            "delay_std_s": self.heading.std_s if known else None,
-            "applied_delay_s": self.applied_heading_s,
-        }
+        return self.heading.summary() | {"applied_delay_s": self.applied_heading_s}
 
     def gnss_summary(self) -> dict[str, Any]:
         """Return the fixes' numbers for run.json; what was applied stands with the filter, as reference_delay_s."""
-        known = math.isfinite(self.gnss.value_s)
-        return {
-            "delay_s": self.gnss.value_s if known else None,
-            "delay_std_s": self.gnss.std_s if known else None,
-        }
+        return self.gnss.summary()
 
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
-    """Return the delays of heading and positions against the wheels, with what is clear, or configured, corrected."""
+    """Return the delays of heading and positions against the wheels, and which of them are corrected."""
     field = config.filter.preset == "field"
     found = {"heading": UNKNOWN, "position": UNKNOWN}
     apart = UNKNOWN
@@ -101,11 +105,10 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
             value, std = fit.estimate(f"{what}_delay")
             found[what] = Delay(value, std) if std < 2 * LARGEST_STD_S else UNKNOWN
         apart = Delay(*fit.estimate("position_after_heading"))
-    topics = {stream.role: stream.topic for stream in log.streams}
-    together = "gnss" in topics and topics["gnss"] == topics.get("heading")
+    together = log.heading_is_of_position
     given = {"heading": config.frames.heading_delay_s, "position": config.frames.reference_delay_s}
     applied, notes = {"heading": 0.0, "position": 0.0}, []
-    if field and fit is not None and fit.slip_std <= SLIPPING:
+    if field and fit is not None and not fit.slips:
         applied = _clear_delays(found["heading"], found["position"], apart, together=together)
         notes = _delay_notes(log.name, applied, {**found, "apart": apart}, given, together=together)
     for what, setting in given.items():
@@ -113,31 +116,9 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
             applied[what] = setting
     if together:
         applied["heading"] = 0.0
-    shifted = delayed(log, applied["position"])
-    if applied["heading"] and not together:
-        shift = round(applied["heading"] * 1e9)
-        moved: HeadingSamples = replace(shifted.heading, stamp_ns=shifted.heading.stamp_ns - shift)
-        shifted = replace(shifted, heading=moved)
     return StreamDelays(
-        shifted, found["heading"], found["position"], apart, together,
-        applied["heading"], applied["position"], tuple(notes),
-    )  # fmt: skip
-
-
-def delayed(log: RobotLog, delay_s: float) -> RobotLog:
-    """Return the log with the position reference taken `delay_s` earlier.
-
-    The heading goes with it where both come from the same messages.
-    """
-    if delay_s == 0.0:
-        return log
-    shift = round(delay_s * 1e9)
-    gnss: PositionFixes = replace(log.gnss, stamp_ns=log.gnss.stamp_ns - shift)
-    topics = {stream.role: stream.topic for stream in log.streams}
-    heading: HeadingSamples = log.heading
-    if topics.get("gnss") == topics.get("heading", ""):
-        heading = replace(heading, stamp_ns=heading.stamp_ns - shift)
-    return replace(log, gnss=gnss, heading=heading)
+        found["heading"], found["position"], apart, together, applied["heading"], applied["position"], tuple(notes)
+    )
 
 
 def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> dict[str, float]:
@@ -173,15 +154,14 @@ def _delay_notes(
     """Return a line for each stream that was moved."""
     notes = []
     keys = {"heading": "frames.heading_delay_s", "position": "frames.reference_delay_s"}
+    alike = not together and applied["heading"] == applied["position"] and given["heading"] == "auto"
+    also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
     for what, key in keys.items():
         value = applied[what]
-        if value == 0.0 or given[what] != "auto" or (together and what == "heading"):
+        if value == 0.0 or given[what] != "auto" or (together and what == "heading") or (alike and what == "position"):
             continue
-        if not together and what == "position" and value == applied["heading"]:
-            notes.append(f"{name}: the position is corrected alike: nothing shows that its delay differs")
-            continue
-        subject = "the position and its heading" if together else f"the {what}"
-        lags = ("lag" if value > 0 else "lead") + ("" if together else "s")
+        subject, lags = ("the position and its heading", "lag") if together else (f"the {what}", "lags")
         std = (found[what] if found[what].is_significant else found["apart"]).std_s
-        notes.append(f"{name}: {subject} {lags} the wheels by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it")
+        fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
+        notes.append(f"{name}: {fact} by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it{also}")
     return notes

@@ -15,21 +15,21 @@ from icrtool.records.samples import GyroAxes
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
 """Skid-steer robots turn about this much of what their wheels would without slip."""
 
-RESPONSE_S = 0.15
-"""How much later robots answer their wheels; measured on rigid-body simulated ones: 0.1 s."""
+RESPONSE_S = 0.1
+"""How much later robots answer their wheels, on rigid-body simulated drives."""
 
 ALONG_AN_AXIS = 0.95
 """A sensor whose axis is this near to the vertical (cosine) is mounted along it."""
 
 BETTER = 0.9
-"""Another axis than z up is used where course changes scatter about it by no more than this share."""
+"""Another axis than z up is used where turns of the course over ground scatter about it by no more than this share."""
 
 LARGEST_CHANGE_RAD = 2.5
 HOLE_IN_INTERVALS, SHORTEST_HOLE_S = 5.0, 0.1
 """A turn rate has a hole where its interval is so many times the usual one, and at least so long."""
 
 LEAST_AXIS = 0.3
-"""A gyro that shows less than this share of the course changes shows no axis."""
+"""A gyro that shows less than this share of the changes of the course over ground shows no axis."""
 
 
 def wheel_rate(drive: DriveArrays, width_m: float) -> TurnRate:
@@ -45,7 +45,7 @@ def wheel_rate(drive: DriveArrays, width_m: float) -> TurnRate:
 def gyro_rate(drive: DriveArrays, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, str] | None:
     """Return the turn rate of a gyro about the vertical, and how it is mounted; None where it does not cover courses.
 
-    Course changes of the fixes are regressed on the turns about all three axes of the sensor.
+    Changes of the course over ground are regressed on the turns about all three axes of the sensor.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
     begin, end, change = course_changes(drive)
@@ -68,7 +68,7 @@ def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Flo
 
     Parameters
     ----------
-    turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course [rad]
+    turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course over ground [rad]
     """
     up = np.array([0.0, 0.0, -1.0])
     small = np.abs(turned).max(axis=1) < LARGEST_CHANGE_RAD

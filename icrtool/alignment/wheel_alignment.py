@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
-from icrtool.alignment.estimator import SLIPPING, AlignmentFit
+from icrtool.alignment.estimator import AlignmentFit
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.samples import WheelSamples
@@ -44,7 +44,7 @@ FUSED_CORRELATION = 0.9995
 
 @dataclass(frozen=True, slots=True)
 class WheelAlignment:
-    """The estimate, and the log with what was certain corrected.
+    """What is known of the wheels, and what was done with it.
 
     Attributes
     ----------
@@ -54,7 +54,6 @@ class WheelAlignment:
     held_share : share of samples, while moving, that repeat the one before
     """
 
-    log: RobotLog
     scale: float
     scale_std: float
     applied: tuple[float, float]
@@ -140,7 +139,7 @@ def dead_or_copied(log: RobotLog) -> list[str]:
     return []
 
 
-def held_share(wheels: WheelSamples) -> float:
+def _held_share(wheels: WheelSamples) -> float:
     """Return the share of samples, while moving, that repeat the one before on both sides."""
     left, right = wheels.v_left_mps, wheels.v_right_mps
     moving = (np.abs(left) + np.abs(right))[1:] > 0
@@ -150,7 +149,7 @@ def held_share(wheels: WheelSamples) -> float:
     return float(np.count_nonzero(same & moving) / np.count_nonzero(moving))
 
 
-def held_note(wheels: WheelSamples, share: float) -> list[str]:
+def _held_note(wheels: WheelSamples, share: float) -> list[str]:
     """Return a warning where wheel values are held, with how often they change."""
     if share <= HELD_SHARE:
         return []
@@ -180,9 +179,29 @@ def refuse_standing(log: RobotLog, drive: DriveArrays, windows: DriveWindows) ->
         )
 
 
-def find_scales(
-    fit: AlignmentFit | None, config: Config, *, sound: bool, corrects: bool
-) -> tuple[tuple[float, float], list[str]]:
+def align_wheels(
+    log: RobotLog, config: Config, fit: AlignmentFit | None, configured: tuple[float, float], notes: list[str],
+    *, sound: bool,
+) -> WheelAlignment:  # fmt: skip
+    """Return the scales of the sides, and what is applied.
+
+    Parameters
+    ----------
+    log : with the configured scales (left, right); fit : of it, None where the drive is too short
+    notes : what else was found
+    sound : no side is dead or a copy of the other
+    """
+    applied, of_scale = _find_scales(fit, config, sound=sound)
+    a, a_std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
+    share = _held_share(log.wheels)
+    notes = [*notes, *of_scale, *_held_note(log.wheels, share), *_fused_note(log)]
+    return WheelAlignment(
+        a, a_std, applied, (abs(configured[0]), abs(configured[1])), share,
+        tuple(f"{log.name}: {note}" for note in notes),
+    )  # fmt: skip
+
+
+def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[str]]:
     """Return the factors to apply to the speeds of the left and of the right side, and what to report.
 
     Notes
@@ -193,10 +212,13 @@ def find_scales(
     if fit is None:
         return (1.0, 1.0), []
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-    if fit.slip_std > SLIPPING:
-        slip = f"the wheels slip: their distance differs from that of the positions by {100 * fit.slip_std:.0f} % every"
-        return (1.0, 1.0), [f"{slip} {fit.windows.length_m:.0f} m; no scale and no delay is corrected"]
-    may = corrects and sound and not given
+    if fit.slips:
+        slip = (
+            f"their distance differs by {100 * fit.slip_std:.0f} % every {fit.windows.length_m:.0f} m from the robot's"
+        )
+        turns = f"their turns by {100 * fit.turn_slip:.0f} %"
+        return (1.0, 1.0), [f"the wheels slip: {slip}, {turns}; no scale and no delay is corrected"]
+    may = config.filter.preset == "field" and sound and not given
     scale, notes = _common_scale(fit, may=may)
     difference, std = _side_difference(fit)
     if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS * std):
@@ -234,7 +256,7 @@ def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
     return 1.0, [f"{text}: check wheel radius, encoder resolution and units"]
 
 
-def fused_note(log: RobotLog) -> list[str]:
+def _fused_note(log: RobotLog) -> list[str]:
     """Warn of wheels that are another filter's output: their turn rate is the gyro's."""
     stream = next((one for one in log.streams if one.role == "wheels"), None)
     fused_type = stream is not None and any(word in stream.message_type for word in ("Odometry", "Twist"))

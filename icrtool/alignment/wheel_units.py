@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icrtool.alignment.drive_windows import CHORD_S, cut_chords, join_streams
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
-from icrtool.records.samples import PositionFixes, WheelSamples, WheelUnit
+from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 
-WINDOW_S = 2.0
 LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
-"""The distance by the position reference is compared with that of the wheels over windows of this length: straight
+"""The distance by the position reference is compared with that of the wheels over spans of time: straight
 ones, in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
 
 FASTEST_MPS = 100.0
@@ -60,7 +60,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     wheels = log.wheels
     if wheels.unit == "mps":
         return log
-    topic = next((stream.topic for stream in log.streams if stream.role == "wheels"), "wheels")
+    topic = log.topic("wheels", "wheels")
     try:
         factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
     except ConfigError:
@@ -131,38 +131,24 @@ def _spikes(speed: Floats) -> Bools:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over windows; None where too few windows show one.
+    """Compare distances by reference and wheels over `CHORD_S`; None where too few spans show one.
 
     Notes
     -----
-    Straight windows where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
+    Straight spans where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
     before and after. Senses of the wheels do not matter.
     """
-    if len(gnss.stamp_ns) < 2:
+    if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
-    begin, end, window = max(stamps[0], gnss.stamp_ns[0]), min(stamps[-1], gnss.stamp_ns[-1]), int(WINDOW_S * 1e9)
-    inside = gnss.stamp_ns[(gnss.stamp_ns >= begin) & (gnss.stamp_ns < end)]
-    # Only windows that a fix begins: one stamp that is years off would make billions of them.
-    edges = begin + window * np.unique((inside - begin) // window)
-    if len(edges) < 2:
-        return None
-    places = np.searchsorted(gnss.stamp_ns, edges)
-    places = places[places < len(gnss.stamp_ns)]
-    moments = gnss.stamp_ns[places]
-    interval = np.diff(stamps) / 1e9
-    sides = []
-    for speed in (left, right):
-        travelled = np.concatenate([[0.0], np.cumsum(speed[:-1] * interval)])
-        sides.append(np.abs(np.diff(np.interp(moments, stamps, travelled))))
+    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    chords = cut_chords(join_streams(WheelSamples(stamps, left, right), gnss, nothing, same_clock=False))
+    sides, chord = (np.abs(chords.left), np.abs(chords.right)), np.abs(chords.step)
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
-    step = np.diff(gnss.north_m[places]) + 1j * np.diff(gnss.east_m[places])
-    chord = np.abs(step)
-    whole = np.abs(np.diff(moments) / 1e9 - WINDOW_S) < WINDOW_S / 4
-    usable = whole & (chord > LEAST_MOVE_M) & (distance > 0)
+    usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_MOVE_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
     if np.count_nonzero(straight) < FEWEST_WINDOWS:
-        bend = np.full(len(step), np.inf)
-        bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
+        bend = np.full(len(chord), np.inf)
+        bend[1:-1] = np.abs(np.angle(chords.step[2:] * np.conj(chords.step[:-2]))) / 2
         beside = usable.copy()
         beside[1:-1] &= usable[2:] & usable[:-2]
         straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)

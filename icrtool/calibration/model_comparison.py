@@ -16,7 +16,7 @@ from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
 from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
 from icrtool.calibration.record import Calibration
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.error_statistics import summarise
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
@@ -119,7 +119,7 @@ def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> Compar
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         scores=tuple(scores),
         chosen=wheels.chosen,
-        fits={name: fit.fitted for name, fit in wheels.fits.items()},
+        fits={name: fit.fitted for name, fit in (wheels.fits | (turned.fits if turned else {})).items()},
         best=wheels.recommended,
         width_m=recording.width_m,
         heading=heading,
@@ -200,6 +200,15 @@ def _turned_scores(
         yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 
+def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
+    """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
+    held = recording.held_s
+    psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
+    mean = (run.table.v_left_mps + run.table.v_right_mps) / 2.0
+    middle = np.exp(0.5j * (psi + np.append(psi[1:], psi[-1])))
+    return psi, np.concatenate([[0.0], np.cumsum(held * mean * middle)[:-1]])
+
+
 def _errors_along(run: Run, recording: Recording, trials: Trials, icrs: FrozenIcrs) -> Floats:
     """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the measured turn rate.
 
@@ -208,11 +217,8 @@ def _errors_along(run: Run, recording: Recording, trials: Trials, icrs: FrozenIc
     With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
     ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
-    held, drive = recording.held_s, recording.drive
-    psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
-    mean = (run.table.v_left_mps + run.table.v_right_mps) / 2.0
-    middle = np.exp(0.5j * (psi + np.append(psi[1:], psi[-1])))
-    place = np.concatenate([[0.0], np.cumsum(held * mean * middle)[:-1]])
+    drive = recording.drive
+    psi, place = turned_path(run, recording)
     lever, turn = -1j * np.exp(1j * psi), np.exp(1j * (drive.heading - psi))
     arm = (icrs.y_icr_right + icrs.y_icr_left) / 2.0 - 1j * icrs.x_icr
     reference = drive.north + 1j * drive.east

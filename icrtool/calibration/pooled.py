@@ -21,8 +21,9 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Fold, Prediction, own_constants
+from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording, cut_windows, joined_steps
-from icrtool.motion.trials import PathAt, Trials, predicted_path
+from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
 
@@ -90,7 +91,12 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 
 def gyro_recording_of(run: Run) -> Recording:
     """Return a run as `recording_of`, with its gyro where it has one."""
-    return recording_of(run, next((one for one in measured_headings(run) if one.kind == "gyro"), None))
+    return heading_recording_of(run, "gyro")
+
+
+def heading_recording_of(run: Run, kind: str, *, width_m: float | None = None) -> Recording:
+    """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
+    return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
 
 
 def scaled_gyro(recording: Recording) -> Floats:
@@ -209,11 +215,6 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
     return lambda trials: errors_without(recording, trials, folds, 0, lambda _: found, steps)
 
 
-def calibrated_path(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> PathAt:
-    """Return the path that a calibration makes of a recording; see `calibrated`."""
-    return predicted_path(recording, *calibrated(calibration, recording, with_gyro=with_gyro))
-
-
 def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Prediction:
     """Return the model of a calibration for a recording, and the recording's constants.
 
@@ -237,7 +238,13 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
-    fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
+    return in_recording(
+        calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted, recording
+    )
+
+
+def in_recording(fitted: FittedModel, recording: Recording) -> Prediction:
+    """Return a model for a recording, and the recording's constants; raises DataError as `calibrated`."""
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
 
 

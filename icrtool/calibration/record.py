@@ -118,7 +118,7 @@ class ErrorSources(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """A path from wheel speeds alone, from the origin with heading zero; (n,) each."""
+    """A path from wheel speeds alone, from the origin with heading zero; (n,) each, heading clockwise, unwrapped."""
 
     stamp_ns: Ints
     forward_m: Floats
@@ -170,11 +170,11 @@ class Calibration:
 
     @property
     def width_m(self) -> float:
-        """Track width b."""
+        """Track width b [m]."""
         return float(self.robot["track_width_m"])
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs, multipliers and radius factors of the recommended model, and their covariance (7, 7)."""
+        """Return ICRs [m], multipliers and radius factors of the recommended model, and their covariance (7, 7)."""
         return self.fitted.geometry(self.width_m, self.typical)
 
     def controller_numbers(self) -> ControllerNumbers:
@@ -211,6 +211,10 @@ class Calibration:
     def odometry(self, log: RobotLog) -> Odometry:
         """Return the path that the wheels of a log make, from the origin with heading zero.
 
+        Parameters
+        ----------
+        log : of `icrtool.read_log`; its gyro is not used
+
         Notes
         -----
         A speed holds until the next sample; Euler steps, as in the dropout analysis.
@@ -224,7 +228,7 @@ class Calibration:
         return Odometry(wheels.stamp_ns, place.real, place.imag, heading)
 
     def warm_start(self) -> WarmStart:
-        """Return ICRs and their covariance for a filter to begin with."""
+        """Return the three ICRs [m] and their covariance [m^2] for a filter to begin with (`icrtool.fit`)."""
         geometry, covariance = self.geometry()
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m)
 

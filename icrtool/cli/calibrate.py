@@ -47,7 +47,7 @@ def command(
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import IcrToolError
     from icrtool.output.calibration_file import calibration_file, write_calibration
-    from icrtool.output.figures.calibration_picture import check_picture
+    from icrtool.output.picture_file import check_picture
     from icrtool.output.tables.calibration import format_calibration
     from icrtool.output.tables.held_out import format_result
 
@@ -122,10 +122,11 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.alignment.reference_choice import choose_reference
     from icrtool.alignment.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
-    from icrtool.output.figures.calibration_picture import write_picture
+    from icrtool.output.figures.calibration import residuals_figure
+    from icrtool.output.picture_file import save_picture
     from icrtool.output.stored_run import log_of
 
     log = read_log(source if run.directory is None else log_of(run), run.config)
     fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit
     if fit is not None:
-        write_picture(run.name, window_residuals(fit), plot)
+        save_picture(residuals_figure(run.name, window_residuals(fit)), plot)

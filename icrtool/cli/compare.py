@@ -41,8 +41,8 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.atomic_file import check_place, write_file
-    from icrtool.output.figures.calibration_picture import check_picture, write_transfer_picture
     from icrtool.output.json_file import json_bytes
+    from icrtool.output.picture_file import check_picture, save_picture
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
@@ -67,7 +67,9 @@ def command(
         if file is not None:
             write_file(file, content)
     if plot is not None:
-        write_transfer_picture(document, plot)
+        from icrtool.output.figures.transfer import transfer as transfer_figure
+
+        save_picture(transfer_figure(document), plot)
     if as_json:
         print_json("compare", document)
     elif not quiet:

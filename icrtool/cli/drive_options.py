@@ -69,37 +69,23 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
         raise click.BadParameter(why, param_hint="--change")
 
 
-class Degrees(click.FloatRange):
-    """An angle in degrees; the command gets radians."""
+def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
+    """Return what reads an angle in degrees, of a range where one is given, and gives radians."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:  # noqa: ANN401 - click's
-        """Return radians."""
-        return math.radians(super().convert(value, param, ctx))
+    def radians(text: Any) -> float:  # noqa: ANN401 - what click has: a text, or the default
+        return math.radians((within or click.FLOAT).convert(text, None, None))
+
+    return radians
 
 
 OPTIONS: dict[str, tuple[str, str | None, Any, str]] = {
-    "--icrs": (
-        "icrs_m",
-        "YR,YL,X",
-        icrs_text,
-        "True ICRs [m]; default: wider than the robot; of a study, the paper's.",
-    ),
+    "--icrs": ("icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default by the robot's width, or the study's."),
     "--path": ("kind", None, click.Choice(PATHS), "What is driven; in study convergence, this alone."),
-    "--duration": (
-        "duration_s",
-        "S",
-        POSITIVE,
-        "Length of the drive [s]; default 100, or that of --speeds or the study.",
-    ),
+    "--duration": ("duration_s", "S", POSITIVE, "Length of a drive [s]; default 100, or the study's."),
     "--speed": ("speed_mps", "MPS", POSITIVE, "Speed of the body; of the faster track on the spot."),
     "--radius": ("radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
     "--leg": ("leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
-    "--encoder-counts": (
-        "encoder_counts",
-        "N",
-        POSITIVE,
-        "Counts of a wheel revolution; default the robot's, or 8192.",
-    ),
+    "--encoder-counts": ("encoder_counts", "N", POSITIVE, "Counts of a wheel revolution; else the robot's, or 8192."),
     "--input-noise": ("input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of the track speeds, a sample."),
     "--input-bias": ("input_bias_mps", "MPS", float, "Bias of both track speeds."),
     "--gnss": ("gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: 0.01, 0.30 or so many metres."),

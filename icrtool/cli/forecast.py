@@ -44,7 +44,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.output.atomic_file import check_place, write_file
     from icrtool.output.calibration_file import open_calibration
-    from icrtool.output.figures.calibration_picture import check_picture, write_forecast_picture
+    from icrtool.output.picture_file import check_picture, save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
     if output is not None:
@@ -56,7 +56,10 @@ def command(
     if output is not None:
         write_file(output, forecast_csv(forecast, gyro))
     if plot is not None:
-        write_forecast_picture(forecast, path.name, budgets, measured_to_m(calibration), plot, gyro)
+        from icrtool.output.figures.forecast import forecast_figure
+
+        measured_m = measured_to_m(calibration)
+        save_picture(forecast_figure(forecast, path.name, budgets, measured_m, gyro), plot)
     if as_json:
         print_json("forecast", forecast_document(forecast, calibration, budgets, gyro))
     elif not quiet:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import Degrees, check_changes, drive_options, given_fields, place_text, span_text
+from icrtool.cli.drive_options import check_changes, degrees, drive_options, given_fields, place_text, span_text
 from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
     kind="curved", speed_mps=0.4, radius_m=1.5, leg_m=10.0, input_noise_mps=0.0, input_bias_mps=0.0, gnss_std_m="rtk",
     gnss_rate_hz=20.0,
 )  # fmt: skip
-@click.option("--start-heading", "start_heading_rad", metavar="DEG", type=Degrees(), default=30.0, show_default=True,
+@click.option("--start-heading", "start_heading_rad", metavar="DEG", type=degrees(), default=30.0, show_default=True,
               help="Heading at the start, clockwise from north.")  # fmt: skip
 @click.option("--wheels", type=click.Choice(["encoder", "commanded"]), default="encoder", show_default=True,
               help="Content of the wheel messages: counted travel, or the motor commands.")  # fmt: skip
@@ -55,13 +55,13 @@ ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
               help="The stamps of the fixes lag by this.")  # fmt: skip
 @click.option("--heading", "convention", type=click.Choice(["enu", "ned"]), default="enu", show_default=True,
               help="Convention of the Imu: REP-103, or REP-145's NED.")  # fmt: skip
-@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=Degrees(min=0), default=1.0, show_default=True,
-              help="White noise of the heading.")  # fmt: skip
-@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=Degrees(min=0), default=0.05,
+@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=degrees(NOT_NEGATIVE), default=1.0,
+              show_default=True, help="White noise of the heading.")  # fmt: skip
+@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=degrees(NOT_NEGATIVE), default=0.05,
               show_default=True, help="Headings are rounded to this.")  # fmt: skip
 @click.option("--heading-rate", "heading_rate_hz", metavar="HZ", type=POSITIVE, default=100.0, show_default=True,
               help="Headings a second.")  # fmt: skip
-@click.option("--heading-offset", "heading_offset_rad", metavar="DEG", type=Degrees(), default=0.0, show_default=True,
+@click.option("--heading-offset", "heading_offset_rad", metavar="DEG", type=degrees(), default=0.0, show_default=True,
               help="Added to every heading, clockwise.")  # fmt: skip
 @click.option("--heading-delay", "heading_delay_s", metavar="S", type=float, default=0.0, show_default=True,
               help="The stamps of the headings lag by this.")  # fmt: skip

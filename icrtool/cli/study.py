@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import Degrees, check_changes, drive_options, given_fields, numbers
+from icrtool.cli.drive_options import check_changes, degrees, drive_options, given_fields, numbers
 from icrtool.cli.fit import RUNS
+from icrtool.cli.options import POSITIVE
 from icrtool.cli.simulate import default_icrs, encoder_counts
 from icrtool.cli.terminal import show
 
@@ -55,7 +56,7 @@ def values_text(text: str) -> tuple[float, ...]:
 @click.option("--wheels", type=click.Choice(["ideal", "encoder"]),
               help="Wheel speeds without error, or counted travel.")  # fmt: skip
 @click.option("--rate", metavar="HZ", type=click.FloatRange(min=1, max=200), help="Wheel and heading samples a second.")
-@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=Degrees(min=0, min_open=True),
+@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=degrees(POSITIVE),
               help="White noise of the heading.")  # fmt: skip
 @options.plots
 @options.configuration

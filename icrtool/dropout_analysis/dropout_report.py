@@ -20,7 +20,7 @@ from icrtool.dropout_analysis.slip_events import leave_out_events, with_event_co
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.straight_and_turning import split_by_turning
-from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, configured_horizons_m, dropout
+from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
@@ -45,7 +45,7 @@ def dropout_report(
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
 ) -> DropoutReport:
-    """Return how far a robot can go without GNSS, with all that ``icrtool dropout-report`` gives.
+    """Return how far a robot can drive without GNSS, with all that ``icrtool dropout-report`` gives.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def dropout_report(
     if found is not None:
         further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 
-    horizons = _horizons(horizons_m if horizons_m is not None else configured_horizons_m(run), limits)
+    horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
     report = dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink)
     if without_events:
         report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)

@@ -17,7 +17,7 @@ WORST_COUNT = 10
 WORST_HORIZON_M = 10.0
 EXAMPLE_HORIZON_M = 15.0
 ALIKE_RAD = np.radians(10.0)
-STRAIGHT_SHARE = 0.05
+STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
 TYPICAL_OF = 30
 """Trials enough to find the median error."""
 PICTURED = ("icr", "no_slip")
@@ -59,6 +59,8 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
         return ()
     last = ends[moving]
     chord = np.hypot(drive.north[last] - drive.north[moving], drive.east[last] - drive.east[moving])
+    # Further than its wheels rolled: the reference jumped.
+    chord[chord > LONGEST_CHORD * horizon_m] = 0.0
     off = np.abs(np.abs(drive.heading[last] - drive.heading[moving]) - np.pi)
     groups = (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)])
     chosen = (_typical(drive, models[0], ends, group) for group in groups)

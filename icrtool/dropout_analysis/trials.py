@@ -87,7 +87,7 @@ def dropout(
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
 ) -> DropoutReport:
-    """Return how far off the robot is after driving without GNSS.
+    """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
 
     Parameters
     ----------
@@ -98,6 +98,11 @@ def dropout(
     further : models of constant parameters, beside those
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
+
+    Returns
+    -------
+    DropoutReport
+        Mean, median, 95th percentile and largest error [m] by model and horizon, with intervals; no file is touched.
 
     Raises
     ------
@@ -110,15 +115,16 @@ def dropout(
 
     Notes
     -----
-    ICRs are frozen at the start, wheel speeds alone drive on, the error is the horizontal distance to the filter's
-    estimate where the path has grown by the horizon. A start with less path left, a path across a gap in the wheel data
-    and an end inside a real GNSS outage are no trials; they are counted. So are the states of a standstill but its
-    last: their trials are copies of one another, and a parked robot would set the result. Overlapping trials are not
-    independent: the intervals come from a moving-block bootstrap with blocks of the horizon's length.
+    A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
+    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. No
+    trials, but counted: starts with less path left, paths across a gap of the wheel data, ends in a real GNSS outage.
+    Of a standstill the last state alone starts trials: the others would be copies, and a parked robot would set the
+    result. Overlapping trials are not independent: the intervals come from a moving-block bootstrap (Kuensch 1989) with
+    blocks of the horizon's length.
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
-    horizons = check_horizons(horizons_m if horizons_m is not None else configured_horizons_m(run))
+    horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
     drive = drive_of(run)
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
@@ -204,11 +210,6 @@ def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
     drive = drive_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     return {model.name: open_loop_errors(drive, model.icrs, ends)[:, 0] for model in models_of(run)}
-
-
-def configured_horizons_m(run: Run) -> tuple[float, ...]:
-    """Return the horizons [m] of the configuration a run was made with."""
-    return run.config.dropout.horizons_m
 
 
 def check_horizons(horizons_m: Iterable[float]) -> Floats:

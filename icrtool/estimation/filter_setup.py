@@ -68,11 +68,10 @@ sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow 
 RESPONSE_S, CHANGE_S = 0.1, 0.5
 """Rigid-body simulated robots answer their wheels by up to this much later; a change of the turn rate takes so long."""
 
-AVERAGING_S = (0.05, 0.1, 0.2, 0.4, 0.8)
-NOISE_SHARE = 0.02
-"""Wheels may have this share of noise in the mean square of their turn; it moves the ICRs apart by as much."""
-
-FEWEST_MEANS = 20
+MEMORY_S = 0.5
+"""Estimated headings of 0.1 deg are averaged over this time: followed sample by sample, they teach the ICRs of the
+shortest turns. Tracked robots turn by 2 % more in those than over some metres, wheels of few counts show no turn in
+them."""
 
 PAPER_TERRAIN_ICR_STD_M = 10.0
 """Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's
@@ -175,8 +174,9 @@ def set_up_filter(
         # with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more.
         density = math.radians(noise.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
         variance = float(np.median(headings.var_rad2))
-        # The memory of the filter is then sqrt(2 tau s^2 / q): at least the time over which noisy wheels average out.
-        correlation_s = max(variance / (2.0 * density), _wheel_averaging_s(data) ** 2 * density / (2.0 * variance))
+        # The memory of the filter is then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
+        usual = math.radians(FIELD_NOISE.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
+        correlation_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
@@ -336,23 +336,6 @@ def _response_variance(data: Measurements, width_m: float) -> Floats:
     before, now, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, 0.0, CHANGE_S))
     change = (after - 2.0 * now + before) / CHANGE_S
     return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
-
-
-def _wheel_averaging_s(data: Measurements) -> float:
-    """Return the time [s] over which the noise of the wheels' turn averages out; 0 where it is small, or does not.
-
-    A heading that is followed sample by sample compares each noisy turn of the wheels with the true one, and noise in
-    what a slope is fitted to makes the slope smaller (Fuller 1987): the ICRs would be too far apart. Counts of a coarse
-    encoder average out within some of them. The noise is that of second differences of means over equal times.
-    """
-    t, turned = data.wheel_t, _travel_difference(data)
-    for span_s in AVERAGING_S:
-        mean = np.diff(np.interp(np.arange(t[0], t[-1], max(span_s, (t[-1] - t[0]) / len(t))), t, turned))
-        if len(mean) < FEWEST_MEANS:
-            break
-        if float(np.mean(np.diff(mean, 2) ** 2)) / 6.0 <= NOISE_SHARE * float(np.mean(mean**2)):
-            return 0.0 if span_s == AVERAGING_S[0] else span_s
-    return 0.0
 
 
 def _parameters(

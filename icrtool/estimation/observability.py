@@ -189,7 +189,7 @@ def _sentences(
     first = f"this drive could not show the ICRs well: {unshown}"
     if lacks := lacking_turns(right, left):
         return (first, lacks)
-    return (first, f"too few turns in {distance_m:.0f} m for this measurement noise: {SPIN_BOTH}")
+    return (first, f"too few turns in {distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}")
 
 
 def lacking_turns(right_rad: float, left_rad: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import (
+    TURN_WANDER_RAD,
     FilterSetup,
     ProcessNoise,
     check_start,
@@ -22,7 +24,7 @@ from icrtool.kernels.ekf_step import PLACES
 from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
-from icrtool.records.samples import WheelSamples
+from icrtool.records.samples import HeadingSamples, WheelSamples
 from icrtool.records.tables import States
 
 OUTAGE_S = 2.0
@@ -31,6 +33,10 @@ OUTAGE_S = 2.0
 OUTAGE_IN_INTERVALS = 5.0
 """... and at least this many times the usual interval between fixes."""
 
+
+LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
+"""An estimated heading is carried on by the wheels for less than this, and where it is so many times as certain as the
+filter's own: among noisy fixes it is not."""
 
 LEAST_WHEEL_TRAVEL_M = 0.1
 """Wheels that travel less than this to and fro have not turned."""
@@ -99,6 +105,8 @@ def run_filter(
         sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
         output.heading_innovation,
     )  # fmt: skip
+    if sensors.heading_is_estimated:
+        table = carry_headings(table, sensors.headings, heading.used)
     return Filtered(
         sensors=sensors,
         table=table,
@@ -167,6 +175,28 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
         v_left_mps=wheels.v_left_mps[first:],
         v_right_mps=wheels.v_right_mps[first:],
         distance_m=output.distance,
+    )
+
+
+def carry_headings(table: States, headings: HeadingSamples, used: Bools) -> States:
+    """Return states with the estimated headings (h,), where they are `used` (h,), carried on by the wheels' turn.
+
+    The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
+    """
+    if not used.any():
+        return table
+    stamps, psi = headings.stamp_ns[used], table.heading_rad
+    t, seen = ((one - table.stamp_ns[0]) / 1e9 for one in (table.stamp_ns, stamps))
+    last = np.searchsorted(seen, t, side="right") - 1
+    age = t - seen[last]
+    recent = (last >= 0) & (age < LONGEST_CARRY_S)
+    off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
+    std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
+    clear = recent & (CLEARLY * std < table.std_heading_rad)
+    return replace(
+        table,
+        heading_rad=psi + np.where(clear, off[last], 0.0),
+        std_heading_rad=np.where(clear, std, table.std_heading_rad),
     )
 
 

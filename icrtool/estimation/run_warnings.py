@@ -63,7 +63,8 @@ def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
     configured = configured_noise(config)
     if noise.position_mps != configured.position_mps:
         found.append(
-            f"{name}: the wheels contradict the position reference (repeated samples, clock offsets, slip): "
+            f"{name}: the wheels contradict the position reference (slip, clock offsets, repeated samples, fixes "
+            "worse than they state): "
             f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
         )
     if noise.heading_degps != configured.heading_degps:

@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from icrtool.estimation.run_filter import set_up_again
+from icrtool.estimation.run_filter import carry_headings, set_up_again
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.smoother import run_smoother
@@ -39,7 +39,8 @@ def smooth(run: Run) -> States:
         columns[name] = np.ascontiguousarray(smoothed.x[:, i])
         columns[f"std_{name}"] = np.ascontiguousarray(std[:, i])
     kept = {field.name: getattr(run.table, field.name) for field in fields(States) if field.name not in columns}
-    return States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
+    table = States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
+    return carry_headings(table, run.sensors.headings, run.heading.used) if run.sensors.heading_is_estimated else table
 
 
 def _distance(run: Run, x: Floats) -> Floats:

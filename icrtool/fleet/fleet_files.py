@@ -94,8 +94,10 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
 
 
 def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:
-    """Draw the ICRs by robot and date, the error by group and the failures by reason, those that have anything."""
-    from icrtool.output.figures.fleet import IcrPoint, draw_fleet
+    """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed."""
+    from icrtool.output.figure_catalogue import FIGURES, figures_of
+    from icrtool.output.figures.fleet import FleetNumbers, IcrPoint
+    from icrtool.output.picture_file import save_picture
 
     points: list[IcrPoint] = []
     errors: dict[str, list[float]] = {}
@@ -106,11 +108,18 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
         if right is not None and left is not None and row.start_utc:
             points.append(IcrPoint(row.robot, row.start_utc, right, left, *std))
         if (error := row.errors.get(SHOWN_ERROR)) is not None:
-            name = ", ".join(part for part in (row.robot, row.group) if part) or "all logs"
+            name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, []).append(error)
         if row.status == "failed":
             reasons[reason_of(row)] += 1
-    draw_fleet(directory, formats, f"{len(rows)} logs", points, errors, dict(reasons.most_common()))
+    directory.mkdir(exist_ok=True)
+    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, dict(reasons.most_common()))
+    drawn = {directory / f"{name}.{form}": figure for name, figure in figures_of("fleet", numbers) for form in formats}
+    for file, figure in drawn.items():
+        save_picture(figure, file)
+    for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
+        for old in set(directory.glob(f"{name}.*")) - set(drawn):
+            old.unlink()
 
 
 def reason_of(row: Row) -> str:

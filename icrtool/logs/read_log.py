@@ -162,7 +162,7 @@ def read_log(
     LogError
         The log cannot be read.
     MissingStreamError
-        No wheels, no position or no heading in it.
+        No wheels or no position in it; a heading may be missing.
     ConfigError
         A configured topic that is not there, or a width or radius that is needed.
     DataError

@@ -19,7 +19,6 @@ from icrtool.kernels.open_loop_fast import TOLERANCE_M
 from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.csv_file import csv_bytes
-from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.tables.dropout import why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
@@ -70,11 +69,9 @@ def write_report(
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
-            (partial / "plots").mkdir()
-            with quiet_matplotlib():
-                from icrtool.output.figures.dropout_figures import draw_figures
+            from icrtool.output.figure_catalogue import draw_figures
 
-                draw_figures(report, partial / "plots", plots)
+            draw_figures("report", report, partial / "plots", plots)
         write_tables(report, partial)
     return report
 
@@ -152,35 +149,20 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         ],
         "passed": report.passed,
         "baseline": _baseline_document(report),
-        "outages": [
-            {
-                "kind": one.kind,
-                "begin_s": one.begin_s,
-                "end_s": one.end_s,
-                "distance_m": one.distance_m,
-                "end_error_m": one.end_error_m,
-                "max_error_m": one.max_error_m,
-            }
-            for one in report.outages
-        ],
-        "worst": [_drive_document(drive) for drive in report.worst],
-        "examples": [_drive_document(drive) for drive in report.examples],
+        "outages": [{name: getattr(one, name) for name in OUTAGE_KEYS} for one in report.outages],
+        "worst": [_trial_document(one) for one in report.worst],
+        "examples": [_trial_document(one) for one in report.examples],
     }
 
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
 
+OUTAGE_KEYS = ("kind", "begin_s", "end_s", "distance_m", "end_error_m", "max_error_m")
+
 WORST_COLUMNS = (
-    "rank",
-    "stamp_ns",
-    "t_s",
-    "north_m",
-    "east_m",
-    "horizon_m",
-    "heading_change_deg",
-    "speed_mean_mps",
+    "rank", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
     *(f"{model}_error_m" for model in ERROR_COLUMNS),
-)
+)  # fmt: skip
 
 
 def _recommended_document(report: DropoutReport) -> dict[str, Any] | None:
@@ -276,17 +258,12 @@ def _summary_documents(report: DropoutReport, summaries: Mapping[str, Summary]) 
     }
 
 
-def _drive_document(drive: ExampleTrial) -> dict[str, Any]:
+def _trial_document(trial: ExampleTrial) -> dict[str, Any]:
     return {
-        "stamp_ns": drive.stamp_ns,
-        "t_s": drive.t_s,
-        "north_m": drive.north_m,
-        "east_m": drive.east_m,
-        "horizon_m": drive.horizon_m,
-        "heading_change_deg": float(np.degrees(drive.heading_change_rad)),
-        "speed_mean_mps": drive.speed_mean_mps,
-        "errors_m": drive.errors_m,
-    }
+        "stamp_ns": trial.stamp_ns, "t_s": trial.t_s, "north_m": trial.north_m, "east_m": trial.east_m,
+        "horizon_m": trial.horizon_m, "heading_change_deg": float(np.degrees(trial.heading_change_rad)),
+        "speed_mean_mps": trial.speed_mean_mps, "errors_m": trial.errors_m,
+    }  # fmt: skip
 
 
 def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
@@ -297,8 +274,8 @@ def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
 
 
 def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[Sequence[Cell]]:
-    for rank, drive in enumerate(worst, start=1):
-        document = {"rank": rank, **_drive_document(drive)}
+    for rank, trial in enumerate(worst, start=1):
+        document = {"rank": rank, **_trial_document(trial)}
         errors = document.pop("errors_m")
         yield *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)
 

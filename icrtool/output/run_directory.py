@@ -14,7 +14,6 @@ from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_directory
 from icrtool.output.csv_file import csv_bytes
-from icrtool.output.figures.quiet_matplotlib import quiet_matplotlib
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.own_files import made_from
@@ -123,7 +122,9 @@ def write_run(
         states_name = f"states.{states}"
         states_sum = pool.submit(write_states, run.table, partial / states_name, states)
         if plots:
-            _write_figures(run, partial / "plots", plots)
+            from icrtool.output.figure_catalogue import draw_figures
+
+            draw_figures("run", run, partial / "plots", plots)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
@@ -165,11 +166,3 @@ def is_run_directory(directory: Path) -> bool:
 def events_csv(events: Sequence[Mapping[str, Any]]) -> bytes:
     """Return events.csv: a row an event."""
     return csv_bytes(EVENT_COLUMNS, ([event[column] for column in EVENT_COLUMNS] for event in events))
-
-
-def _write_figures(run: Run, directory: Path, formats: tuple[str, ...]) -> None:
-    directory.mkdir()
-    with quiet_matplotlib():
-        from icrtool.output.figures.run_figures import draw_figures
-
-        draw_figures(run, directory, formats)

@@ -49,9 +49,10 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
         rows = zip(*map(_cells, result.columns.values()), strict=True)
         (partial / f"{name}.csv").write_bytes(csv_bytes(result.columns, rows))
         if plots:
-            from icrtool.output.figures.study import draw_study
+            from icrtool.output.figures.study import study_figure
+            from icrtool.output.figures.style import save
 
-            draw_study(result, partial / name, plots)
+            save(study_figure(result), partial / name, plots)
 
 
 def is_study_directory(directory: Path) -> bool:

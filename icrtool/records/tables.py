@@ -16,6 +16,7 @@ from icrtool.records.samples import (
     InputFile,
     OtherReceiver,
     PositionFixes,
+    Role,
     StreamChoice,
     WheelSamples,
 )
@@ -77,6 +78,15 @@ class RobotLog:
             LogText(name), parts.wheels, parts.gnss, parts.heading, parts.datum, parts.streams, (), {}, parts.warnings,
             gyro=parts.gyro,
         )  # fmt: skip
+
+    def topic(self, role: Role, unknown: str = "") -> str:
+        """Return the topic that a stream came from."""
+        return next((stream.topic for stream in self.streams if stream.role == role), unknown)
+
+    @property
+    def heading_is_of_position(self) -> bool:
+        """Whether heading and position are fields of the same messages."""
+        return self.topic("heading") == self.topic("gnss") != ""
 
     def __repr__(self) -> str:
         spans = [samples.stamp_ns[[0, -1]] for samples in self._by_role().values() if len(samples.stamp_ns)]

@@ -177,22 +177,9 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[StudyNumber]:
             findings.append(StudyNumber(f"{name}: {WORDS[what]}, mean", (level[what]["mean"],), "", expected))
             findings.append(StudyNumber(f"{name}: {WORDS[what]}, median run", (level["by_run"][what]["p50"],), ""))
         covered = level["coverage_pct"]
-        findings.append(
-            StudyNumber(
-                f"{name}: pose within 2 sigma, least and most",
-                (min(covered[:3]), max(covered[:3])),
-                "%",
-                "95.4 %",
-            )
-        )
-        findings.append(
-            StudyNumber(
-                f"{name}: ICRs within 2 sigma, least and most",
-                (min(covered[3:]), max(covered[3:])),
-                "%",
-                "95.4 %",
-            )
-        )
+        for what, part in (("pose", covered[:3]), ("ICRs", covered[3:])):
+            label = f"{name}: {what} within 2 sigma, least and most"
+            findings.append(StudyNumber(label, (min(part), max(part)), "%", "95.4 %"))
     return findings
 
 

@@ -14,12 +14,19 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.pooled import gyro_recording_of, predictor, recording_of
+from icrtool.calibration.model_comparison import _errors_along, _icrs_of
+from icrtool.calibration.pooled import (
+    gyro_recording_of,
+    heading_recording_of,
+    in_recording,
+    predictor,
+    recording_of,
+)
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop import open_loop_path, trial_ends
-from icrtool.motion.trials import Trials
+from icrtool.motion.trials import Trials, predicted_path
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.json_file import json_bytes
 from icrtool.output.page import drive_data
@@ -32,6 +39,7 @@ from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.browser import Browser, Page, browser, chromium
+from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
 LENGTHS_M = (5.0, 10.0, 20.0)
@@ -151,7 +159,7 @@ def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file:
     )
     page.click(x, y)
     rows = page.evaluate("[...document.querySelectorAll('#loop tbody tr')].map((row) => row.textContent)")
-    assert len(rows) == 4
+    assert len(rows) == page.evaluate("icrtoolPage.data.models.length") > 4
     assert all(re.search(r"\d m", row) for row in rows)
     assert page.complaints() == []
 
@@ -162,7 +170,23 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
     starts = np.flatnonzero((ends >= 0).all(axis=1))
     starts = starts[:: len(starts) // 8]
     assert report.calibration is not None
-    recommended = predictor(report.calibration, recording_of(run))(Trials(starts, ends[starts]))
+    trials = Trials(starts, ends[starts])
+    along = {"recommended": predictor(report.calibration, recording_of(run))(trials)}
+    compared = report.comparison
+    assert compared is not None
+    assert compared.heading == "heading"
+    turned = heading_recording_of(run, "heading")
+    for row, of in (
+        ("multiplier", ""),
+        ("window", "icr"),
+        ("window_heading", "icr_gyro"),
+        ("no_slip_heading", "no_slip_gyro"),
+    ):
+        along[row] = table_errors(
+            turned, trials, predicted_path(turned, *in_recording(compared.fits[of or row], turned))
+        )
+    for name in ("icr", "icr_final"):
+        along[f"{name}_heading"] = _errors_along(run, turned, trials, _icrs_of(run, name))
     final = (table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
     # Every state of so short a drive is a row of the series.
     assert page.evaluate("icrtoolPage.data.series.step.length") == len(table)
@@ -176,7 +200,8 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
                 error = np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end])
                 # Micrometres of rounding in each column, seven digits in the first heading.
                 assert errors[name][h] == pytest.approx(error, abs=1e-4), (name, start, h)
-        assert errors["recommended"] == pytest.approx(recommended[number].tolist(), abs=1e-4)
+        for name, of_model in along.items():
+            assert errors[name] == pytest.approx(of_model[number].tolist(), abs=1e-4), (name, start)
 
 
 def test_paths_of_joined_samples_are_close_to_those_of_the_library(
@@ -219,17 +244,23 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     names = {"calibration": False, "calibration_gyro": True}
     assert {one.name: one.with_gyro for one in report.calibrations} == names
     # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
-    monkeypatch.setattr(drive_data, "MOST_STEPS", 4000)
+    monkeypatch.setattr(drive_data, "MOST_STEPS", 10_000)
     document = json.loads(json_bytes(report_document(report)))
     file = tmp_path / "calibrations.html"
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
-    assert page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)") == [3] * 4
+    assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {3}
+    table, recording = report.comparison, gyro_recording_of(run)
+    assert table is not None
+    drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))
+    # What the comparison chose by block is, of the whole drive, the recommended model.
+    assert {score.name.replace("extended", "recommended") for score in table.scores} <= drawn
     ends = trial_ends(drive_of(run), np.array(LENGTHS_M))
     starts = np.flatnonzero((ends >= 0).all(axis=1))[::300]
+    trials = Trials(starts, ends[starts])
     for name, with_gyro in names.items():
-        expected = predictor(calibration, gyro_recording_of(run), with_gyro=with_gyro)(Trials(starts, ends[starts]))
+        expected = predictor(calibration, recording, with_gyro=with_gyro)(trials)
         for start, errors in zip(starts.tolist(), expected.tolist(), strict=True):
             found = page.evaluate(f"icrtoolPage.openLoop({start}).models.find((one) => one.name === '{name}').errors")
             # Between its points a path is straight, and its heading at a start is known to some 0.0002 rad.

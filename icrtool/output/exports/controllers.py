@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Literal, get_args
 
@@ -30,6 +29,20 @@ ODOMETRY_USED = (6, 11)
 """Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
 
 
+CONTROLLER_PLACES: dict[Target, tuple[str, ...]] = {
+    "diff_drive_controller": ("diff_drive_controller:  # your controller's name", "  ros__parameters:"),
+    "clearpath": (
+        "# robot.yaml: merge into its platform section", "platform:", "  extras:", "    ros_parameters:",
+        "      platform_velocity_controller:",
+    ),
+    "husarion": (
+        "# husarion_ugv_controller: WH0x_controller.yaml, passed as controller_config_path", "/**:",
+        "  drive_controller:", "    ros__parameters:",
+    ),
+}  # fmt: skip
+"""Where the parameters of a diff_drive_controller stand in each robot's configuration."""
+
+
 def format_export(calibration: Calibration, target: Target) -> str:
     """Return the text to paste, no line end.
 
@@ -48,7 +61,15 @@ def format_export(calibration: Calibration, target: Target) -> str:
     if calibration.controller is None:
         advice = "covariances need a longer drive"
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
-    return _WRITERS[target](calibration, calibration.controller)
+    errors = calibration.controller
+    if target == "json":
+        return _json(calibration, errors)
+    if target == "nav2":
+        body = _nav2(errors)
+    else:
+        place = CONTROLLER_PLACES[target]
+        body = [*place, *_controller(calibration, errors, indent=len(place[-1]) - len(place[-1].lstrip()) + 2)]
+    return "\n".join([*_header(calibration, errors), *body])
 
 
 def _json(calibration: Calibration, errors: ControllerErrors) -> str:
@@ -81,41 +102,9 @@ def _json(calibration: Calibration, errors: ControllerErrors) -> str:
     return json_bytes(document).decode().rstrip("\n")
 
 
-def _diff_drive_controller(calibration: Calibration, errors: ControllerErrors) -> str:
-    body = [
-        "diff_drive_controller:  # your controller's name",
-        "  ros__parameters:",
-        *_controller(calibration, errors, 4),
-    ]
-    return "\n".join([*_header(calibration, errors), *body])
-
-
-def _clearpath(calibration: Calibration, errors: ControllerErrors) -> str:
-    body = [
-        "# robot.yaml: merge into its platform section",
-        "platform:",
-        "  extras:",
-        "    ros_parameters:",
-        "      platform_velocity_controller:",
-        *_controller(calibration, errors, 8),
-    ]
-    return "\n".join([*_header(calibration, errors), *body])
-
-
-def _husarion(calibration: Calibration, errors: ControllerErrors) -> str:
-    body = [
-        "# husarion_ugv_controller: WH0x_controller.yaml, passed as controller_config_path",
-        "/**:",
-        "  drive_controller:",
-        "    ros__parameters:",
-        *_controller(calibration, errors, 6),
-    ]
-    return "\n".join([*_header(calibration, errors), *body])
-
-
-def _nav2(calibration: Calibration, errors: ControllerErrors) -> str:
+def _nav2(errors: ControllerErrors) -> list[str]:
     (alpha1, alpha2), (alpha3, alpha4) = errors.turn_noise, errors.way_noise
-    body = [
+    return [
         "# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the odometry message:",
         f"# set there twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
         "ekf_filter_node:",
@@ -135,7 +124,6 @@ def _nav2(calibration: Calibration, errors: ControllerErrors) -> str:
         f"    alpha3: {_number(alpha3)}",
         f"    alpha4: {_number(alpha4)}",
     ]
-    return "\n".join([*_header(calibration, errors), *body])
 
 
 def _controller(calibration: Calibration, errors: ControllerErrors, indent: int) -> list[str]:
@@ -226,12 +214,3 @@ def _date(calibration: Calibration) -> str:
 def _one_line(text: str) -> str:
     """Return text fit for a comment: whatever a log is called."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
-
-
-_WRITERS: dict[Target, Callable[[Calibration, ControllerErrors], str]] = {
-    "diff_drive_controller": _diff_drive_controller,
-    "clearpath": _clearpath,
-    "nav2": _nav2,
-    "husarion": _husarion,
-    "json": _json,
-}

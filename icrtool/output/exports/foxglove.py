@@ -253,11 +253,7 @@ def _errors(run: Run) -> TopicPlan:
 
 def _slip_events(run: Run) -> Iterator[dict[str, Any]]:
     for event in run.summary["events"]:
-        yield {
-            "kind": event["kind"], "begin_ns": event["begin_ns"], "end_ns": event["end_ns"],
-            "x_m": event["east_m"], "y_m": event["north_m"], "distance_m": event["distance_m"],
-            "severity": event["severity"], "confidence": event["confidence"],
-        }  # fmt: skip
+        yield {**event, "x_m": event["east_m"], "y_m": event["north_m"]}
 
 
 def _outages(run: Run) -> Iterator[dict[str, Any]]:

@@ -30,7 +30,10 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
         "StateTransitions!events": {
             "foxglovePanelTitle": "Slip events and outages",
             "isSynced": True,
-            "paths": [{"value": f"/{topic}.kind", "timestampMethod": "receiveTime"} for topic in ("events", "outages")],
+            "paths": [
+                {"value": f"/{topic}.kind", "enabled": True, "timestampMethod": "receiveTime"}
+                for topic in ("events", "outages")
+            ],
         },
     }
     left: str | dict[str, Any] = "3D!paths"

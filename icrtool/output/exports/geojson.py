@@ -13,6 +13,7 @@ from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.measurement_codes import GATED, UNSEEN
+from icrtool.output.decimate import places
 from icrtool.output.exports.paths import (
     LABELS,
     ExportPath,
@@ -23,7 +24,6 @@ from icrtool.output.exports.paths import (
     paths_of,
     utc_text,
 )
-from icrtool.output.figures.decimate import places
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 

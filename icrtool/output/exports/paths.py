@@ -17,7 +17,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, odometry
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.trials import FrozenIcrs
-from icrtool.output.figures.decimate import places
+from icrtool.output.decimate import places
 from icrtool.records.run import Run
 from icrtool.records.tables import States
 

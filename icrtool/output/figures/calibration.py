@@ -5,66 +5,50 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from icrtool.alignment.estimator import WindowResiduals
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.style import ICR, inches, new_figure
+from icrtool.output.figures.style import ICR, add_legend, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN, HEIGHT_IN = 7.2, 4.2
 SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
 BEFORE: dict[str, Any] = {
+    "label": "before: as configured, W estimated",
     "marker": "s",
     "color": "0.62",
     "markersize": 3.2,
     "linestyle": "none",
     "markeredgewidth": 0.0,
 }
-AFTER: dict[str, Any] = {
-    "marker": "o",
-    "color": ICR.color,
-    "markersize": 2.8,
-    "linestyle": "none",
-    "markeredgewidth": 0.0,
-}
+AFTER: dict[str, Any] = BEFORE | {"label": "after: calibrated", "marker": "o", "color": ICR.color, "markersize": 2.8}
 
 
-def draw_calibration(name: str, residuals: WindowResiduals) -> Figure:
-    """Draw residuals of displacements and of heading changes over windows, before and after."""
+@styled
+def residuals_figure(name: str, residuals: WindowResiduals) -> Figure:
+    """Return residuals of displacements and of heading changes over windows, before and after."""
     figure = new_figure(
-        name,
-        f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals",
-        width_in=WIDTH_IN,
-        height_in=HEIGHT_IN,
-    )
+        name, f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals",
+        height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32,
+    )  # fmt: skip
     place, turn = figure.subplots(1, 2)
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.7, bottom=1.0), wspace=0.32)
     turns = (residuals.turn_before, residuals.turn_after)
     for part, turned, look in zip((residuals.before, residuals.after), turns, (BEFORE, AFTER), strict=True):
         place.plot(part[1], part[0], **look)
         turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
     reach = _reach(np.hypot(*np.concatenate([residuals.before, residuals.after], axis=1)))
-    place.set_xlim(-reach, reach)
-    place.set_ylim(-reach, reach)
-    place.set_xlabel("Residual to the right [m]")
-    place.set_ylabel("Residual ahead [m]")
+    place.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    place.set(xlabel="Residual to the right [m]", ylabel="Residual ahead [m]")
     turned = np.degrees(np.concatenate(turns))
+    turn.set(xlabel="Heading change measured, clockwise [°]", ylabel="Residual of the heading change [°]")
     turn.set_ylim(-_reach(turned), _reach(turned))
-    turn.set_xlabel("Heading change measured, clockwise [°]")
-    turn.set_ylabel("Residual of the heading change [°]")
     _label(place, residuals.before, residuals.after, 1.0, "m")
     _label(turn, residuals.turn_before[None], residuals.turn_after[None], float(np.degrees(1.0)), "°")
-    keys = [
-        Line2D([], [], label="as configured, with the W found", **BEFORE | {"markersize": 6}),
-        Line2D([], [], label="calibrated", **AFTER | {"markersize": 6}),
-    ]
-    figure.legend(handles=keys, loc="lower center", ncols=2, columnspacing=3.0)
+    add_legend(figure, markerscale=2.0)
     return figure
 
 

@@ -4,35 +4,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox, BboxBase
 
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.decimate import places
-from icrtool.output.figures.style import BAD_FIX_COLOR, FILTER, FIX_COLOR, ICR, NO_SLIP, Pen, inches, new_figure
-from icrtool.output.text_format import duration_text, metres_text
+from icrtool.output.decimate import places
+from icrtool.output.figures.ground import draw_path, fitted_box_in, look_down, name_directions
+from icrtool.output.figures.style import (
+    FILTER,
+    FIX_COLOR,
+    FORCED,
+    ICR,
+    LABEL_BOX,
+    MODEL_WORDS,
+    NO_SLIP,
+    REAL,
+    WIDTH_IN,
+    Pen,
+    add_legend,
+    new_figure,
+    spot,
+    styled,
+)
+from icrtool.output.text_format import duration_text, metres_text, run_title
 from icrtool.records.dropout import ExampleTrial, Outage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2
-EXAMPLES_HEIGHT_IN = 4.7
 WORST_COLUMNS = 4
 WORST_CELL_IN = 1.95
-OUTAGES_BOX_IN = (2.4, 5.4)
+CELL_TITLE: dict[str, Any] = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
-PENS: dict[str, Pen] = {"icr": ICR, "no_slip": NO_SLIP}
-LABELS = {"icr": "ICR", "no_slip": "no slip"}
-FORCED = Pen(BAD_FIX_COLOR, width=1.8)
-REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
+PENS = {"icr": ICR, "no_slip": NO_SLIP}
+OUTAGES = {"forced": FORCED, "real": REAL}
 PATH = Pen(FIX_COLOR, width=1.4)
-
-Box = tuple[float, float, float, float]
-"""Left, bottom, right, top [points]."""
 
 MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
 """Half the size of a mark, height of a line of text, usual width of a character, in points."""
@@ -47,176 +58,144 @@ LINE_FROM_PT = 20.0
 NUMBERS_APART = 0.16
 """Trials that start closer together than this share of the overview's width have one place for their numbers."""
 
-SMALLEST_VIEW_M = 0.5
-CELLS = 1500.0
 
+@styled
+def dropout_examples(report: DropoutReport) -> Figure:
+    """Return a trial of about half a turn and the straightest one side by side [m]: reference, ICR, no slip.
 
-def draw_examples(title: str, examples: Sequence[ExampleTrial]) -> Figure:
-    """Draw a trial of about half a turn and the straightest one side by side: reference, ICR, no slip."""
+    Raises
+    ------
+    DataError
+        The report holds none, as one of `icrtool.dropout`.
+    """
+    examples = _needed(report, report.examples, "example trials")
     horizon = examples[0].horizon_m
+    what = "about half a turn (left), as straight as the drive has it (right)"
     figure = new_figure(
-        title,
-        f"Trials without GNSS over {horizon:g} m: about half a turn (left), as straight as the drive has it (right)",
-        width_in=WIDTH_IN,
-        height_in=EXAMPLES_HEIGHT_IN,
-    )
+        run_title(report.run_summary), f"Trials without GNSS over {horizon:g} m: {what}",
+        height_in=4.7, margins_in=(0.7, 0.2, 1.0, 0.9), wspace=0.34,
+    )  # fmt: skip
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
-    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=1.0, bottom=0.9), wspace=0.34)
     for axes, drive in zip(panels, examples, strict=True):
-        _draw_drive(axes, drive, box=(3.0, 2.75))
+        _draw_drive(axes, drive, shape=3.0 / 2.75)
         facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{LABELS[name]} {metres_text(error)}" for name, error in drive.errors_m.items())
+        errors = ",  ".join(f"{MODEL_WORDS[name]} {metres_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
-    _add_keys(figure, examples)
+    add_legend(figure)
     return figure
 
 
-def draw_worst(title: str, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> Figure:
-    """Draw the worst trials, each in a cell with its own scale; the first cell shows where on the path they are.
+@styled
+def dropout_worst(report: DropoutReport) -> Figure:
+    """Return the worst trials [m], each in a cell with its own scale; the first cell shows where they start.
 
-    Parameters
-    ----------
-    north_m, east_m : (n,) the whole path of the reference
+    Raises
+    ------
+    DataError
+        The report holds none, as one of `icrtool.dropout`.
     """
+    worst = _needed(report, report.worst, "worst trials")
     rows = -(-(len(worst) + 1) // WORST_COLUMNS)
     figure = new_figure(
-        title,
+        run_title(report.run_summary),
         f"The {len(worst)} worst trials without GNSS over {worst[0].horizon_m:g} m, momentary ICRs, none overlapping",
-        width_in=9.6,
-        height_in=1.25 + rows * (WORST_CELL_IN + 0.75),
-    )
+        width_in=9.6, height_in=1.25 + rows * (WORST_CELL_IN + 0.75), margins_in=(0.65, 0.15, 1.07, 0.9), wspace=0.3,
+        hspace=0.5,
+    )  # fmt: skip
     panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
-    figure.subplots_adjust(**inches(figure, left=0.65, right=0.15, top=1.07, bottom=0.9), wspace=0.3, hspace=0.5)
     figure.supxlabel("East of start [m]", fontsize=9.0, y=0.42 / figure.get_figheight())
     figure.supylabel("North of start [m]", fontsize=9.0, x=0.12 / figure.get_figwidth())
-    _draw_overview(panels[0], worst, north_m, east_m)
+    _draw_overview(panels[0], worst, report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
-        _draw_drive(axes, drive, box=(1.0, 1.0), ticks=5)
-        axes.set_title(
-            f"{rank}.  ICR error {metres_text(drive.errors_m['icr'])}\n"
-            f"at {drive.t_s:.0f} s, turns {_turn_text(drive)}\nat {drive.speed_mean_mps:.2f} m/s",
-            loc="left",
-            pad=4.0,
-            fontsize=8.0,
+        _draw_drive(axes, drive, shape=1.0)
+        text = (
+            f"{rank}.  ICR error {metres_text(drive.errors_m['icr'])}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
         )
+        axes.set_title(f"{text}\nat {drive.speed_mean_mps:.2f} m/s", **CELL_TITLE)
         axes.tick_params(labelsize=7.5)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
-    _add_keys(figure, worst)
+    add_legend(figure)
     return figure
 
 
 def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> None:
     """Draw the whole path and, numbered, where the trials start."""
     norths, easts = north_m - north_m[0], east_m - east_m[0]
-    (south, north), (west, east) = _view(norths, easts, 1.0)
-    shown = places(norths, easts, (east - west) / CELLS)
-    axes.plot(easts[shown], norths[shown], zorder=2, **PATH.keywords())
+    cell = look_down(axes, norths, easts, 1.0, ticks=4)
+    draw_path(axes, norths, easts, cell, PATH, zorder=2)
+    apart = NUMBERS_APART * float(np.ptp(axes.get_xlim()))
     together: dict[tuple[float, float], list[int]] = {}
     for rank, drive in enumerate(worst, start=1):
         place = drive.east_m - float(east_m[0]), drive.north_m - float(north_m[0])
-        near = (one for one in together if math.dist(one, place) < NUMBERS_APART * (east - west))
+        near = (one for one in together if math.dist(one, place) < apart)
         together.setdefault(next(near, place), []).append(rank)
     for place, ranks in together.items():
         text = ",".join(map(str, ranks))
         axes.text(*place, text, fontsize=7.5, fontweight="bold", ha="center", va="center", zorder=3)
-    axes.set_xlim(west, east)
-    axes.set_ylim(south, north)
-    axes.set_aspect("equal")
-    axes.locator_params(nbins=4, steps=[1, 2, 5, 10])
     axes.tick_params(labelsize=7.5)
-    axes.set_title("where they start\non the whole path\n(from its first point)", loc="left", pad=4.0, fontsize=8.0)
+    axes.set_title("where they start\non the whole path\n(from its first point)", **CELL_TITLE)
 
 
-def draw_outages(title: str, north_m: Floats, east_m: Floats, outages: Sequence[Outage]) -> Figure:
-    """Draw the path with those of forced and real outages."""
-    paths = [(one.north_m, one.east_m) for one in outages]
-    norths = np.concatenate([north_m, *(north for north, _ in paths)])
-    easts = np.concatenate([east_m, *(east for _, east in paths)])
-    (south, north), (west, east), box_in = _fit_to_box(norths, easts)
-    figure = new_figure(title, _outages_text(outages), width_in=WIDTH_IN, height_in=box_in + 1.65)
+@styled
+def dropout_outages(report: DropoutReport) -> Figure:
+    """Return the path [m] with those of forced and real outages, and their end errors [m].
+
+    Raises
+    ------
+    DataError
+        The report holds none, as one of `icrtool.dropout`.
+    """
+    outages = _needed(report, report.outages, "outages")
+    norths = np.concatenate([report.reference_north_m, *(one.north_m for one in outages)])
+    easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
+    width_in = WIDTH_IN - 0.95
+    box_in = fitted_box_in(norths, easts, width_in)
+    figure = new_figure(run_title(report.run_summary), _outages_text(outages), height_in=box_in + 1.65)
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
-    cell = (east - west) / CELLS
-    shown = places(north_m, east_m, cell)
-    axes.plot(east_m[shown], north_m[shown], zorder=2, **PATH.keywords())
+    cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
+    draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
     for one in outages:
-        pen = FORCED if one.kind == "forced" else REAL
-        shown = places(one.north_m, one.east_m, cell)
-        axes.plot(one.east_m[shown], one.north_m[shown], zorder=3, **pen.keywords())
-        axes.plot(one.east_m[:1], one.north_m[:1], zorder=4, **_mark("white"))
-        axes.plot(one.east_m[-1:], one.north_m[-1:], zorder=4, **_mark("black"))
-    axes.set_xlim(west, east)
-    axes.set_ylim(south, north)
-    axes.set_aspect("equal")
-    _write_errors(axes, outages, (south, west), 72.0 * box_in / (north - south))
-    axes.set_xlabel("East [m]")
-    axes.set_ylabel("North [m]")
-    keys = [Line2D([], [], label="filter", **PATH.keywords())]
-    for kind, pen in (("forced", FORCED), ("real", REAL)):
-        if any(one.kind == kind for one in outages):
-            keys.append(Line2D([], [], label=f"{kind} outage", **pen.keywords()))
-    keys += [Line2D([], [], label="its begin", **_mark("white")), Line2D([], [], label="its end", **_mark("black"))]
-    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.8)
+        draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[one.kind], zorder=3, label=f"{one.kind} outage")
+    for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
+        ends = [(one.east_m[row], one.north_m[row]) for one in outages]
+        axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **spot(fill))
+    _write_errors(axes, outages)
+    name_directions(axes)
+    add_legend(figure)
     return figure
 
 
-def _draw_drive(axes: Axes, drive: ExampleTrial, box: tuple[float, float], ticks: int = 5) -> None:
-    """Draw one trial about its start; the view has the shape of `box` (width, height), metres are square."""
-    north0, east0 = drive.north_m, drive.east_m
-    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, 2.0)]
-    lines += [(path.north, path.east, PENS[name], 3.0) for name, path in drive.paths.items()]
-    norths = np.concatenate([north - north0 for north, *_ in lines])
-    easts = np.concatenate([east - east0 for _, east, *_ in lines])
-    (south, north), (west, east) = _view(norths, easts, box[0] / box[1])
-    cell = (east - west) / CELLS
-    for line_north, line_east, pen, order in lines:
-        shown = places(line_north, line_east, cell)
-        axes.plot(line_east[shown] - east0, line_north[shown] - north0, zorder=order, **pen.keywords())
-        axes.plot(line_east[-1:] - east0, line_north[-1:] - north0, zorder=order + 2, **_end(pen))
-    axes.plot([0.0], [0.0], zorder=6, **_mark("white"))
-    axes.set_xlim(west, east)
-    axes.set_ylim(south, north)
-    axes.set_aspect("equal")
-    axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
+Content = TypeVar("Content", ExampleTrial, Outage)
 
 
-def _add_keys(figure: Figure, drives: Sequence[ExampleTrial]) -> None:
-    keys = [Line2D([], [], label="start", **_mark("white")), Line2D([], [], label="filter", **FILTER.keywords())]
-    keys += [Line2D([], [], label=LABELS[name], **PENS[name].keywords()) for name in drives[0].paths]
-    keys.append(Line2D([], [], label="where each ends", **_end(Pen("0.45"))))
-    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=2.4)
+def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> tuple[Content, ...]:
+    if not content:
+        raise DataError(report.name, f"the report holds no {what}", "icrtool.dropout_report finds what there is")
+    return content
+
+
+def _draw_drive(axes: Axes, drive: ExampleTrial, shape: float) -> None:
+    """Draw one trial about its start in axes `shape` times as wide as high."""
+    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, "filter")]
+    lines += [(path.north, path.east, PENS[name], MODEL_WORDS[name]) for name, path in drive.paths.items()]
+    lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
+    norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
+    cell = look_down(axes, norths, easts, shape)
+    axes.plot([0.0], [0.0], zorder=6, label="start", **spot("white"))
+    for order, (north, east, pen, label) in enumerate(lines):
+        draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
+    for north, east, pen, _ in lines:
+        axes.plot(
+            east[-1:], north[-1:], linestyle="none", marker="D", color=pen.color, markersize=4.5, zorder=5,
+            label="where each ends",
+        )  # fmt: skip
 
 
 def _turn_text(drive: ExampleTrial) -> str:
     return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
-
-
-def _mark(fill: str) -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": 5.5}
-
-
-def _end(pen: Pen) -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "D", "color": pen.color, "markersize": 4.5}
-
-
-def _view(norths: Floats, easts: Floats, shape: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the range of north and of east [m] of a view `shape` times as wide as high, with a margin."""
-    middle = [(float(column.min()) + float(column.max())) / 2 for column in (norths, easts)]
-    spans = [float(np.ptp(column)) for column in (norths, easts)]
-    height = 1.16 * max(spans[0], spans[1] / shape, SMALLEST_VIEW_M)
-    half = (height / 2, height * shape / 2)
-    return (middle[0] - half[0], middle[0] + half[0]), (middle[1] - half[1], middle[1] + half[1])
-
-
-def _fit_to_box(norths: Floats, easts: Floats) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Return the view of a whole path, and the height [in] its axes take."""
-    width_in = WIDTH_IN - 0.95
-    north, east = max(float(np.ptp(norths)), SMALLEST_VIEW_M), max(float(np.ptp(easts)), SMALLEST_VIEW_M)
-    box_in = float(np.clip(width_in * north / east, *OUTAGES_BOX_IN))
-    return *_view(norths, easts, width_in / box_in), box_in
 
 
 def _outages_text(outages: Sequence[Outage]) -> str:
@@ -233,73 +212,51 @@ def _outages_text(outages: Sequence[Outage]) -> str:
     return "Outages: " + "; ".join(parts)
 
 
-def _write_errors(axes: Axes, outages: Sequence[Outage], lowest: tuple[float, float], points_per_metre: float) -> None:
-    """Write each outage's number and end error beside its end where it fits; the tables have them all.
-
-    Parameters
-    ----------
-    axes : with its limits set
-    lowest : north and east [m] of the lower left corner
-    points_per_metre : scale of the picture
-    """
-
-    def point(one: Outage, row: int) -> tuple[float, float]:
-        east, north = float(one.east_m[row]), float(one.north_m[row])
-        return (east - lowest[1]) * points_per_metre, (north - lowest[0]) * points_per_metre
-
-    ends = [point(one, row) for one in outages for row in (0, -1)]
-    crossings = [
-        point(one, int(row)) for one in outages for row in places(one.north_m, one.east_m, LINE_PT / points_per_metre)
+def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
+    """Write each outage's number and end error beside its end where it fits; the tables have them all."""
+    axes.apply_aspect()
+    point_px = axes.figure.dpi / 72.0
+    paths = [axes.transData.transform(np.column_stack([one.east_m, one.north_m])) for one in outages]
+    taken = [_spot_box(place, point_px) for path in paths for place in path[[0, -1]]]
+    crossed = [
+        _spot_box(path[row], point_px) for path in paths for row in places(path[:, 1], path[:, 0], LINE_PT * point_px)
     ]
-    taken = [_box_about(place) for place in ends]
-    crossed = [_box_about(place) for place in crossings]
-    upper = (axes.get_xlim()[1] - lowest[1]) * points_per_metre, (axes.get_ylim()[1] - lowest[0]) * points_per_metre
-    for number, one in enumerate(outages, start=1):
+    for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
         text = f"{number}: {metres_text(one.end_error_m)}"
-        offset = _free_offset(point(one, -1), CHARACTER_PT * len(text), taken, crossed, upper)
-        if offset is not None:
-            taken.append(_label_box(point(one, -1), CHARACTER_PT * len(text), offset))
-            _write(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), offset)
+        boxes = _label_boxes(path[-1], CHARACTER_PT * len(text), point_px)
+        found = _free_box(boxes, [*taken, *crossed], axes.bbox) or _free_box(boxes, taken, axes.bbox)
+        if found is None:
+            continue
+        taken.append(boxes[found])
+        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
+        axes.annotate(
+            text, (float(one.east_m[-1]), float(one.north_m[-1])), xytext=found, textcoords="offset points",
+            ha="left" if found[0] > 0 else "right", va="center", fontsize=8.0, zorder=6, bbox=LABEL_BOX,
+            arrowprops=line,
+        )  # fmt: skip
 
 
-def _free_offset(
-    place: tuple[float, float], width: float, taken: list[Box], crossed: list[Box], upper: tuple[float, float]
+def _spot_box(place: Floats, point_px: float) -> Bbox:
+    return Bbox([place, place]).padded(MARK_PT * point_px)
+
+
+def _label_boxes(place: Floats, width_pt: float, point_px: float) -> dict[tuple[float, float], Bbox]:
+    """Return where a label of this width can stand beside a place [px], by its offset [points], nearest first."""
+    return {
+        (dx, dy): Bbox.from_bounds(
+            place[0] + point_px * (dx if dx > 0 else dx - width_pt), place[1] + point_px * (dy - LINE_PT / 2),
+            point_px * width_pt, point_px * LINE_PT,
+        )
+        for dx, dy in LABEL_OFFSETS_PT
+    }  # fmt: skip
+
+
+def _free_box(
+    boxes: dict[tuple[float, float], Bbox], obstacles: list[Bbox], frame: BboxBase
 ) -> tuple[float, float] | None:
-    """Return where a label of this width can stand: off all that is taken, off the lines too where it can."""
-    for obstacles in ([*taken, *crossed], taken):
-        for offset in LABEL_OFFSETS_PT:
-            box = _label_box(place, width, offset)
-            inside = box[0] > 0 and box[1] > 0 and box[2] < upper[0] and box[3] < upper[1]
-            if inside and not any(_overlap(box, other) for other in obstacles):
-                return offset
+    """Return the offset of the first box within the frame that covers no obstacle."""
+    for offset, box in boxes.items():
+        inside = frame.x0 < box.x0 and frame.y0 < box.y0 and box.x1 < frame.x1 and box.y1 < frame.y1
+        if inside and not box.count_overlaps(obstacles):
+            return offset
     return None
-
-
-def _box_about(place: tuple[float, float]) -> Box:
-    return place[0] - MARK_PT, place[1] - MARK_PT, place[0] + MARK_PT, place[1] + MARK_PT
-
-
-def _label_box(place: tuple[float, float], width: float, offset: tuple[float, float]) -> Box:
-    left, bottom = place[0] + (offset[0] if offset[0] > 0 else offset[0] - width), place[1] + offset[1] - LINE_PT / 2
-    return left, bottom, left + width, bottom + LINE_PT
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-def _write(axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float]) -> None:
-    axes.annotate(
-        text,
-        place,
-        xytext=offset_pt,
-        textcoords="offset points",
-        ha="left" if offset_pt[0] > 0 else "right",
-        va="center",
-        fontsize=8.0,
-        zorder=6,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
-        arrowprops={"arrowstyle": "-", "color": "0.5", "linewidth": 0.6}
-        if math.hypot(*offset_pt) > LINE_FROM_PT
-        else None,
-    )

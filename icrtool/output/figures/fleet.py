@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.output.atomic_file import atomic_file
-from icrtool.output.figures.style import drawable, inches, new_figure, save, style
+from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, shortened, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2
 ROW_IN = 0.32
 LONGEST_LABEL = 48
 COLORS = ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666")
@@ -32,89 +30,77 @@ class IcrPoint(NamedTuple):
     left_std_m: float
 
 
-def draw_fleet(
-    directory: Path, formats: tuple[str, ...], title: str, points: Sequence[IcrPoint],
-    errors_m: Mapping[str, Sequence[float]], reasons: Mapping[str, int],
-) -> None:  # fmt: skip
-    """Write the figures that have anything to show into a directory; older ones are removed."""
-    directory.mkdir(exist_ok=True)
-    with style():
-        figures = {
-            "icrs": draw_fleet_icrs(title, points) if points else None,
-            "errors": draw_fleet_errors(title, errors_m) if errors_m else None,
-            "failures": draw_fleet_failures(title, reasons) if reasons else None,
-        }
-        for stem, figure in figures.items():
-            wanted = {directory / f"{stem}.{form}" for form in formats if figure is not None}
-            for file in wanted:
-                with atomic_file(file) as partial:
-                    save(cast("Figure", figure), partial.with_suffix(""), (file.suffix[1:],))
-            for old in set(directory.glob(f"{stem}.*")) - wanted:
-                old.unlink()
+class FleetNumbers(NamedTuple):
+    """What the figures of a batch show.
+
+    Attributes
+    ----------
+    errors_m : 95 % error after 10 m of each log, by group
+    reasons : how many logs failed, by reason
+    """
+
+    title: str
+    points: Sequence[IcrPoint]
+    errors_m: Mapping[str, Sequence[float]]
+    reasons: Mapping[str, int]
 
 
-def draw_fleet_icrs(title: str, points: Sequence[IcrPoint]) -> Figure:
-    """Draw both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
+@styled
+def fleet_icrs(fleet: FleetNumbers) -> Figure:
+    """Return both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
-    figure = new_figure(title, "final ICRs of every log, ±σ", width_in=WIDTH_IN, height_in=5.0)
+    figure = new_figure(
+        fleet.title, "final ICRs of every log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12
+    )  # fmt: skip
     panels = figure.subplots(2, 1, sharex=True)
-    figure.subplots_adjust(**inches(figure, left=0.85, right=0.2, top=0.85, bottom=0.95), hspace=0.12)
-    robots = list(dict.fromkeys(point.robot for point in points))
     for axes, side, label in zip(panels, (0, 1), ("ICR y right [m]", "ICR y left [m]"), strict=True):
-        for number, robot in enumerate(robots):
-            mine = [point for point in points if point.robot == robot]
+        for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
+            mine = [point for point in fleet.points if point.robot == robot]
             when = date2num([np.datetime64(point.date.rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
             axes.errorbar(
                 when, [point[2 + side] for point in mine], [point[4 + side] for point in mine],
                 linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
-                markersize=4.5, capsize=2.0, linewidth=1.0, label=drawable(robot or "robot"),
+                markersize=4.5, capsize=2.0, linewidth=1.0, label=drawable(robot or "robot not named"),
             )  # fmt: skip
         axes.set_ylabel(label)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
     panels[-1].set_xlabel("Date (UTC) [-]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=4)
+    add_legend(figure, ncols=4)
     return figure
 
 
-def draw_fleet_errors(title: str, errors_m: Mapping[str, Sequence[float]]) -> Figure:
-    """Draw the 95 % error of the ICRs after 10 m of every log by group, the median marked."""
-    figure = new_figure(
-        title, "95 % error after 10 m without GNSS, momentary ICRs; bar: median of the logs", width_in=WIDTH_IN,
-        height_in=1.7 + ROW_IN * max(len(errors_m), 2),
-    )  # fmt: skip
-    axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=2.4, right=0.3, top=0.85, bottom=0.6))
-    for row, values in enumerate(errors_m.values()):
+@styled
+def fleet_errors(fleet: FleetNumbers) -> Figure:
+    """Return the 95 % error of the ICRs after 10 m of every log by group, the median marked."""
+    what = "95 % error after 10 m without GNSS, momentary ICRs; bar: median of the logs"
+    labels = [f"{shortened(name, LONGEST_LABEL)} ({len(values)})" for name, values in fleet.errors_m.items()]
+    figure, axes = _rows(fleet.title, what, labels, left_in=2.4)
+    for row, values in enumerate(fleet.errors_m.values()):
         axes.plot(values, [row] * len(values), linestyle="none", marker="o", markersize=4.5, color=COLORS[0], alpha=0.6)
-        median = float(np.median(values))
-        axes.plot([median, median], [row - 0.3, row + 0.3], color="black", linewidth=2.0)
-    axes.set_yticks(range(len(errors_m)), [_label(name, len(values)) for name, values in errors_m.items()])
-    axes.set_ylim(len(errors_m) - 0.4, -0.6)
-    axes.set_xlim(left=0)
-    axes.set_xlabel("Error [m]")
+        axes.plot([float(np.median(values))] * 2, [row - 0.3, row + 0.3], color="black", linewidth=2.0)
+    logarithmic_errors(axes)
     return figure
 
 
-def draw_fleet_failures(title: str, reasons: Mapping[str, int]) -> Figure:
-    """Draw how many logs could not be used, by reason."""
-    figure = new_figure(
-        title, "logs that could not be used, by reason", width_in=WIDTH_IN,
-        height_in=1.7 + ROW_IN * max(len(reasons), 2),
-    )  # fmt: skip
-    axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=3.3, right=0.3, top=0.85, bottom=0.6))
-    axes.barh(range(len(reasons)), list(reasons.values()), height=0.6, color=COLORS[1])
-    axes.set_yticks(range(len(reasons)), [_label(reason) for reason in reasons])
-    axes.set_ylim(len(reasons) - 0.4, -0.6)
+@styled
+def fleet_failures(fleet: FleetNumbers) -> Figure:
+    """Return how many logs could not be used, by reason."""
+    labels = [shortened(reason, LONGEST_LABEL) for reason in fleet.reasons]
+    figure, axes = _rows(fleet.title, "logs that could not be used, by reason", labels, left_in=3.3)
+    axes.barh(range(len(labels)), list(fleet.reasons.values()), height=0.6, color=COLORS[1])
     axes.set_xlabel("Logs [-]")
     axes.locator_params(axis="x", integer=True)
     return figure
 
 
-def _label(text: str, count: int | None = None) -> str:
-    short = text if len(text) <= LONGEST_LABEL else f"{text[: LONGEST_LABEL - 1]}…"
-    return drawable(short) if count is None else f"{drawable(short)} ({count})"
+def _rows(title: str, what: str, labels: Sequence[str], *, left_in: float) -> tuple[Figure, Axes]:
+    """Return a figure with a row for each label, the first one at the top."""
+    height_in = 1.7 + ROW_IN * max(len(labels), 2)
+    figure = new_figure(title, what, height_in=height_in, margins_in=(left_in, 0.3, 0.85, 0.6))
+    axes = figure.subplots()
+    axes.set_yticks(range(len(labels)), [drawable(label) for label in labels], parse_math=False)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    return figure, axes

@@ -5,65 +5,52 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.collections import EllipseCollection
+from matplotlib.patches import Circle
 
 from icrtool.calibration.forecast import Forecast
-from icrtool.output.figures.style import FILTER, HALF_WIDTH, ICR, MEAN, inches, new_figure
+from icrtool.output.figures.style import FILTER, HALF_WIDTH, ICR, LABEL_BOX, MEAN, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH_IN, HEIGHT_IN = 9.0, 4.2
-
 CIRCLES = 20
 
 
-def draw_forecast(
+@styled
+def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None
 ) -> Figure:
     """Return the figure of a forecast; a dashed line for each budget, and where the calibration's errors end."""
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
     subtitle = f"Forecast error without GNSS from the start: {by}, by the calibration"
-    figure = new_figure(title, subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
+    figure = new_figure(
+        title, subtitle, width_in=9.0, height_in=4.2, margins_in=(0.7, 0.25, 0.75, 0.95), wspace=0.28
+    )  # fmt: skip
     grown, path = figure.subplots(1, 2)
-    figure.subplots_adjust(wspace=0.28, **inches(figure, left=0.7, right=0.25, top=0.75, bottom=0.95))
-    grown.plot(forecast.distance_m, forecast.p95_m, label="95 %", **ICR.keywords())
-    grown.plot(forecast.distance_m, forecast.expected_m, label="expected", **FILTER.keywords())
-    if gyro is not None:
-        grown.plot(gyro.distance_m, gyro.p95_m, label="95 %, with gyro", **ICR.keywords() | {"linestyle": ":"})
-        grown.plot(gyro.distance_m, gyro.expected_m, label="expected, with gyro",
-                   **FILTER.keywords() | {"linestyle": ":"})  # fmt: skip
+    for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
+        if one is not None:
+            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **ICR.keywords() | dash)
+            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **FILTER.keywords() | dash)
     for budget in budgets_m:
         grown.axhline(budget, **HALF_WIDTH.keywords())
         grown.annotate(
             f"budget {budget:g} m", (0.99, budget), xycoords=("axes fraction", "data"), xytext=(0, 2),
-            textcoords="offset points", ha="right", fontsize=8, color="0.3", zorder=4,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
+            textcoords="offset points", ha="right", fontsize=8, color="0.3", zorder=4, bbox=LABEL_BOX,
         )  # fmt: skip
     if forecast.distance_m[-1] > measured_m:
         grown.axvline(measured_m, label="measured up to here", **MEAN.keywords())
-    grown.set_xlabel("Distance without GNSS [m]")
-    grown.set_ylabel("Error [m]")
-    grown.set_xlim(0.0, None)
-    grown.set_ylim(0.0, None)
+    grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))
     path.plot(forecast.east_m, forecast.north_m, label="path", **HALF_WIDTH.keywords() | {"linestyle": "-"})
     # Where the forecast is extrapolated its circles would bury the path.
     measured = np.flatnonzero(forecast.distance_m <= measured_m)
     rows = measured[:: max(len(measured) // CIRCLES, 1)]
-    size = 2.0 * forecast.p95_m[rows]
-    circles = EllipseCollection(
-        size, size, np.zeros(len(rows)), units="xy", offset_transform=path.transData, edgecolors=ICR.color,
-        facecolors="none", linewidths=0.8, offsets=np.column_stack([forecast.east_m[rows], forecast.north_m[rows]]),
-    )  # fmt: skip
+    for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
+        path.add_patch(
+            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=ICR.color, linewidth=0.8)
+        )
     path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=ICR.color, linewidth=0.8)
-    path.add_collection(circles)
-    path.update_datalim(
-        [(e + a * r, n + a * r) for e, n, r in zip(forecast.east_m[rows], forecast.north_m[rows], size / 2, strict=True)
-         for a in (-1, 1)]
-    )  # fmt: skip
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
-    path.set_xlabel("East [m]")
-    path.set_ylabel("North [m]")
-    figure.legend(loc="lower center", ncols=4, columnspacing=1.8)
+    path.set(xlabel="East [m]", ylabel="North [m]")
+    figure.legend(ncols=4)
     return figure

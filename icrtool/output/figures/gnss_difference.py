@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.output.figures.decimate import extremes, percentiles
+from icrtool.output.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     BAND_COLOR,
@@ -16,10 +16,11 @@ from icrtool.output.figures.style import (
     FLOAT_COLOR,
     ICR,
     MEAN,
-    TimeAxis,
-    inches,
+    add_legend,
     new_figure,
     shade_spans,
+    styled,
+    time_unit,
 )
 from icrtool.output.text_format import metres_text, position_word, run_title
 from icrtool.records.run import Run
@@ -27,8 +28,6 @@ from icrtool.records.run import Run
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-WIDTH_IN, HEIGHT_IN = 7.2, 3.9
 
 TYPICAL_PERCENT = 99.5
 HEADROOM = 1.6
@@ -44,41 +43,38 @@ MARKS = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
-def draw_gnss_difference(run: Run) -> Figure:
-    """Draw the distance between filter and fixes over time, rejected fixes apart.
+@styled
+def gnss_difference(run: Run) -> Figure:
+    """Return the distance between filter and fixes [m] over time, rejected fixes apart.
 
     Of many fixes, the range and the median in each of `BINS` equal times are drawn.
     """
     facts = run.summary["gnss"]
     subtitle = f"Distance between filter and {position_word(run.summary)}"
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=HEIGHT_IN)
+    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9)
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.65, bottom=1.0))
-    time = TimeAxis.for_span(float(run.table.t_s[-1]))
-    t, difference = run.gnss.t_s / time.seconds, run.gnss.difference
+    unit, seconds = time_unit(float(run.table.t_s[-1]))
+    t, difference = run.gnss.t_s / seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
     if (mean := facts["mean_difference_m"]) is not None and (most := facts["max_difference_m"]) is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
         _draw_used(axes, t[trusted], difference[trusted], f"used, max {metres_text(most)}")
         axes.axhline(mean, label=f"mean {metres_text(mean)}", **MEAN.keywords())
-    if gated.any():
-        _draw_rejected(axes, t[gated], difference[gated], top)
-    _mark_down_weighted(axes, t, difference, run.sensors.fixes.down_weighted & used, top)
+    _mark(axes, t, difference, gated, top, "rejected", "x", color=BAD_FIX_COLOR, markersize=4.5)
+    weak = run.sensors.fixes.down_weighted & used
+    _mark(axes, t, difference, weak, top, "down-weighted", ".", color=FLOAT_COLOR, markersize=4.0)
     lost = len(run.sensors.losses_ns) > 0
     shade_spans(
         axes,
-        (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / time.seconds,
+        (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / seconds,
         label="no usable GNSS, or RTK lost" if lost else "no usable GNSS",
     )
-    axes.set_xlim(0, max(float(run.table.t_s[-1]) / time.seconds, 1e-3))
-    axes.set_ylim(0, top)
-    axes.set_xlabel(f"Time [{time.unit}]")
-    axes.set_ylabel("Difference [m]")
+    axes.set(xlim=(0, max(float(run.table.t_s[-1]) / seconds, 1e-3)), ylim=(0, top))
+    axes.set(xlabel=f"Time [{unit}]", ylabel="Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
     ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
-    if axes.get_legend_handles_labels()[0]:
-        figure.legend(loc="lower center", ncols=ncols, columnspacing=1.6, handlelength=2.0)
+    add_legend(figure, ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 
@@ -98,25 +94,16 @@ def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
     axes.plot(centre, middle, color=ICR.color, linewidth=1.0, label="median")
 
 
-def _draw_rejected(axes: Axes, t: Floats, difference: Floats, top: float) -> None:
-    """Mark rejected fixes where they are, and those above the picture at its upper edge."""
-    look: dict[str, Any] = {"linestyle": "none", "color": BAD_FIX_COLOR, "markersize": 4.5, "clip_on": False}
+def _mark(
+    axes: Axes, t: Floats, difference: Floats, rows: Bools, top: float, label: str, marker: str, **look: Any
+) -> None:
+    """Mark fixes where they are, the extremes of many; those above the picture at its upper edge."""
     beyond = difference > top
-    for rows, marker, where in ((~beyond, "x", ""), (beyond, "^", ", above")):
-        x, y = t[rows], np.minimum(difference[rows], top)
-        if len(x):
-            shown = extremes(difference[rows], points=MARKS)
-            axes.plot(x[shown], y[shown], marker=marker, label=f"{len(x)} rejected{where}", **look)
-
-
-def _mark_down_weighted(axes: Axes, t: Floats, difference: Floats, rows: Bools, top: float) -> None:
-    """Mark the fixes that were used with the noise of float or other ones."""
-    if not rows.any():
-        return
-    shown = extremes(difference[rows], points=MARKS)
-    x, y = t[rows][shown], np.minimum(difference[rows][shown], top)
-    look: dict[str, Any] = {"linestyle": "none", "marker": ".", "color": FLOAT_COLOR, "markersize": 4.0}
-    axes.plot(x, y, label=f"{np.count_nonzero(rows):,} down-weighted", **look)
+    for chosen, shape, where in ((rows & ~beyond, marker, ""), (rows & beyond, "^", ", above")):
+        if chosen.any():
+            shown = extremes(difference[chosen], points=MARKS)
+            y, words = np.minimum(difference[chosen][shown], top), f"{np.count_nonzero(chosen):,} {label}{where}"
+            axes.plot(t[chosen][shown], y, marker=shape, linestyle="none", clip_on=False, label=words, **look)
 
 
 def _top(difference: Floats) -> float:

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.decimate import extremes, percentiles
+from icrtool.output.decimate import extremes, percentiles
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     BAND_COLOR,
     BAR_COLOR,
     CHANGE,
     HALF_WIDTH,
+    LABEL_BOX,
     MEAN,
-    OUTAGE_COLOR,
     Pen,
-    TimeAxis,
+    add_legend,
     fill_bins,
-    inches,
     new_figure,
     shade_spans,
+    spot,
+    styled,
+    time_unit,
 )
 from icrtool.output.text_format import run_title, signed
 from icrtool.records.run import ICR_COLUMNS, Run
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2
-
-LINE_COLOR = "black"
 SEGMENT = Pen("#e08214", width=1.6)
 # Plain text: mathtext costs more than the rest of a figure.
 NAMES = {
@@ -45,6 +42,8 @@ NAMES = {
 }
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
+
+NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **HALF_WIDTH.keywords()}
 
 RANGE_PERCENT = (0.2, 99.8)
 BAND_RANGE_PERCENT = (2.0, 98.0)
@@ -60,19 +59,20 @@ LEAST_MARGIN_S = 10.0
 BINS = 30
 
 
-def draw_icr_estimates(run: Run) -> Figure:
-    """Draw the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
+@styled
+def icr_estimates(run: Run) -> Figure:
+    """Return the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
     subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=5.8)
+    figure = new_figure(
+        run_title(run.summary), subtitle, height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3
+    )  # fmt: skip
     panels = figure.subplots(
         3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
     )
-    margins = inches(figure, left=0.75, right=0.2, top=0.8, bottom=0.9)
-    figure.subplots_adjust(**margins, wspace=0.22, hspace=0.3)
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
         for axes, span in zip(row, spans, strict=True):
             _draw_estimate(axes, run, column, span, first=axes is row[0])
@@ -80,37 +80,28 @@ def draw_icr_estimates(run: Run) -> Figure:
         row[0].set_title(_convergence_text(run, column), loc="left", pad=4.0)
         row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
-        axes.set_xlabel(f"Time [{TimeAxis.for_span(end - begin).unit}]")
-    keys = _estimate_keys(run)
-    figure.legend(handles=keys, loc="lower center", ncols=len(keys), columnspacing=1.4, handlelength=2.0)
+        axes.set_xlabel(f"Time [{time_unit(end - begin)[0]}]")
+    add_legend(figure, columnspacing=1.4, handlelength=2.0)
     return figure
 
 
-def draw_icr_clusters(run: Run) -> Figure:
-    """Draw how much of the time each ICR estimate had which value, after convergence."""
+@styled
+def icr_clusters(run: Run) -> Figure:
+    """Return the percent of the time that each ICR estimate had which value [m], after convergence."""
     settled = run.settled_s
     after = run.table.t_s >= settled
     subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
-    figure = new_figure(run_title(run.summary), subtitle, width_in=WIDTH_IN, height_in=3.9)
+    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9, margins_in=(0.65, 0.2, 1.0, 0.9))
     panels = figure.subplots(1, 3, sharey=True)
-    figure.subplots_adjust(**inches(figure, left=0.65, right=0.2, top=1.0, bottom=0.9), wspace=0.2)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
     columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
     spans = [float(np.ptp(percentiles(value, CLUSTER_RANGE_PERCENT))) for value in values]
     span = max(*spans, 2 * LEAST_HALF_RANGE_M)
-    no_slip_shown = [
+    for axes, column, value in zip(panels, columns, values, strict=True):
         _draw_histogram(axes, run, column, value, weight, span)
-        for axes, column, value in zip(panels, columns, values, strict=True)
-    ]
     panels[0].set_ylabel("Time [%]")
-    keys = [
-        Patch(color=BAR_COLOR, linewidth=0, label=f"estimates, bins of {_bin_width(span):g} m"),
-        Line2D([], [], label="mean", **MEAN.keywords()),
-    ]
-    if any(no_slip_shown):
-        keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
-    figure.legend(handles=keys, loc="lower center", ncols=3, columnspacing=3.0)
+    add_legend(figure, columnspacing=3.0)
     return figure
 
 
@@ -126,18 +117,15 @@ def _spans_s(run: Run) -> list[tuple[float, float]]:
 
 def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
     """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
-    table, unit = run.table, TimeAxis.for_span(span_s[1] - span_s[0]).seconds
+    table, unit = run.table, time_unit(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
     t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
     band = 2 * getattr(table, f"std_{column}")[rows]
     low, high = value - band, value + band
-    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit)
-    for change in run.changes_s:
-        axes.axvline(change / unit, zorder=2.6, **CHANGE.keywords())
-    shown = extremes(low, high)
-    axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0)
     shown = extremes(value)
-    axes.plot(t[shown], value[shown], color=LINE_COLOR, linewidth=1.0)
+    axes.plot(t[shown], value[shown], color="black", linewidth=1.0, label="estimate")
+    shown = extremes(low, high)
+    axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0, label="±2σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
@@ -148,16 +136,14 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.set_xlim(span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3))
     axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
     axes.locator_params(axis="y", nbins=5)
-    _draw_segments(axes, run, column, unit)
-    _mark_clipped(axes, t, value)
-
-
-def _draw_segments(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> None:
-    """Draw the mean of each stretch between the given terrain changes."""
+    for change in run.changes_s:
+        axes.axvline(change / unit, zorder=2.6, label="terrain change", **CHANGE.keywords())
     for segment in run.summary["segments"]:
         if (mean := segment["mean"][column]) is not None:
-            span = segment["begin_s"] / unit_s, segment["end_s"] / unit_s
-            axes.plot(span, (mean, mean), zorder=2.5, **SEGMENT.keywords())
+            stretch = segment["begin_s"] / unit, segment["end_s"] / unit
+            axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT.keywords())
+    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
+    _mark_clipped(axes, t, value)
 
 
 def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
@@ -167,26 +153,21 @@ def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
         if not low <= value[row] <= high:
             axes.annotate(
                 f"{arrow} {signed(value[row])}", (t[row], edge), ha="left", va="top" if edge == high else "bottom",
-                fontsize=7.5, color=BAD_FIX_COLOR,
+                fontsize=7.5, color=BAD_FIX_COLOR, bbox=LABEL_BOX,
             )  # fmt: skip
 
 
 def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> list[float]:
     """Draw b/2 and the begin and end of the convergence; return where they are [m]."""
     heights: list[float] = []
+    marks = ("white", "10 %"), ("black", "90 % of the change")
+    for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
+        heights.append(float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)]))
+        axes.plot([second / unit_s], heights[-1:], zorder=4, clip_on=False, label=label, **spot(fill))
     if (width := run.track_width_m) is not None:
         heights.append(SIDES[column] * width / 2)
-        axes.axhline(heights[0], **HALF_WIDTH.keywords())
-    if (span := run.convergence_s[column]) is not None:
-        for second, fill in zip(span, ("white", "black"), strict=True):
-            height = float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)])
-            axes.plot([second / unit_s], [height], markerfacecolor=fill, **_mark())
-            heights.append(height)
+        axes.axhline(heights[-1], **NO_SLIP_PLACE)
     return heights
-
-
-def _mark() -> dict[str, Any]:
-    return {"linestyle": "none", "marker": "o", "color": "black", "markersize": 5.5, "zorder": 4, "clip_on": False}
 
 
 def _convergence_text(run: Run, column: IcrColumn) -> str:
@@ -199,49 +180,31 @@ def _final_text(run: Run, column: IcrColumn) -> str:
     return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
 
 
-def _estimate_keys(run: Run) -> list[Line2D | Patch]:
-    keys: list[Line2D | Patch] = [
-        Line2D([], [], color=LINE_COLOR, linewidth=1.0, label="estimate"),
-        Patch(color=BAND_COLOR, linewidth=0, label="±2σ"),
-    ]
-    if any(span is not None for span in run.convergence_s.values()):
-        keys.append(Line2D([], [], markerfacecolor="white", label="10 %", **_mark()))
-        keys.append(Line2D([], [], label="90 % of the change", **_mark()))
-    if run.track_width_m is not None:
-        keys.append(Line2D([], [], label="no slip (±b/2, 0)", **HALF_WIDTH.keywords()))
-    if run.changes_s:
-        keys.append(Line2D([], [], label="terrain change", **CHANGE.keywords()))
-        keys.append(Line2D([], [], label="mean between", **SEGMENT.keywords()))
-    if len(run.outages_ns):
-        keys.append(Patch(color=OUTAGE_COLOR, linewidth=0, label="no usable GNSS"))
-    return keys
-
-
-def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weight: Floats, span_m: float) -> bool:
-    """Draw percent of time over value, and show `span_m` of it; return whether the place of no slip is in view."""
+def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weight: Floats, span_m: float) -> None:
+    """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
     width = _bin_width(span_m)
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
-    fill_bins(axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR)
+    fill_bins(
+        axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR, label=f"estimates, bins of {width:g} m"
+    )
     axes.set_xlim(low, high)
     mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
     title = "not shown"
     if mean is not None:
-        axes.axvline(mean, **MEAN.keywords())
+        axes.axvline(mean, label="mean", **MEAN.keywords())
         title = f"{signed(mean)} ± {std:.3f} m"
-    no_slip_shown = False
     if (track := run.track_width_m) is not None:
-        no_slip_shown = bool(low <= SIDES[column] * track / 2 <= high)
-        if no_slip_shown:
-            axes.axvline(SIDES[column] * track / 2, **HALF_WIDTH.keywords())
-        title += f"\nno slip: {signed(SIDES[column] * track / 2)} m"
+        place = SIDES[column] * track / 2
+        if low <= place <= high:
+            axes.axvline(place, **NO_SLIP_PLACE)
+        title += f"\nno slip: {signed(place)} m"
     axes.set_title(title, pad=4.0)
     axes.set_xlabel(NAMES[column])
     axes.locator_params(axis="x", nbins=3, min_n_ticks=2)
     axes.grid(visible=False, axis="x")
-    return no_slip_shown
 
 
 def _bin_width(span_m: float) -> float:

@@ -2,48 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from icrtool.output.figures.style import ICR, inches, new_figure
-from icrtool.output.text_format import FITTED
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.errors import DataError
+from icrtool.output.figures.style import ICR, logarithmic_errors, new_figure, styled
+from icrtool.output.text_format import FITTED, run_title
 from icrtool.records.dropout import CHOICE_HORIZON_M, ModelScore
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+ROW_IN = 0.27
 
-WIDTH_IN, ROW_IN = 7.2, 0.27
 
+@styled
+def model_comparison(report: DropoutReport) -> Figure:
+    """Return 95 % (filled) and expected error (open) [m] of each model; held-out ones are circles, others squares.
 
-def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequence[float]) -> Figure:
-    """Draw 95 % (filled) and expected error (open) of each model; held-out ones as circles, others as squares.
-
-    Parameters
-    ----------
-    scores, horizons_m : of a `icrtool.calibration.model_comparison.ModelComparison`
+    Raises
+    ------
+    DataError
+        The report holds no model comparison.
     """
-    h = int(np.argmin(np.abs(np.array(horizons_m) - CHOICE_HORIZON_M)))
-    scores = [score for score in scores if score.summary.trials[h]]
-    groups = sum(1 for score in scores if score.measured_heading) > 0
+    table = report.comparison
+    if table is None:
+        raise DataError(report.name, "the report holds no model comparison", report.no_comparison)
+    h = int(np.argmin(np.abs(np.array(table.horizons_m) - CHOICE_HORIZON_M)))
+    scores = [score for score in table.scores if score.summary.trials[h]]
+    groups = any(score.measured_heading for score in scores)
+    what = "95 % / expected, on distance they were not fitted to"
     figure = new_figure(
-        title,
-        f"Open-loop error after {horizons_m[h]:g} m, 95 % / expected, on distance they were not fitted to",
-        width_in=WIDTH_IN,
-        height_in=1.65 + ROW_IN * (len(scores) + 0.6 * groups),
-    )
+        run_title(report.run_summary), f"Open-loop error after {table.horizons_m[h]:g} m, {what}",
+        height_in=1.65 + ROW_IN * (len(scores) + 0.6 * groups), margins_in=(2.75, 1.05, 0.62, 0.9),
+    )  # fmt: skip
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, left=2.75, right=1.05, top=0.62, bottom=0.9))
     _draw_rows(axes, scores, h)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("Error [m], logarithmic")
+    logarithmic_errors(axes)
     axes.grid(visible=False, axis="y")
     keys = [
         Line2D([], [], label="95 %", linestyle="none", marker="D", color="0.25", markersize=5),
@@ -51,7 +49,7 @@ def draw_comparison(title: str, scores: Sequence[ModelScore], horizons_m: Sequen
         Line2D([], [], label="held out", linestyle="none", marker="o", color=ICR.color, markersize=6),
         Line2D([], [], label="not held out", linestyle="none", marker="s", color="0.6", markersize=6),
     ]  # fmt: skip
-    figure.legend(handles=keys, loc="lower center", ncols=4, columnspacing=1.8)
+    figure.legend(handles=keys, ncols=4)
     return figure
 
 
@@ -64,10 +62,8 @@ def _draw_rows(axes: Axes, scores: list[ModelScore], h: int) -> None:
         color, marker = (ICR.color, "o") if held_out else ("0.6", "s")
         p95, expected = float(score.summary.p95[h]), float(score.summary.expected[h])
         axes.plot([expected, p95], [y, y], color=color, linewidth=1.2)
-        axes.plot([p95], [y], marker=marker, color=color, markersize=6.5, linestyle="none")
-        axes.plot(
-            [expected], [y], marker=marker, color=color, markerfacecolor="white", markersize=6.5, linestyle="none"
-        )
+        for place, fill in ((p95, color), (expected, "white")):
+            axes.plot([place], [y], marker, color=color, markerfacecolor=fill, markersize=6.5)
         axes.annotate(
             f"{p95:.2f} / {expected:.2f} m", (p95, y), xytext=(7, 0), textcoords="offset points", va="center",
             fontsize=8, color="0.2", annotation_clip=False,

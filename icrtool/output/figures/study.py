@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change
+from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change, icr_keys
 from icrtool.output.figures.study_special import draw_consistency, draw_initial
-from icrtool.output.figures.style import Pen, inches, new_figure, save, style
+from icrtool.output.figures.style import ICR_LOOKS, NO_SLIP, new_figure, styled
 from icrtool.output.tables.study import capital, runs_text, study_title
 from icrtool.simulation.studies import KINDS, StudyName, StudyResult
 from icrtool.simulation.study_measures import ICR_NAMES
@@ -21,13 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ICR_PENS = {
-    "y_icr_right": Pen("#2166ac", "-", 1.5),
-    "y_icr_left": Pen("#b2182b", (0, (6, 2)), 1.5),
-    "x_icr": Pen("0.25", (0, (1.5, 1.5)), 1.5),
-}
-ICR_MARKS = {"y_icr_right": "o", "y_icr_left": "s", "x_icr": "^"}
-ICR_WORDS = {"y_icr_right": "y right", "y_icr_left": "y left", "x_icr": "x"}
+OPEN_LOOP: dict[str, Any] = {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5}
 
 Rows = tuple[tuple[str, str, bool], ...]
 """Metric pattern, axis label, whether there is one for every ICR."""
@@ -44,8 +37,9 @@ PANEL_IN = 2.3
 LEAST_RANGE_M = 0.02
 
 
-def draw_study(result: StudyResult, stem: Path, formats: tuple[str, ...]) -> None:
-    """Write the picture of a study as ``stem.format`` in each of `formats`."""
+@styled
+def study_figure(result: StudyResult) -> Figure:
+    """Return the picture of a study."""
     special: dict[StudyName, Callable[[StudyResult], Figure]] = {
         "convergence": draw_convergence,
         "icr-change": draw_icr_change,
@@ -53,8 +47,7 @@ def draw_study(result: StudyResult, stem: Path, formats: tuple[str, ...]) -> Non
         "consistency": draw_consistency,
         "input-source": draw_input_source,
     }
-    with style():
-        save(special.get(result.request.name, draw_sweep)(result), stem, formats)
+    return special.get(result.request.name, draw_sweep)(result)
 
 
 def subtitle(result: StudyResult) -> str:
@@ -70,10 +63,11 @@ def subtitle(result: StudyResult) -> str:
 def draw_sweep(result: StudyResult) -> Figure:
     """Draw metrics over what was varied: medians, bars from the 5th to the 95th percentile; one column a preset."""
     rows, presets = ROWS[result.request.name], result.request.presets
-    height = 1.5 + PANEL_IN * len(rows)
-    figure = new_figure(study_title(result), subtitle(result), width_in=7.2, height_in=height)
+    figure = new_figure(
+        study_title(result), subtitle(result), height_in=1.5 + PANEL_IN * len(rows), margins_in=(0.85, 0.2, 0.8, 0.95),
+        wspace=0.12, hspace=0.18,
+    )  # fmt: skip
     panels = figure.subplots(len(rows), len(presets), squeeze=False, sharex=True, sharey="row")
-    figure.subplots_adjust(**inches(figure, left=0.85, right=0.2, top=0.8, bottom=0.95), wspace=0.12, hspace=0.18)
     for column, preset in enumerate(presets):
         levels = [level for level in result.levels if level["series"] == preset]
         for row, (metric, label, by_icr) in enumerate(rows):
@@ -96,7 +90,7 @@ def draw_sweep(result: StudyResult) -> Figure:
             # On a drive without a turn nothing is missed, and zero has no logarithm.
             if all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
                 axes.set_yscale("log")
-    figure.legend(handles=_keys(result), loc="lower center", ncols=5, columnspacing=1.6, handlelength=2.4)
+    figure.legend(handles=_keys(result), ncols=5, columnspacing=1.6)
     return figure
 
 
@@ -113,12 +107,12 @@ def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_ic
     if by_icr:
         if metric.startswith("error"):
             axes.axhline(0.0, color="0.6", linewidth=0.8)
-        for icr, pen in ICR_PENS.items():
-            _bars(axes, x, [level["metrics"][metric.format(icr=icr)] for level in levels], pen, ICR_MARKS[icr])
+        for icr, look in ICR_LOOKS.items():
+            _bars(axes, x, [level["metrics"][metric.format(icr=icr)] for level in levels], look)
     elif metric == "open_loop":
-        _bars(axes, x, [level["metrics"]["blind_icr_10m_p95_m"] for level in levels], Pen("#1b7837"), "D")
+        _bars(axes, x, [level["metrics"]["blind_icr_10m_p95_m"] for level in levels], OPEN_LOOP)
         no_slip = [level["metrics"]["blind_no_slip_10m_p95_m"]["p50"] for level in levels]
-        axes.plot(x, no_slip, color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), linewidth=1.5)
+        axes.plot(x, no_slip, **NO_SLIP.keywords())
     else:
         axes.plot(
             x, [100 * level["metrics"][metric]["mean"] for level in levels], color="black", marker="o", markersize=3.5
@@ -126,31 +120,26 @@ def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_ic
         axes.set_ylim(-4, 104)
 
 
-def _bars(axes: Axes, x: Floats, found: list[dict[str, Any]], pen: Pen, mark: str) -> None:
+def _bars(axes: Axes, x: Floats, found: list[dict[str, Any]], look: dict[str, Any]) -> None:
     middle, low, high = (np.array([one[name] for one in found]) for name in ("p50", "p5", "p95"))
     span = np.array([middle - low, high - middle])
-    axes.errorbar(
-        x, middle, span, color=pen.color, linestyle=pen.dash, linewidth=pen.width, marker=mark, markersize=3.5,
-        elinewidth=0.8, capsize=2.0,
-    )  # fmt: skip
+    axes.errorbar(x, middle, span, linewidth=1.5, elinewidth=0.8, capsize=2.0, **look)
 
 
 def _keys(result: StudyResult) -> list[Line2D]:
-    keys = [
-        Line2D([], [], marker=ICR_MARKS[icr], markersize=3.5, label=ICR_WORDS[icr], **pen.keywords())
-        for icr, pen in ICR_PENS.items()
-    ]
+    keys = icr_keys()
     if result.request.name == "gnss":
-        keys.append(Line2D([], [], color="#1b7837", marker="D", markersize=3.5, label="open loop, final ICRs"))
-        keys.append(Line2D([], [], color="#e08214", linestyle=(0, (6, 1.5, 1.2, 1.5)), label="open loop, no slip"))
+        keys.append(Line2D([], [], label="open loop, final ICRs", **OPEN_LOOP))
+        keys.append(Line2D([], [], label="open loop, no slip", **NO_SLIP.keywords()))
     return keys
 
 
 def draw_input_source(result: StudyResult) -> Figure:
     """Draw the two inputs over time (Fig. 11), and the ICR errors with either."""
-    figure = new_figure(study_title(result), subtitle(result), width_in=7.2, height_in=5.6)
+    figure = new_figure(
+        study_title(result), subtitle(result), height_in=5.6, margins_in=(0.85, 0.2, 0.85, 0.8), hspace=0.42
+    )  # fmt: skip
     top, bottom = figure.subplots(2, 1)
-    figure.subplots_adjust(**inches(figure, left=0.85, right=0.2, top=0.85, bottom=0.8), hspace=0.42)
     curves = result.curves
     until = min(100.0, result.request.plan.duration_s)
     for name, color, width, order in (("encoder", "0.65", 0.6, 2), ("commanded", "#b2182b", 1.2, 3)):
@@ -159,17 +148,15 @@ def draw_input_source(result: StudyResult) -> Figure:
             curves[f"{name}_t"][seen], curves[f"{name}_v"][seen], where="post", color=color, linewidth=width,
             label=name, zorder=order,
         )  # fmt: skip
-    top.set_xlabel("Time [s]")
-    top.set_ylabel("Left track speed [m/s]")
+    top.set(xlabel="Time [s]", ylabel="Left track speed [m/s]")
     top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
     names = [f"{level['value']}\n{level['series']}" for level in result.levels]
     for shift, icr in zip((-0.15, 0.0, 0.15), ICR_NAMES, strict=True):
         x = np.arange(len(names), dtype=np.float64) + shift
         found = [level["metrics"][f"error_{icr}_m"] for level in result.levels]
-        pen = ICR_PENS[icr]
-        _bars(bottom, x, found, Pen(pen.color, "none", pen.width), ICR_MARKS[icr])
+        _bars(bottom, x, found, ICR_LOOKS[icr] | {"linestyle": "none"})
     bottom.axhline(0.0, color="0.6", linewidth=0.8)
     bottom.set_xticks(np.arange(len(names)), names)
     bottom.set_ylabel("ICR error [m]")
-    figure.legend(handles=_keys(result), loc="lower center", ncols=3)
+    figure.legend(handles=_keys(result), ncols=3)
     return figure

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Patch
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.style import inches, new_figure
+from icrtool.output.figures.style import new_figure
 from icrtool.output.tables.study import runs_text, study_title
 from icrtool.simulation.studies import StudyResult
 from icrtool.simulation.study_initial import GUARDS
@@ -33,10 +33,9 @@ def draw_initial(result: StudyResult) -> Figure:
         study_title(result),
         f"Initial y ICRs {starts.min():g} to {starts.max():g} m, preset {request.presets[0]}; {runs_text(request)} "
         "from every start",
-        width_in=7.2, height_in=5.6,
+        height_in=5.6, margins_in=(0.7, 0.2, 0.85, 0.95), wspace=0.12, hspace=0.42,
     )  # fmt: skip
     panels = figure.subplots(2, len(GUARDS), sharey="row")
-    figure.subplots_adjust(**inches(figure, left=0.7, right=0.2, top=0.85, bottom=0.95), wspace=0.12, hspace=0.42)
     near = float(curves["left_of_curves"][0])
     order = np.argsort(starts)
     for column, name in enumerate(GUARDS):
@@ -53,9 +52,7 @@ def draw_initial(result: StudyResult) -> Figure:
     panels[0][0].set_ylabel("Initial y right [m]")
     panels[1][0].set_ylabel(f"y right [m] (y left {near:g})")
     keys = [Patch(color=color, label=fate) for fate, color in FATES.items()]
-    figure.legend(
-        handles=keys, loc="lower center", ncols=3, title="share of the runs; above the dashed line the start is proper"
-    )
+    figure.legend(handles=keys, ncols=3, title="share of the runs; above the dashed line the start is proper")
     return figure
 
 
@@ -63,8 +60,7 @@ def _draw_curves(axes: Axes, traces: Floats, target: float) -> None:
     for one in traces:
         axes.plot(one[:, 0], np.clip(one[:, 1], -50, 50), color="0.35", linewidth=0.8)
     axes.axhline(target, color="#2166ac", linewidth=1.1, linestyle=(0, (4, 2)))
-    axes.set_ylim(-3.2, 3.2)
-    axes.set_xlabel("Time [s]")
+    axes.set(ylim=(-3.2, 3.2), xlabel="Time [s]")
 
 
 def draw_consistency(result: StudyResult) -> Figure:
@@ -73,20 +69,16 @@ def draw_consistency(result: StudyResult) -> Figure:
     request = result.request
     figure = new_figure(
         study_title(result),
-        f"{runs_text(request)}; model: truth drawn from Q and R, "
-        "paper and field: exact kinematics, preset's start",
-        width_in=7.2, height_in=5.6,
+        f"{runs_text(request)}; model: truth drawn from Q and R, paper and field: exact kinematics, preset's start",
+        height_in=5.6, margins_in=(0.75, 0.2, 0.75, 0.85), hspace=0.4,
     )  # fmt: skip
     top, bottom = figure.subplots(2, 1)
-    figure.subplots_adjust(**inches(figure, left=0.75, right=0.2, top=0.75, bottom=0.85), hspace=0.4)
     t = curves["stops_s"]
     low, high = curves["nees_band"]
     top.axhspan(low, high, color="#d9ead3", zorder=0.5, label="95 % band")
     for name in cases:
         top.plot(t, curves[f"nees {name}"], color=CASE_COLORS[name], linestyle=CASE_DASHES[name], label=name)
-    top.set_yscale("log")
-    top.set_xlabel("Time [s]")
-    top.set_ylabel("NEES, mean (6 expected)")
+    top.set(yscale="log", xlabel="Time [s]", ylabel="NEES, mean (6 expected)")
     states = result.levels[0]["states"]
     width = 0.8 / len(cases)
     for place, name in enumerate(cases):
@@ -98,6 +90,6 @@ def draw_consistency(result: StudyResult) -> Figure:
     bottom.set_ylim(min(80.0, *(float(curves[f"coverage {name}"].min()) - 2 for name in cases)), 101)
     bottom.set_xticks(np.arange(len(states)), [state.replace("_", " ") for state in states])
     bottom.set_ylabel("Within 2 sigma [%]")
-    bottom.legend(loc="lower right", ncols=len(cases), frameon=True, framealpha=0.9)
-    figure.legend(*top.get_legend_handles_labels(), loc="lower center", ncols=4)
+    bottom.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(cases), borderaxespad=0.0)
+    figure.legend(*top.get_legend_handles_labels(), ncols=4)
     return figure

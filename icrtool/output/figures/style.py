@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, cast
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.kernels.arrays import Floats
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+P = ParamSpec("P")
+
 PNG_DPI = 130
+
+WIDTH_IN = 7.2
+"""Of most figures: the text width of a page."""
 
 TITLE_CHARACTERS_PER_INCH = 9.5
 
@@ -49,7 +57,9 @@ RC: dict[str, Any] = {
     "lines.solid_joinstyle": "round",
     "legend.fontsize": 8.5,
     "legend.frameon": False,
-    "legend.handlelength": 2.8,
+    "legend.handlelength": 2.4,
+    "legend.columnspacing": 1.8,
+    "legend.loc": "lower center",
     "xtick.labelsize": 8.5,
     "ytick.labelsize": 8.5,
     "path.simplify": True,
@@ -91,6 +101,20 @@ NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
 CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)
 MEAN = Pen("black", (0, (5, 2)), 1.1)
+FORCED = Pen(BAD_FIX_COLOR, width=1.8)
+REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
+
+ICR_LOOKS: dict[str, dict[str, Any]] = {
+    "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
+    "y_icr_left": {"label": "y left", "color": "#b2182b", "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
+    "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
+}
+"""Of the three ICRs where they share a panel, by `icrtool.simulation.study_measures.ICR_NAMES`."""
+
+MODEL_WORDS = {"icr": "ICR", "no_slip": "no slip"}
+
+LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
+"""Behind text that lies on lines."""
 
 
 @contextmanager
@@ -104,17 +128,60 @@ def style() -> Iterator[None]:
         yield
 
 
-def new_figure(title: str, subtitle: str, *, width_in: float, height_in: float) -> Figure:
-    """Return an empty figure with two lines of title at its upper left."""
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Return a function that draws in our style."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **keywords: P.kwargs) -> Figure:
+        with style():
+            return draw(*args, **keywords)
+
+    return drawn
+
+
+def new_figure(
+    title: str, subtitle: str, *, height_in: float, width_in: float = WIDTH_IN,
+    margins_in: tuple[float, float, float, float] = (0.75, 0.2, 0.65, 1.0), wspace: float = 0.2, hspace: float = 0.2,
+) -> Figure:  # fmt: skip
+    """Return an empty figure with two lines of title at its upper left.
+
+    Parameters
+    ----------
+    margins_in : left, right, top and bottom of its axes [in]
+    wspace, hspace : between axes, as a share of their width and height
+    """
     figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI)
     FigureCanvasAgg(figure)
-    left = 0.09 / width_in
-    if len(title) > (most := int(TITLE_CHARACTERS_PER_INCH * width_in)):
-        title = f"{title[: most // 2]}…{title[-most // 2 :]}"
+    left, right, top, bottom = margins_in
+    figure.subplots_adjust(
+        left / width_in, bottom / height_in, 1 - right / width_in, 1 - top / height_in, wspace, hspace
+    )
+    edge = 0.09 / width_in
+    most = int(TITLE_CHARACTERS_PER_INCH * width_in)
     at: dict[str, Any] = {"va": "top", "ha": "left", "parse_math": False}
-    figure.text(left, 1 - 0.09 / height_in, drawable(title), fontsize=10.5, fontweight="bold", **at)
-    figure.text(left, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
+    figure.text(edge, 1 - 0.09 / height_in, drawable(shortened(title, most)), fontsize=10.5, fontweight="bold", **at)
+    figure.text(edge, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
     return figure
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text of so many characters at most, its middle left out: names differ at their ends."""
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
+
+
+def add_legend(figure: Figure, **layout: Any) -> None:
+    """Add a legend below all axes with each label once; in one row where `layout` has no number of columns."""
+    found: dict[str, Artist] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(str(label), handle)
+    if found:
+        figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+
+
+def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
+    """Return the look of a place: white where something begins, black where it ends."""
+    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": size}
 
 
 def drawable(text: str) -> str:
@@ -129,39 +196,32 @@ def drawable(text: str) -> str:
     )
 
 
-def inches(figure: Figure, *, left: float, right: float, top: float, bottom: float) -> dict[str, float]:
-    """Return margins [in] as the fractions that `Figure.subplots_adjust` takes."""
-    width, height = figure.get_size_inches()
-    return {"left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height}
-
-
 def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
     """Write a figure as ``stem.format`` in each of `formats`; the bytes depend on the figure alone."""
-    for form in formats:
-        memory = BytesIO()
-        figure.savefig(memory, format=form, **SAVE[form])
-        stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
+    with style():
+        for form in formats:
+            memory = BytesIO()
+            figure.savefig(memory, format=form, **SAVE[form])
+            stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
 
 
-@dataclass(frozen=True, slots=True)
-class TimeAxis:
-    """A unit of time that suits a span: seconds, minutes or hours."""
-
-    unit: str
-    seconds: float
-
-    @classmethod
-    def for_span(cls, span_s: float) -> TimeAxis:
-        """Choose the unit for a span [s]."""
-        if span_s <= 600:
-            return cls("s", 1.0)
-        return cls("min", 60.0) if span_s <= 4 * 3600 else cls("h", 3600.0)
+def time_unit(span_s: float) -> tuple[str, float]:
+    """Return the unit of time that suits a span [s], and its seconds."""
+    return ("s", 1.0) if span_s <= 600 else ("min", 60.0) if span_s <= 4 * 3600 else ("h", 3600.0)
 
 
 def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
     """Fill the bins of a histogram from zero up; `Axes.stairs` measures every step of its outline and takes longer."""
     filled = axes.fill_between(edges, np.append(heights, heights[-1:]), step="post", linewidth=0, **look)
     filled.sticky_edges.y.append(0.0)
+
+
+def logarithmic_errors(axes: Axes) -> None:
+    """Give the x axis errors [m] on a logarithmic scale with plain numbers."""
+    axes.set(xscale="log", xlabel="Error [m], logarithmic")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def shade_spans(axes: Axes, spans: Floats, label: str = "") -> None:

@@ -5,51 +5,45 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import ScalarFormatter
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
-from icrtool.kernels.arrays import Bools, Floats
-from icrtool.output.figures.decimate import places
+from icrtool.estimation.odometry import OdometryPath, odometry
+from icrtool.kernels.arrays import Floats
+from icrtool.output.decimate import places
+from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     FILTER,
     FIX_COLOR,
     FLOAT_COLOR,
     ICR,
+    LABEL_BOX,
     NO_SLIP,
-    Pen,
-    inches,
+    WIDTH_IN,
+    add_legend,
     new_figure,
+    spot,
+    styled,
 )
 from icrtool.output.text_format import distance_text, duration_text, metres_text, position_word, run_title
-from icrtool.records.measurements import Fixes
 from icrtool.records.run import Run
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
+from icrtool.records.tables import States
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from icrtool.estimation.odometry import OdometryPath, WheelPaths
-
-WIDTH_IN = 7.2
-MARGINS_IN = {"left": 0.75, "right": 0.2, "top": 0.6, "bottom": 1.3}
-LOWEST_BOX_IN, HIGHEST_BOX_IN = 2.4, 5.4
+MARGINS_IN = (0.75, 0.2, 0.6, 1.3)
 
 LARGEST_DETOUR = 0.75
 """Odometry is shown this far outside the filter's path, in sizes of that path; what leads further is cut off."""
 
-SMALLEST_VIEW_M = 2.0
-FAR_M = 20_000.0
+SMALLEST_DRIVE_M = 2.0
 TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
 MOST_TIMES = 12
 TIME_CLEARANCE = 0.06
 """At most so many times are written beside the path, none closer to another than this share of the view."""
-TIME_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-CELLS = 1500.0
-"""Points closer than this fraction of the view are one point: about a pixel."""
-
 
 _DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
 FIX_LOOKS: dict[int, dict[str, Any]] = {
@@ -58,9 +52,8 @@ FIX_LOOKS: dict[int, dict[str, Any]] = {
     FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
-SLIP_COLOR = FLOAT_COLOR
 SLIP_LOOK: dict[str, Any] = {
-    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": SLIP_COLOR,
+    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": FLOAT_COLOR,
     "linestyle": "none", "zorder": 4.6,
 }  # fmt: skip
 JUMP_LOOK: dict[str, Any] = {
@@ -71,128 +64,88 @@ REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewi
 """Markers by class: shape and luminance distinguish them."""
 
 
-def draw_trajectory(run: Run, odometry: WheelPaths) -> Figure:
-    """Draw fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north.
-
-    Parameters
-    ----------
-    odometry : of the run, by `icrtool.estimation.odometry.odometry`
-    """
+@styled
+def trajectory(run: Run) -> Figure:
+    """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
+    found = odometry(run)
     table, drive = run.table, run.summary["drive"]
-    icr, no_slip = odometry.icr, odometry.no_slip
-    lowest, highest = _view(run, icr, no_slip)
-    lowest, highest, box_in = _fit_to_box(lowest, highest)
+    lowest, highest = _extent(run, found.icr, found.no_slip)
+    norths, easts = np.column_stack([lowest, highest])
+    width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
+    box_in = fitted_box_in(norths, easts, width_in)
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-    facts = f"Trajectory, {driven}; ICR odometry: final ICRs"
-    height_in = box_in + MARGINS_IN["top"] + MARGINS_IN["bottom"]
-    figure = new_figure(run_title(run.summary), facts, width_in=WIDTH_IN, height_in=height_in)
+    figure = new_figure(
+        run_title(run.summary), f"Trajectory, {driven}; ICR odometry: final ICRs",
+        height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
+    )  # fmt: skip
     axes = figure.subplots()
-    figure.subplots_adjust(**inches(figure, **MARGINS_IN))
-
-    cell = float((highest - lowest).max()) / CELLS
+    cell = look_down(axes, norths, easts, width_in / box_in, margin=0.04, ticks=9)
+    lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
-    _draw_path(axes, table.north_m, table.east_m, cell, FILTER, "filter", 4)
+    draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
     for path, pen, name, order in (
-        (icr, ICR, "ICR odometry", 3),
-        (no_slip, NO_SLIP, "no-slip odometry", 2),
+        (found.icr, ICR, "ICR odometry", 3),
+        (found.no_slip, NO_SLIP, "no-slip odometry", 2),
     ):
         if path is not None:
             label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
-            _draw_path(axes, path.north_m, path.east_m, cell, pen, label, order)
+            draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
             axes.plot(path.east_m[-1:], path.north_m[-1:], marker="D", color=pen.color, markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
-    ends: dict[str, Any] = {"marker": "o", "color": "black", "linestyle": "none", "zorder": 5}
-    axes.plot(table.east_m[:1], table.north_m[:1], markerfacecolor="white", markersize=8, label="start", **ends)
-    axes.plot(table.east_m[-1:], table.north_m[-1:], markerfacecolor="black", markersize=6, label="end", **ends)
-
-    axes.set_xlim(lowest[1], highest[1])
-    axes.set_ylim(lowest[0], highest[0])
-    axes.set_aspect("equal")
-    axes.set_xlabel("East [m]" + _short_ticks(axes.xaxis, lowest[1]))
-    axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, lowest[0]))
-    figure.legend(loc="lower center", ncols=2, columnspacing=3.0)
+    axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **spot("white", 8.0))
+    axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **spot("black", 6.0))
+    name_directions(axes)
+    add_legend(figure, ncols=2, columnspacing=3.0)
     return figure
 
 
-def _view(run: Run, *odometry: OdometryPath | None) -> tuple[Floats, Floats]:
-    """Return the least and the greatest (north, east) to show [m], margin included."""
-    table = run.table
-    lowest = np.array([table.north_m.min(), table.east_m.min()])
-    highest = np.array([table.north_m.max(), table.east_m.max()])
-    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_VIEW_M)
-    low, high = lowest.copy(), highest.copy()
-    for path in odometry:
-        if path is not None:
-            low = np.minimum(low, [path.north_m.min(), path.east_m.min()])
-            high = np.maximum(high, [path.north_m.max(), path.east_m.max()])
-    low, high = np.maximum(low, lowest - detour), np.minimum(high, highest + detour)
-    margin = 0.04 * max(float((high - low).max()), SMALLEST_VIEW_M)
-    return low - margin, high + margin
+def _extent(run: Run, *paths: OdometryPath | None) -> tuple[Floats, Floats]:
+    """Return the least and the greatest (north, east) to show [m]."""
+    lowest, highest = _corners(run.table)
+    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
+    lows, highs = zip(*(_corners(path) for path in (run.table, *paths) if path is not None), strict=True)
+    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
 
 
-def _fit_to_box(lowest: Floats, highest: Floats) -> tuple[Floats, Floats, float]:
-    """Widen a view [m] to the shape of the axes, and return it with the height of the axes [in]: metres stay square."""
-    width_in = WIDTH_IN - MARGINS_IN["left"] - MARGINS_IN["right"]
-    north, east = highest - lowest
-    box_in = float(np.clip(width_in * north / east, LOWEST_BOX_IN, HIGHEST_BOX_IN))
-    metres_per_inch = max(north / box_in, east / width_in)
-    middle, half = (lowest + highest) / 2, metres_per_inch * np.array([box_in, width_in]) / 2
-    return middle - half, middle + half, box_in
-
-
-def _short_ticks(axis: Axis, lowest_m: float) -> str:
-    """Take whole kilometres off the ticks where coordinates are far from zero (UTM); return what the label adds."""
-    if abs(lowest_m) < FAR_M:
-        return ""
-    formatter = ScalarFormatter()
-    offset = float(np.floor(lowest_m / 1000) * 1000)
-    formatter.set_useOffset(offset)
-    axis.set_major_formatter(formatter)
-    axis.get_offset_text().set_visible(False)
-    return f"  {'+' if offset > 0 else '−'} {abs(offset):,.0f} m"
+def _corners(path: States | OdometryPath) -> tuple[Floats, Floats]:
+    """Return the least and the greatest (north, east) of a path [m]."""
+    place = np.array([path.north_m, path.east_m])
+    return place.min(axis=1), place.max(axis=1)
 
 
 def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
-    low = path.north_m.min() < lowest[0] or path.east_m.min() < lowest[1]
-    high = path.north_m.max() > highest[0] or path.east_m.max() > highest[1]
-    return " (out of view)" if low or high else ""
+    low, high = _corners(path)
+    return " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    fixes, kind = run.sensors.fixes, run.sensors.fixes.fix_class
-    word, used = position_word(run.summary), run.gnss.used
-    several = len(np.unique(kind)) > 1
-    for value, look in FIX_LOOKS.items():
-        label = f"{word}, {CLASSES[value]}" if several else word
-        _draw_places(axes, fixes, used & (kind == value), (lowest, highest, cell_m), {**look, "label": label})
-    rejected = {**REJECTED_LOOK, "label": f"{word}, rejected"}
-    _draw_places(axes, fixes, run.gnss.rejected, (lowest, highest, cell_m), rejected)
-
-
-def _draw_places(
-    axes: Axes, fixes: Fixes, chosen: Bools, view: tuple[Floats, Floats, float], look: dict[str, Any]
-) -> None:
-    if not chosen.any():
-        return
-    lowest, highest, cell_m = view
-    north, east = fixes.north_m[chosen], fixes.east_m[chosen]
-    seen = (north >= lowest[0]) & (north <= highest[0]) & (east >= lowest[1]) & (east <= highest[1])
-    shown = np.flatnonzero(seen)[places(north[seen], east[seen], cell_m)]
-    axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, **look)
+    """Draw the fixes in view: those used, by class, and those rejected."""
+    fixes, word, gnss = run.sensors.fixes, position_word(run.summary), run.gnss
+    several = len(np.unique(fixes.fix_class)) > 1
+    groups = [
+        (gnss.used & (fixes.fix_class == value), look, f"{word}, {CLASSES[value]}" if several else word)
+        for value, look in FIX_LOOKS.items()
+    ]
+    place = np.column_stack([fixes.north_m, fixes.east_m])
+    seen = ((place >= lowest) & (place <= highest)).all(axis=1)
+    for chosen, look, label in (*groups, (gnss.rejected, REJECTED_LOOK, f"{word}, rejected")):
+        if chosen.any():
+            north, east = place[chosen & seen].T
+            shown = places(north, east, cell_m)
+            axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
 
 
 def _draw_events(axes: Axes, run: Run) -> None:
     """Mark where the slip events were: the filter's path through each, and a ring at its begin."""
-    table, label = run.table, "slip event"
+    table = run.table
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():
             east, north = table.east_m[rows], table.north_m[rows]
-            axes.plot(east, north, color=SLIP_COLOR, linewidth=3.0, zorder=4.5)
-            axes.plot(east[:1], north[:1], label=label, **SLIP_LOOK)
-            label = "_"
+            axes.plot(east, north, color=FLOAT_COLOR, linewidth=3.0, zorder=4.5)
+            axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
@@ -221,10 +174,5 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
             axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
             axes.annotate(
                 text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0,
-                color="0.25", zorder=4.9, bbox=TIME_BOX, annotation_clip=True,
+                color="0.25", zorder=4.9, bbox=LABEL_BOX, annotation_clip=True,
             )  # fmt: skip
-
-
-def _draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, label: str, order: float) -> None:
-    shown = places(north_m, east_m, cell_m)
-    axes.plot(east_m[shown], north_m[shown], label=label, zorder=order, **pen.keywords())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, inches, new_figure
+from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, new_figure, shortened, styled
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 if TYPE_CHECKING:
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 LONGEST_NAME = 14
 
 
-def draw_transfer(document: Mapping[str, Any]) -> Figure:
+@styled
+def transfer(document: Mapping[str, Any]) -> Figure:
     """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals.
 
     Parameters
@@ -26,9 +27,11 @@ def draw_transfer(document: Mapping[str, Any]) -> Figure:
     """
     names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
     subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
-    figure = new_figure(" · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows))
+    figure = new_figure(
+        " · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows),
+        margins_in=(1.3, 0.2, 1.0, 0.65), wspace=0.75,
+    )  # fmt: skip
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
-    figure.subplots_adjust(wspace=0.75, **inches(figure, left=1.3, right=0.2, top=1.0, bottom=0.65))
     _draw_matrix(matrix, document, names)
     labels = []
     for y, one in enumerate(rows):
@@ -66,5 +69,4 @@ def _known(value: float | None) -> bool:
 
 
 def _short(name: str) -> str:
-    text = drawable(name)
-    return text if len(text) <= LONGEST_NAME else f"{text[: LONGEST_NAME - 1]}…"
+    return shortened(drawable(name), LONGEST_NAME)

@@ -11,7 +11,6 @@ from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import metres_text, reach_text
-from icrtool.output.text_format import signed
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run import ICR_WORDS
 
@@ -54,17 +53,14 @@ class Answer(NamedTuple):
     Attributes
     ----------
     grade, verdict : may the numbers be used, in one word and in one sentence
-    no_reach, no_numbers : reason why there is no distance, or no number; empty where there is one
-    icrs : name and final value of each
+    no_numbers : reason why there is no number, or no multiplier; empty where there is one
     export : configuration of a diff_drive_controller; empty without a calibration
     """
 
     grade: Grade
     verdict: str
     reaches: tuple[Reach, ...]
-    no_reach: str
     numbers: tuple[Number, ...]
-    icrs: tuple[tuple[str, str], ...]
     no_numbers: str
     export: str
     model: str
@@ -91,15 +87,12 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
         grade, verdict = "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
     else:
         grade, verdict = "good", "Yes."
-    reaches = _reaches(report)
     numbers, no_numbers = _numbers(summary, calibration)
     return Answer(
         grade=grade,
         verdict=verdict,
-        reaches=reaches,
-        no_reach="" if reaches else "no trial is as long as the shortest horizon",
+        reaches=_reaches(report),
         numbers=numbers,
-        icrs=_icrs(summary["icr"]),
         no_numbers=no_numbers,
         export=_export(calibration),
         model=calibration.fitted.model.label if calibration is not None else "",
@@ -108,64 +101,48 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
 
 
 def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
-    def number(value: float | None) -> float:
-        return math.nan if value is None else value
-
-    def interval_text(one: BudgetDistance) -> str:
-        if one.beyond and not one.interval_text:
-            return f"no trial is longer than {one.distance_m:g} m"
-        return one.interval_text or "too few trials for an interval"
-
-    known = [
-        BudgetDistance(**{**one, "between_m": tuple(one["between_m"]), "low_m": number(one["low_m"]),
-                          "high_m": number(one["high_m"])})
-        for one in report["budgets"]
-    ]  # fmt: skip
+    rows: list[dict[str, Any]] = [
+        {key: math.nan if value is None else value for key, value in one.items()} for one in report["budgets"]
+    ]
+    known = [BudgetDistance(**one) for one in rows]
     found = []
     for budget_m in dict.fromkeys(one.budget_m for one in known):
         mine = [one for one in known if one.budget_m == budget_m]
         best = next((one for one in mine if one.model == "recommended"), mine[0])
         others = tuple((IN_SAMPLE.get(one.model, one.label), reach_text(one)) for one in mine if one is not best)
-        found.append(Reach(budget_m, best.label, reach_text(best), interval_text(best), others))
+        interval = best.interval_text or "too few trials for an interval"
+        if best.beyond and not best.interval_text:
+            interval = f"no trial is longer than {best.distance_m:g} m"
+        found.append(Reach(budget_m, best.label, reach_text(best), interval, others))
     return tuple(found)
 
 
 def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tuple[tuple[Number, ...], str]:
-    icr, numbers = summary["icr"], []
+    icr, numbers = summary["icr"], list[Number]()
     width = summary["config"]["robot"]["track_width_m"]
     if calibration is not None:
-        one = calibration.controller_numbers()
-        numbers += [
-            Number("wheel_separation_multiplier", _with_std(one.multiplier, one.multiplier_std),
-                   f"the robot turns as if its tracks were {one.multiplier:.2f} times as far apart as {width:g} m"),
-            Number("left_wheel_radius_multiplier", _with_std(one.left_radius, one.left_radius_std),
-                   "left wheels roll this share of the configured radius"),
-            Number("right_wheel_radius_multiplier", _with_std(one.right_radius, one.right_radius_std),
-                   "right wheels roll this share of the configured radius"),
-        ]  # fmt: skip
+        one, share = calibration.controller_numbers(), "wheels roll this share of the configured radius"
+        meaning = f"the robot turns as if its tracks were {one.multiplier:.2f} times as far apart as {width:g} m"
+        numbers = [
+            Number("wheel_separation_multiplier", _with_std(one.multiplier, one.multiplier_std), meaning),
+            Number("left_wheel_radius_multiplier", _with_std(one.left_radius, one.left_radius_std), f"left {share}"),
+            Number(
+                "right_wheel_radius_multiplier", _with_std(one.right_radius, one.right_radius_std), f"right {share}"
+            ),
+        ]
     elif icr["separation_multiplier"] is not None:
-        value, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
-        text = _with_std(value, std) if std is not None else f"{value:.3f}"
-        numbers.append(
-            Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")
-        )
+        text = _with_std(icr["separation_multiplier"], icr["separation_multiplier_std"])
+        numbers = [Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")]
+    why_none = "" if numbers else "The drive shows none of them."
     if width is None:
-        return tuple(
-            numbers
-        ), "robot.track_width_m is not known: without it there is no multiplier and no no-slip model."
-    return tuple(numbers), "" if numbers else "The drive shows none of them."
+        why_none = "robot.track_width_m is not known: without it there is no multiplier and no no-slip model."
+    return tuple(numbers), why_none
 
 
-def _with_std(value: float, std: float) -> str:
+def _with_std(value: float, std: float | None) -> str:
+    if std is None:
+        return f"{value:.3f}"
     return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f} ± less than 0.001"
-
-
-def _icrs(icr: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    final, std = icr["final"], icr["final_std"]
-    return tuple(
-        (name, f"{signed(final[column])} ± {std[column]:.3f}" if final[column] is not None else "not shown")
-        for column, name in ICR_WORDS.items()
-    )
 
 
 def _export(calibration: Calibration | None) -> str:
@@ -233,22 +210,21 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
     if not rows:
         return [Check("bad", "No trial was long enough to measure an error.")]
     row = min(rows, key=lambda one: abs(one["horizon_m"] - CHOICE_HORIZON_M))
+    horizon_m = row["horizon_m"]
     found = [
-        Check(
-            "fact", f"{row['trials']:,} trials of {row['horizon_m']:g} m were driven from {report['starts']:,} states."
-        )
+        Check("fact", f"{row['trials']:,} trials of {horizon_m:g} m were driven from {report['starts']:,} states.")
     ]
-    h = [one["horizon_m"] for one in report["reference_error"]]
-    if row["horizon_m"] in h:
-        own = report["reference_error"][h.index(row["horizon_m"])]["p95_m"]
-        mine = next((one for one in report["models"] if one["name"] == "icr"), None)
-        p95 = (
-            None if mine is None else next(r["p95_m"] for r in mine["by_horizon"] if r["horizon_m"] == row["horizon_m"])
+    own, p95 = (
+        next((one["p95_m"] for one in table if one["horizon_m"] == horizon_m), None)
+        for table in (
+            report["reference_error"],
+            *(one["by_horizon"] for one in report["models"] if one["name"] == "icr"),
         )
-        if own is not None and p95 is not None:
-            share = f"Up to {metres_text(own)}" if own < p95 else "All"
-            what = f"the {metres_text(p95)} error of the ICRs after {row['horizon_m']:g} m (95 %)"
-            found.append(Check("fact", f"{share} of {what} can be the position reference's own."))
+    )
+    if own is not None and p95 is not None:
+        share = f"Up to {metres_text(own)}" if own < p95 else "All"
+        what = f"the {metres_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
+        found.append(Check("fact", f"{share} of {what} can be the position reference's own."))
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from icrtool.output.json_file import schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
@@ -12,13 +12,7 @@ from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 SCRIPTS = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js", "columns.js", "charts.js", "comparison.js")
-
-CELL_KEYS = {**ERROR_KEYS, "expected": "expected_m", "expected_low": "expected_low_m",
-             "expected_high": "expected_high_m"}  # fmt: skip
 
 COMPARISON_FAMILY = "icrtool/compare/"
 
@@ -30,20 +24,16 @@ def comparison_page(document: Mapping[str, Any], title: str) -> str:
     ----------
     document : what `icrtool compare` writes as JSON
     """
+    from icrtool.output.figures.transfer import transfer
+
     names, cells = list(document["groups"]), document["transfer"]
     at_choice = {(one["calibrated_on"], one["tested_on"]): one for one in cells if one["horizon_m"] == CHOICE_HORIZON_M}
-    drawn = drawn_pictures({"transfer": lambda: _figure(document)})["transfer"]
+    drawn = drawn_pictures([("transfer", transfer(document))])["transfer"]
     return render(
         "comparison.html", SCRIPTS, {"by_group": [_errors(cells, names, name) for name in names]}, title=title,
         groups=document["groups"], pairs=document["pairs"], names=names, cells=at_choice, horizon_m=CHOICE_HORIZON_M,
         drawn=drawn,
     )  # fmt: skip
-
-
-def _figure(document: Mapping[str, Any]) -> Figure:
-    from icrtool.output.figures.transfer import draw_transfer
-
-    return draw_transfer(document)
 
 
 def _errors(cells: Sequence[Mapping[str, Any]], names: Sequence[str], tested_on: str) -> dict[str, Any]:
@@ -55,7 +45,7 @@ def _errors(cells: Sequence[Mapping[str, Any]], names: Sequence[str], tested_on:
         "horizons_m": horizons,
         "models": [
             {"name": f"of {name}", "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}"}
-            | {key: [rows.get((name, h), {}).get(column) for h in horizons] for key, column in CELL_KEYS.items()}
+            | {key: [rows.get((name, h), {}).get(f"{key}_m") for h in horizons] for key in ERROR_KEYS}
             for name in names
         ],
         "reference": {"p95": [], "expected": []},

@@ -7,20 +7,23 @@ open-loop path that the page integrates ends where the library's does.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.pooled import calibrated_path, gyro_recording_of
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.model_comparison import FAMILY, turned_path
+from icrtool.calibration.pooled import calibrated, gyro_recording_of, heading_recording_of, in_recording
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
-from icrtool.kernels.arrays import Bools, Ints
-from icrtool.motion.recording import Recording
-from icrtool.output.figures.decimate import extremes, places
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.motion.models import MODELS, FittedModel, MotionModel
+from icrtool.motion.trials import predicted_path
+from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import ICR_COLUMNS, Run, drive_of, half_width_m
 
 MOST_STEPS = 150_000
 """Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""
@@ -181,53 +184,96 @@ def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> 
     return {"icr": path(found.icr), "no_slip": path(found.no_slip)}
 
 
+class Path(NamedTuple):
+    """The path of a model through the whole drive.
+
+    Attributes
+    ----------
+    heading, place : (n,) [rad], forward + j right [m], of the robot; with `icrs` of the mean of its tracks
+    icrs : y right, y left, x [m]; None: those of the start; empty where the path is the robot's
+    """
+
+    name: str
+    label: str
+    heading: Floats
+    place: Complexes
+    icrs: Sequence[float] | None = ()
+
+
 def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str, Any]]:
     """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
     labels = {one["name"]: one["label"] for one in report["models"]}
-    b, table = run.track_width_m, run.table
-    last = [float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)]
-    icrs: dict[str, Sequence[float] | None] = {"icr": None, "no_slip": None if b is None else [b / 2, -b / 2, 0.0],
-                                               "icr_final": last}  # fmt: skip
+    b = run.track_width_m
+    icrs = {"icr": None, "no_slip": None if b is None else [b / 2, -b / 2, 0.0], "icr_final": _last_icrs(run)}
     models: list[dict[str, Any]] = [
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
-    calibrated = list(_calibrated(report, labels))
-    recording = gyro_recording_of(run) if calibrated else None
-    every = max(-(-len(calibrated) * len(steps.rows) // MOST_STEPS), 1)
-    for name, label, calibration, with_gyro in calibrated:
-        if recording is not None and (path := _path(recording, calibration, steps, every, with_gyro)) is not None:
-            models.insert(0 if name == "recommended" else len(models), {"name": name, "label": label, "path": path})
+    paths = list(_calibrated(run, report, labels))
+    paths += _compared(run, report["ladder"], {*labels, *(one.name for one in paths)})
+    every = max(-(-len(paths) * len(steps.rows) // MOST_STEPS), 1)
+    rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
+    for one in paths:
+        columns = {"forward": one.place.real, "right": one.place.imag, "turn": one.heading}
+        path: dict[str, Any] = {"every": every, "first_turn": float(one.heading[0])}
+        path |= {name: packed_sums(column[rows]) for name, column in columns.items()}
+        found = {"name": one.name, "label": one.label, "path": path}
+        models.insert(
+            0 if one.name == "recommended" else len(models), found | ({} if one.icrs == () else {"icrs": one.icrs})
+        )
     return models
 
 
-def _calibrated(report: Mapping[str, Any], labels: Mapping[str, str]) -> Iterator[tuple[str, str, Calibration, bool]]:
-    """Yield name, label and calibration of each model of constant parameters, and whether it uses the gyro."""
+def _last_icrs(run: Run) -> list[float]:
+    return [float(getattr(run.table, column)[-1]) for column in ICR_COLUMNS]
+
+
+def _calibrated(run: Run, report: Mapping[str, Any], labels: Mapping[str, str]) -> Iterator[Path]:
+    """Yield the path of each calibration of the report, its own first; with the gyro too where there is one."""
+    wanted = [(one["name"], one["label"], one["calibration"], one["with_gyro"]) for one in report["calibrations"]]
     if (own := report["recommended"]) is not None and (label := labels.get("recommended")):
-        calibration = calibration_of({**own, "created": ""})
-        yield "recommended", label, calibration, False
-        if calibration.gyro is not None:
-            yield "recommended_gyro", f"{label} + gyro", calibration, True
-    for one in report["calibrations"]:
-        if one.get("calibration"):
-            yield one["name"], one["label"], calibration_of(one["calibration"]), one["with_gyro"]
+        gyro = [("recommended_gyro", f"{label} + gyro", own, True)] if own["gyro"] is not None else []
+        wanted = [("recommended", label, own, False), *gyro, *wanted]
+    recording = gyro_recording_of(run) if wanted else None
+    for name, label, document, with_gyro in wanted:
+        if recording is not None and document and not (with_gyro and recording.gyro_radps is None):
+            # Too short a drive to find the delay of its wheels has no path.
+            with suppress(DataError):
+                model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
+                yield Path(name, label, *predicted_path(recording, *model)(recording.t_s))
 
 
-def _path(
-    recording: Recording, calibration: Calibration, steps: Steps, every: int, with_gyro: bool
-) -> dict[str, Any] | None:
-    """Return the path of a calibration through the whole drive: one of `every` steps, and the last one."""
-    if with_gyro and recording.gyro_radps is None:
-        return None
-    try:
-        heading, place = calibrated_path(calibration, recording, with_gyro=with_gyro)(recording.t_s)
-    except DataError:
-        # Too short a drive to find the delay of its wheels.
-        return None
-    rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
-    columns = {"forward": place.real, "right": place.imag, "turn": heading}
-    return {"every": every, "first_turn": float(heading[0])} | {
-        name: packed_sums(column[rows]) for name, column in columns.items()
-    }
+def _compared(run: Run, ladder: Mapping[str, Any], known: set[str]) -> Iterator[Path]:
+    """Yield the path of each model of the comparison that is not `known`, as fitted to the whole drive."""
+    if "left_out" in ladder:
+        return
+    kind = ladder["heading"] or ""
+    recording = heading_recording_of(run, kind, width_m=2.0 * half_width_m(run.track_width_m))
+    for row in ladder["models"]:
+        name, turned = row["name"], row["heading"] != "wheels"
+        base = name.removesuffix(f"_{kind}") if turned else name
+        # What is chosen by block is, of the whole drive, the recommended model.
+        if {name, name.replace("extended", "recommended")} & known or (turned and recording.gyro_radps is None):
+            continue
+        with suppress(DataError):
+            if base in FAMILY:
+                model = in_recording(_fitted(ladder, base, turned=turned), recording)
+                yield Path(name, row["label"], *predicted_path(recording, *model)(recording.t_s))
+            else:
+                icrs = None if base == "icr" else _last_icrs(run)
+                yield Path(name, row["label"], *turned_path(run, recording), icrs)
+
+
+def _fitted(ladder: Mapping[str, Any], row: str, *, turned: bool) -> FittedModel:
+    """Return the model of a row as it was fitted to the whole drive; with wheels and a measured turn rate."""
+    family = ladder["best"] if row == "extended" else FAMILY[row]
+    names = {of: name for name, of in FAMILY.items()}
+
+    def fit(model: MotionModel, suffix: str) -> FittedModel:
+        value = ladder["fits"][f"{names.get(family, family)}{suffix}"]["value"]
+        return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((0, 0)))
+
+    wheels = fit(MODELS[family], "")
+    return replace(fit(wheels.model.with_gyro(), f"_{ladder['heading']}"), wheels=wheels) if turned else wheels
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

@@ -36,16 +36,14 @@ class Line(NamedTuple):
 
     Attributes
     ----------
+    log : what fleet.json holds of it
     link : relative address of its page; empty where there is none
+    search : what words are looked for in
     """
 
-    log: str
+    log: Mapping[str, Any]
     link: str
-    status: str
-    group: str
-    robot: str
     search: str
-    reason: str
     cells: tuple[Cell, ...]
 
 
@@ -59,12 +57,12 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
     """
     logs = list(document["logs"])
     budgets = _budgets(logs)
-    lines = [_line(log, budgets, folder) for log in logs]
+    lines = [Line(log, _link(log["run"], folder), _search_text(log), tuple(_cells(log, budgets))) for log in logs]
     return render(
         "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
         counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
-        statuses=sorted({one.status for one in lines}), groups=sorted({one.group for one in lines} - {""}),
-        robots=sorted({one.robot for one in lines} - {""}), horizon_m=HORIZON_M,
+        choices={key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")},
+        horizon_m=HORIZON_M,
         pictures=list(pictures_in(folder / PLOTS).values()),
     )  # fmt: skip
 
@@ -96,12 +94,9 @@ def _columns(budgets: Sequence[str]) -> list[str]:
     return [*within, *errors, *found, "events", "warnings", "gates failed"]
 
 
-def _line(log: Mapping[str, Any], budgets: Sequence[str], folder: Path) -> Line:
-    words = (log["log"], log["status"], log["robot"], log["group"], log["reason"], *log["tags"])
-    return Line(
-        log=log["log"], link=_link(log["run"], folder), status=log["status"], group=log["group"], robot=log["robot"],
-        search=" ".join(map(str, words)).casefold(), reason=log["reason"], cells=tuple(_cells(log, budgets)),
-    )  # fmt: skip
+def _search_text(log: Mapping[str, Any]) -> str:
+    words = (*(log[key] for key in ("log", "status", "robot", "group", "reason")), *log["tags"])
+    return " ".join(map(str, words)).casefold()
 
 
 def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
@@ -124,10 +119,8 @@ def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the 
 
 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
-    if value is None:
-        return Cell("", None)
-    text = f"{value:{sign}.3f}".replace("-", "−")
-    return Cell(text + (f" ± {std:.3f}" if std is not None else ""), value)
+    spread = f" ± {std:.3f}" if std is not None else ""
+    return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
 
 
 def _link(run: str, folder: Path) -> str:

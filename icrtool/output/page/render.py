@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -27,6 +28,11 @@ STYLES = ("vendor/uPlot.min.css", "page.css")
 
 BEGIN = "document.documentElement.classList.replace('no-js', 'js');"
 """Carried out before anything is shown: what only a script can draw is hidden without one."""
+
+UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|mm|km|s|min|h|Hz|m/s|%|°|±)(?![\w]))|(?<=±) (?=[\d.])")
+"""The space between a value and its unit, and those about ±."""
+RANGE = re.compile(r"(?<=\d)-(?=\d+(\.\d+)?\xa0)")
+"""The hyphen of a range of values."""
 
 IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
 """Escapes in JSON, so that no text in it can end the element it stands in."""
@@ -73,11 +79,12 @@ def _environment() -> Environment:
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
     environment.filters |= {
-        "metres": _metres,
-        "metric": text_format.length_text,
-        "distance": text_format.distance_text,
-        "duration": text_format.duration_text,
+        "metres": lambda value: "–" if value is None else _with_units(metres_text(value)),
+        "metric": lambda value: _with_units(text_format.length_text(value)),
+        "distance": lambda value: _with_units(text_format.distance_text(value)),
+        "duration": lambda value: _with_units(text_format.duration_text(value)),
         "signed": text_format.signed,
+        "units": _with_units,
         "breakable": _breakable,
         "minus": _minus,
         "turn": _turn,
@@ -90,8 +97,11 @@ def script_json(data: Mapping[str, Any]) -> str:
     return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
 
 
-def _metres(value: float | None) -> str:
-    return "–" if value is None else metres_text(value)
+def _with_units(text: str) -> Markup:
+    """Return a text whose values stay on one line with their units and standard deviations."""
+    from markupsafe import Markup, escape
+
+    return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", str(escape(escaped(text))))))  # noqa: S704 - escaped
 
 
 def _breakable(name: str) -> Markup:

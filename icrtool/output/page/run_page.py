@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,16 @@ from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
+from icrtool.output.json_file import schema_of
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
-from icrtool.output.page.pictures import WITH_PLACE, Picture, drawn_pictures, pictures_in
+from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
 from icrtool.output.text_format import duration_text, length_text, position_word
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run import ICR_WORDS, Run
 from icrtool.records.samples import ROLE_WORDS
 
 SCRIPTS = (
@@ -83,7 +83,7 @@ def run_page(
     return render(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
         title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
-        pictures=pictures, twins=TWINS, columns=ICR_COLUMNS, position_word=position_word(summary),
+        pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
         warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]], streams=_streams(summary),
         begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
@@ -100,16 +100,11 @@ def read_report(directory: Path) -> dict[str, Any] | None:
         It is not a report of this version.
     """
     file = directory / DROPOUT_DIRECTORY / REPORT_FILE
-    try:
-        document = json.loads(file.read_bytes())
-        schema = document["schema"]
-    except FileNotFoundError:
+    if not file.exists():
         return None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as err:
-        raise RunError(file, "cannot be read", "make it again with icrtool dropout-report") from err
-    if schema != DROPOUT_SCHEMA:
-        raise RunError(file, f"its schema is {schema}, this icrtool reads {DROPOUT_SCHEMA}", "make it again")
-    return dict(document)
+    if schema_of(file) != DROPOUT_SCHEMA:
+        raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
+    return dict(json.loads(file.read_bytes()))
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
@@ -121,15 +116,15 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
 
 def draw_pictures(run: Run) -> dict[str, Picture]:
     """Draw the pictures of a run anew, into memory."""
-    from icrtool.output.figures.run_figures import FIGURES
+    from icrtool.output.figure_catalogue import figures_of
 
-    return drawn_pictures({name: partial(draw, run) for name, draw in FIGURES.items()})
+    return drawn_pictures(figures_of("run", run))
 
 
 def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Picture]:
     """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
     metric = run.summary["gnss"]["datum"] is None
-    return {name: one for name, one in pictures.items() if not (metric and name.partition("_")[0] in WITH_PLACE)}
+    return {name: one for name, one in pictures.items() if not (metric and one.with_place)}
 
 
 def _utc(stamp_ns: int) -> str:
@@ -167,7 +162,8 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         sizes = [
             jump["size_m"] for jump in summary["gnss"]["jump_list"] if one["stamp_ns"] <= jump["stamp_ns"] <= end_ns
         ]
-        lost = [out for out in report["outages"] if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
+        real = [out for out in report["outages"] if out["kind"] == "real"]
+        lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
         slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
         notes = [f"the position jumps by {length_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import ModelComparison
+from icrtool.calibration.model_comparison import FAMILY, ModelComparison
 from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
 from icrtool.output.text_format import FITTED
@@ -79,23 +79,27 @@ def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
             }
             for score in comparison.scores
         ],
-        "fits": {FITS.get(name, name): _fit(fit, comparison.width_m) for name, fit in comparison.fits.items()},
+        "fits": {_fit_name(name, comparison): _fit(fit, comparison.width_m) for name, fit in comparison.fits.items()},
     }
 
 
-FITS = {"icr": "window"}
-"""Names of fits that differ from those in the family: ``icr`` is the filter's row."""
+def _fit_name(name: str, comparison: ModelComparison) -> str:
+    """Return the name of a fit: that of its row; ``icr`` is the filter's row."""
+    base = name.removesuffix("_gyro")
+    row = next((row for row, of in FAMILY.items() if of == base), base)
+    return row if base == name else f"{row}_{comparison.heading}"
 
 
 def _fit(fit: FittedModel, width_m: float) -> dict[str, Any]:
-    """Return parameters and track ICRs of a fit, with one standard deviation."""
-    geometry, covariance = fit.geometry(width_m, TypicalDrive())
+    """Return parameters of a fit, and the track ICRs of one by wheels alone, with one standard deviation."""
     terms = fit.model.terms
-    return {
-        "value": dict(zip(terms, fit.parameters.tolist(), strict=True)) | geometry._asdict(),
-        "std": dict(zip(terms, fit.std.tolist(), strict=True))
-        | dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-    }
+    value = dict(zip(terms, fit.parameters.tolist(), strict=True))
+    std = dict(zip(terms, fit.std.tolist(), strict=True))
+    if not fit.model.uses_gyro:
+        geometry, covariance = fit.geometry(width_m, TypicalDrive())
+        value |= geometry._asdict()
+        std |= dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    return {"value": value, "std": std}
 
 
 def _heading(score: ModelScore, comparison: ModelComparison) -> str:

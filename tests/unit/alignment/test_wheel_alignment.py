@@ -30,10 +30,10 @@ def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
 
 def test_good_wheels_are_left_as_they_are() -> None:
     log = make_log(seconds=120.0)
-    check = align_streams(log, CONFIG).wheels
-    assert check.warnings == ()
-    assert check.log is log
-    assert check.scale == pytest.approx(1.0, abs=0.01)
+    found = align_streams(log, CONFIG)
+    assert found.wheels.warnings == ()
+    assert found.log.wheels is log.wheels
+    assert found.wheels.scale == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,7 @@ def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backward
 def test_preset_paper_corrects_nothing() -> None:
     log = make_log(seconds=120.0)
     spoilt = with_wheels(log, log.wheels.v_right_mps, log.wheels.v_left_mps)
-    check = align_streams(spoilt, load_config(sets=["filter.preset=paper"])).wheels
-    assert check.log is spoilt
+    assert align_streams(spoilt, load_config(sets=["filter.preset=paper"])).log is spoilt
 
 
 def test_a_configured_scale_is_not_touched() -> None:

@@ -15,7 +15,7 @@ import icrtool
 from icrtool.config import DropoutConfig
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.starts import first_learned
-from icrtool.dropout_analysis.trials import Model, configured_horizons_m, dropout, models_of
+from icrtool.dropout_analysis.trials import Model, dropout, models_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.kernels.trials import FrozenIcrs
@@ -175,7 +175,7 @@ def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
 
 
 def test_horizons_default_to_the_configured_ones(run: Run) -> None:
-    assert configured_horizons_m(run) == tuple(float(d) for d in range(1, 21))
+    assert run.config.dropout.horizons_m == tuple(float(d) for d in range(1, 21))
     config = replace(run.config, dropout=DropoutConfig(horizons_m=(4.0, 2.0)))
     assert dropout(replace(run, config=config)).horizons_m.tolist() == [2.0, 4.0]
 

@@ -11,7 +11,7 @@ import pytest
 
 from icrtool.config import parse_config
 from icrtool.estimation.fit import fit
-from icrtool.output.figures.icrs import draw_icr_estimates
+from icrtool.output.figures.icrs import icr_estimates
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import RobotLog
@@ -68,7 +68,7 @@ def test_segments_have_their_own_icrs_and_stand_in_every_result() -> None:
         assert [segment["mean"][column] for column in ICR_COLUMNS] == pytest.approx(truth, abs=0.02)
         assert all(0 <= segment["std"][column] < 0.02 for column in ICR_COLUMNS)
     assert f"{summary['segments'][1]['mean']['x_icr_m']:+.3f} ± " in format_run(run)
-    panels = draw_icr_estimates(run).axes
+    panels = icr_estimates(run).axes
     for t in run.changes_s:
         assert any(t in np.asarray(line.get_xdata()) for axes in panels for line in axes.lines)
 

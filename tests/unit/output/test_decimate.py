@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from icrtool.output.figures.decimate import extremes, places
+from icrtool.output.decimate import extremes, places
 
 
 @given(st.integers(1, 5000), st.integers(4, 600), st.integers(0, 99))

@@ -16,7 +16,7 @@ HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "lin
 def test_a_hostile_name_is_drawn_as_text(tmp_path: Path, name: str) -> None:
     with warnings.catch_warnings(), style():
         warnings.simplefilter("error")
-        save(new_figure(name, name, width_in=3.0, height_in=1.0), tmp_path / "title", ("png", "svg", "pdf"))
+        save(new_figure(name, name, width_in=3.0, height_in=2.0), tmp_path / "title", ("png", "svg", "pdf"))
     assert drawable(name).isprintable()
 
 

@@ -17,9 +17,9 @@ from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.output.figures import dropout_figures as pictures
-from icrtool.output.figures.dropout_errors import draw_histogram, draw_summary
-from icrtool.output.figures.dropout_paths import draw_examples, draw_outages, draw_worst
+from icrtool.output.figure_catalogue import draw_figures
+from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
+from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.style import style
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run
@@ -38,12 +38,13 @@ def outages(run: Run) -> tuple[Outage, ...]:
 
 
 def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dict[str, Callable[[], Figure]]:
+    whole = replace(report, outages=outages, examples=example_trials(run, 5.0), worst=worst_trials(run, 2.0))
     return {
-        "summary": lambda: draw_summary("barn", replace(report, outages=outages)),
-        "histogram": lambda: draw_histogram("barn", report, 5.0),
-        "examples": lambda: draw_examples("barn", example_trials(run, 5.0)),
-        "worst": lambda: draw_worst("barn", worst_trials(run, 2.0), run.table.north_m, run.table.east_m),
-        "outages": lambda: draw_outages("barn", run.table.north_m, run.table.east_m, outages),
+        "summary": lambda: dropout_summary(whole),
+        "histogram": lambda: dropout_histogram(whole, 5.0),
+        "examples": lambda: dropout_examples(whole),
+        "worst": lambda: dropout_worst(whole),
+        "outages": lambda: dropout_outages(whole),
     }
 
 
@@ -89,7 +90,7 @@ def test_axes_have_units_and_no_text_lies_on_another(
 
 
 def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
-    figure = drawn(lambda: draw_summary("barn", replace(report, outages=outages)))
+    figure = drawn(lambda: dropout_summary(replace(report, outages=outages)))
     lines = [line.get_ydata() for line in figure.axes[0].lines]
     for name in ("icr", "no_slip", "icr_final"):
         result = report.result(name)
@@ -104,11 +105,11 @@ def test_a_flattened_icr_curve_gets_a_panel_of_its_own(report: DropoutReport) ->
     icr, no_slip = report.results[0], report.results[1]
     near = replace(report, results=(icr, no_slip._replace(summary=icr.summary)))
     far = replace(report, results=(icr, no_slip._replace(summary=icr.summary._replace(p95=10 * icr.summary.p95))))
-    assert [len(drawn(lambda one=one: draw_summary("barn", one)).axes) for one in (near, far)] == [1, 2]
+    assert [len(drawn(lambda one=one: dropout_summary(one)).axes) for one in (near, far)] == [1, 2]
 
 
 def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(report: DropoutReport) -> None:
-    figure = drawn(lambda: draw_histogram("barn", report, 5.0))
+    figure = drawn(lambda: dropout_histogram(report, 5.0))
     for axes, name in zip(figure.axes, ("icr", "no_slip"), strict=True):
         result = report.result(name)
         assert result is not None
@@ -120,18 +121,14 @@ def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(repo
 
 def test_a_histogram_needs_no_other_models_than_it_says(run: Run) -> None:
     models = [model for model in models_of(run) if model.name in ("icr", "no_slip")]
-    assert len(drawn(lambda: draw_histogram("barn", dropout(run, [5.0], models=models), 5.0)).axes) == 2
+    assert len(drawn(lambda: dropout_histogram(dropout(run, [5.0], models=models), 5.0)).axes) == 2
 
 
 def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Run]) -> None:
     run = make_run(track_width_m=None, troubles=False)
-    report = dropout(run, HORIZONS_M)
-    for draw in (
-        lambda: draw_summary("barn", report),
-        lambda: draw_histogram("barn", report, 5.0),
-        lambda: draw_examples("barn", example_trials(run, 5.0)),
-        lambda: draw_worst("barn", worst_trials(run, 5.0), run.table.north_m, run.table.east_m),
-    ):
+    without = figures(run, dropout(run, HORIZONS_M), ())
+    for name in ("summary", "histogram", "examples", "worst"):
+        draw = without[name]
         assert "no slip" not in " ".join(texts_of(drawn(draw)))
 
 
@@ -139,7 +136,7 @@ def test_a_report_draws_what_it_holds(
     run: Run, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
     whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
-    pictures.draw_figures(whole, tmp_path, ("png", "svg"))
+    draw_figures("report", whole, tmp_path, ("png", "svg"))
     names = {path.stem for path in tmp_path.iterdir()}
     assert names == {"summary", "histogram_05m", "histogram_10m", "examples_15m", "worst", "outages"}
     assert len(list(tmp_path.iterdir())) == 2 * len(names)
@@ -148,4 +145,4 @@ def test_a_report_draws_what_it_holds(
 def test_a_picture_that_cannot_be_written_is_named(report: DropoutReport, tmp_path: Path) -> None:
     (tmp_path / "histogram_05m.png").mkdir()
     with pytest.raises(OSError, match="histogram_05m"):
-        pictures.draw_figures(report, tmp_path, ("png",))
+        draw_figures("report", report, tmp_path, ("png",))

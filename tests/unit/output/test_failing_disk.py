@@ -26,8 +26,8 @@ from icrtool.output import disk
 from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.calibration_file import write_calibration
 from icrtool.output.exports.foxglove import write_foxglove
-from icrtool.output.figures.calibration_picture import save_picture
 from icrtool.output.figures.style import new_figure
+from icrtool.output.picture_file import save_picture
 from icrtool.output.study_directory import write_study
 from icrtool.output.truth_file import log_and_truth
 from icrtool.records.run import Run
@@ -89,7 +89,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
         "study": lambda place, text: write_study(replace(study, columns={text: [1.0]}), place),
         "calibration": lambda place, text: write_calibration(table | {"why": text}, place),
         "picture": lambda place, text: save_picture(
-            lambda: new_figure(text, "", width_in=3.0, height_in=2.0), place.with_suffix(".png")
+            new_figure(text, "", width_in=3.0, height_in=2.0), place.with_suffix(".png")
         ),
         "text": write_file,
         "foxglove": foxglove,

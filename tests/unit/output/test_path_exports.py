@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -131,6 +132,35 @@ def test_the_lines_of_the_kml_lie_on_the_paths(slipping: Run) -> None:
     times, places = track.findall(f"{{{KML}}}when"), track.findall(f"{{{GX}}}coord")
     assert len(times) == len(places) == len(track.findall(f"{{{GX}}}angles"))
     assert times[0].text == "2025-10-09T08:53:20.000Z"
+
+
+KML_SEQUENCES = {
+    "kml": ["Document"], "Document": ["name", "description", "Style", "Folder"], "Style": ["LineStyle"],
+    "LineStyle": ["color", "width"], "Folder": ["name", "Placemark"],
+    "Placemark": ["name", "description", "TimeSpan", "styleUrl", "Point", "LineString", "Track"],
+    "TimeSpan": ["begin", "end"], "LineString": ["tessellate", "coordinates"], "Point": ["coordinates"],
+    "Track": ["altitudeMode", "when", "coord", "angles"],
+}  # fmt: skip
+"""Children in the order of the sequences of OGC 07-147r2 (KML 2.2) and of Google's extension, those that we write."""
+
+KML_VALUES = {
+    "color": r"[0-9a-f]{8}", "width": r"\d+", "tessellate": "1", "altitudeMode": "clampToGround",
+    "begin": r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", "angles": r"\d+\.\d 0 0",
+    "coordinates": r"(-?\d+\.\d{9},-?\d+\.\d{9},0 ?)+", "coord": r"-?\d+\.\d{9} -?\d+\.\d{9} 0",
+}  # fmt: skip
+
+
+def test_the_kml_has_the_structure_of_its_schema(slipping: Run) -> None:
+    root = ET.fromstring(format_kml(slipping))
+    extended = {f"{{{GX}}}{name}" for name in ("Track", "coord", "angles")}
+    for element in root.iter():
+        namespace, _, name = element.tag[1:].partition("}")
+        assert namespace == (GX if element.tag in extended else KML)
+        order = [KML_SEQUENCES[name].index(child.tag.partition("}")[2]) for child in element]
+        assert order == sorted(order), name
+        assert re.fullmatch(KML_VALUES.get(name, ".*"), (element.text or "").strip(), re.DOTALL), (name, element.text)
+    styles = {f"#{style.get('id')}" for style in root.iter(f"{{{KML}}}Style")}
+    assert {url.text for url in root.iter(f"{{{KML}}}styleUrl")} <= styles
 
 
 def test_a_hostile_name_stays_text_in_the_kml(run: Run) -> None:
@@ -277,6 +307,11 @@ def test_every_path_of_the_layout_is_a_field_of_a_topic(slipping: Run, mcap_file
     assert set(panels["map!place"]["topicColors"]) <= set(messages)
     shown = json.dumps(layout["layout"])
     assert all(f'"{panel}"' in shown for panel in panels)
+    assert {panel.partition("!")[0] for panel in panels} == {"3D", "Plot", "StateTransitions", "map"}
+    for panel in panels.values():
+        for curve in panel.get("paths", []):
+            assert curve["enabled"] is True
+            assert curve["timestampMethod"] == "receiveTime"
 
 
 def test_a_metric_run_has_an_mcap_without_fixes(metric: Run, tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from icrtool.errors import OutputError
+from icrtool.output import figure_catalogue as catalogue
 from icrtool.output import run_directory
-from icrtool.output.figures import run_figures as figures
 from icrtool.output.json_file import json_bytes
 from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
@@ -31,11 +31,11 @@ def names_in(directory: Path) -> list[str]:
 
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) -> None:
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
-    plots = [f"plots/{name}.{form}" for name in figures.FIGURES for form in ("png", "svg")]
+    figures = ("trajectory", "icr_estimates", "icr_clusters", "gnss_difference")
+    plots = [f"plots/{name}.{form}" for name in figures for form in ("png", "svg")]
     assert names_in(tmp_path / "runs" / "barn") == sorted(
         ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.csv", *plots]
     )
-    assert {"trajectory", "icr_estimates", "icr_clusters", "gnss_difference"} == set(figures.FIGURES)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["barn"]
 
@@ -124,15 +124,15 @@ def test_a_run_of_a_later_version_may_be_replaced(tmp_path: Path, run: Run) -> N
     assert open_run(tmp_path).name == "barn"
 
 
-@pytest.mark.parametrize("where", ["write_states", "_write_figures"])
+@pytest.mark.parametrize(("module", "where"), [(run_directory, "write_states"), (catalogue, "draw_figures")])
 def test_a_full_disk_is_said_and_leaves_the_old_run(
-    written: Path, run: Run, monkeypatch: pytest.MonkeyPatch, where: str
+    written: Path, run: Run, monkeypatch: pytest.MonkeyPatch, module: Any, where: str
 ) -> None:
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     before = (written / "B2SUMS").read_bytes()
-    monkeypatch.setattr(run_directory, where, full)
+    monkeypatch.setattr(module, where, full)
     with pytest.raises(OutputError, match="barn: cannot be written; No space left on device"):
         write_run(run, written)
     assert (written / "B2SUMS").read_bytes() == before
@@ -143,7 +143,7 @@ def test_an_interrupted_drawing_leaves_nothing(tmp_path: Path, run: Run, monkeyp
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(figures, "draw_figures", interrupted)
+    monkeypatch.setattr(catalogue, "draw_figures", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_run(run, tmp_path / "barn")
     assert list(tmp_path.iterdir()) == []

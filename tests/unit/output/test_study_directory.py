@@ -76,7 +76,7 @@ def test_a_study_that_cannot_be_drawn_leaves_nothing_behind(tmp_path: Path, monk
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(figure_study, "draw_study", fail)
+    monkeypatch.setattr(figure_study, "study_figure", fail)
     with pytest.raises(OutputError, match="No space left"):
         write_study(small("rate"), tmp_path / "deep" / "study")
     assert list(tmp_path.iterdir()) == []

@@ -53,6 +53,20 @@ const icrtoolCharts = (() => {
     return svg;
   }
 
+  /** Return a label with a sample of a line and its name; with a box that shows or hides it where `change` is given. */
+  function toggle(one, shown, change) {
+    const label = document.createElement("label");
+    if (change) {
+      const box = document.createElement("input");
+      box.type = "checkbox";
+      box.checked = shown;
+      box.addEventListener("change", () => change(box.checked));
+      label.append(box, " ");
+    }
+    label.append(sample(one), one.label);
+    return label;
+  }
+
   function line(one) {
     return { label: one.label, stroke: color(one.color), width: one.width || 1.3, dash: DASHES[one.dash || "solid"],
       points: { show: false } };
@@ -264,15 +278,17 @@ const icrtoolCharts = (() => {
   const LOOKS = {
     recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
     no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
-    recommended_gyro: { color: "recommended", dash: "dashed", width: 2 },
+    multiplier: { color: "other", dash: "dashdot", width: 2 }, window: { color: "other", dash: "dashed", width: 2 },
+    extended: { color: "recommended", width: 2.6 },
   };
   const OTHERS = [["other", "solid"], ["icr", "dotted"], ["no-slip", "solid"], ["final", "dashdot"], ["other", "dashed"],
     ["icr", "dashdot"], ["no-slip", "dotted"], ["recommended", "dotted"]].map(([color, dash]) => ({ color, dash, width: 2 }));
   const met = new Map();
 
-  /** Return how a model is drawn: the same in every chart; models without a look of their own take turns. */
+  /** Return how a model is drawn: the same in every chart, thin with a measured turn rate; others take turns. */
   function lookOf(name) {
-    if (LOOKS[name]) return LOOKS[name];
+    const wheels = name.replace(/_(gyro|heading)$/, "");
+    if (LOOKS[wheels]) return wheels === name ? LOOKS[name] : { ...LOOKS[wheels], width: 1.2 };
     if (!met.has(name)) met.set(name, met.size);
     return OTHERS[met.get(name) % OTHERS.length];
   }
@@ -323,16 +339,8 @@ const icrtoolCharts = (() => {
       ...(reference.p95.length ? [{ color: "reference", dash: "dotted", label: "position reference alone" }] : []),
       ...data.budgets_m.map((budget) => ({ color: "budget", dash: "dashed", label: `budget ${budget} m` }))];
     list.replaceChildren(...entries.map((one) => {
-      const item = document.createElement("li"), label = document.createElement("label");
-      if (one.name) {
-        const box = document.createElement("input");
-        box.type = "checkbox";
-        box.checked = !hidden.has(one.name);
-        box.addEventListener("change", () => { hidden[box.checked ? "delete" : "add"](one.name); draw(); });
-        label.append(box, " ");
-      }
-      label.append(sample(one), one.label);
-      item.append(label);
+      const item = document.createElement("li");
+      item.append(toggle(one, true, one.name && ((shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); })));
       return item;
     }));
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
@@ -347,5 +355,5 @@ const icrtoolCharts = (() => {
     };
   }
 
-  return { timeCharts, errorChart, color, clock, lookOf, sample };
+  return { timeCharts, errorChart, color, clock, lookOf, toggle };
 })();

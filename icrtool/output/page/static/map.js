@@ -7,7 +7,7 @@ const icrtoolMap = (() => {
 
   /** Make the map; onMoment(row) is called where a pointer is near the drive, onPick(row) where it was clicked. */
   function make(data, { onMoment, onPick }) {
-    const { color, clock, lookOf, sample } = icrtoolCharts, d3 = window.d3;
+    const { color, lookOf, toggle } = icrtoolCharts, d3 = window.d3;
     const element = document.getElementById("map"), s = data.series, steps = data.steps;
     const origin = data.origin || [0, 0];
     const north = steps.north.map((value) => value + steps.first_north), east = steps.east.map((value) => value + steps.first_east);
@@ -153,8 +153,9 @@ const icrtoolMap = (() => {
         const { start, end } = loop;
         lines.push({ d: line(north, east, x, y, start, end), color: color("filter"), width: 3.5, dash: null, end: [east[end], north[end]] });
         for (const model of loop.models) {
+          if (hidden.has(`loop ${model.name}`)) continue;
           const look = lookOf(model.name), norths = model.path.north.map((v) => v + north[start]), easts = model.path.east.map((v) => v + east[start]);
-          lines.push({ d: line(norths, easts, x, y), color: color(look.color), width: 2.6, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[look.dash] || null,
+          lines.push({ d: line(norths, easts, x, y), color: color(look.color), width: 1.3 * look.width, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[look.dash] || null,
             end: [easts[easts.length - 1], norths[norths.length - 1]] });
         }
       }
@@ -206,6 +207,11 @@ const icrtoolMap = (() => {
       if (row !== null) onPick(row);
     });
 
+    function hide(name, away) {
+      hidden[away ? "add" : "delete"](name);
+      draw();
+    }
+
     function keys() {
       const entries = [
         { name: "filter", label: "filter", color: "filter" }, { name: "fixes", label: "fixes used", color: "fix", marker: "dot" },
@@ -216,12 +222,8 @@ const icrtoolMap = (() => {
         ...(data.outages.length ? [{ name: "outages", label: "outages", color: "final", width: 5 }] : []),
       ];
       document.getElementById("layers").replaceChildren(...entries.map((one) => {
-        const item = document.createElement("li"), label = document.createElement("label"), box = document.createElement("input");
-        box.type = "checkbox";
-        box.checked = !hidden.has(one.name);
-        box.addEventListener("change", () => { hidden[box.checked ? "delete" : "add"](one.name); draw(); });
-        label.append(box, " ", sample(one), one.label);
-        item.append(label);
+        const item = document.createElement("li");
+        item.append(toggle(one, true, (shown) => hide(one.name, !shown)));
         return item;
       }));
     }
@@ -243,6 +245,8 @@ const icrtoolMap = (() => {
       show(from, to) { span = [from, to]; soon(); },
       zoomBy(factor) { svg.call(zoom.scaleBy, factor); },
       zoomAll() { svg.call(zoom.transform, d3.zoomIdentity); },
+      hideModel(name, away) { hide(`loop ${name}`, away); },
+      hidesModel(name) { return hidden.has(`loop ${name}`); },
       drawLoop(result) {
         loop = result;
         const norths = [], easts = [];

@@ -22,18 +22,27 @@ const icrtoolOpenLoop = (() => {
     return { north, east };
   }
 
-  /** Return the path of a model with constant parameters: its path through the whole drive, turned into place. */
-  function alongPath(path, start, end, last, heading) {
+  /**
+   * Return the path of a model with constant parameters: its path through the whole drive, turned into place.
+   * Of a model that moves by ICRs along a measured turn the path is that of the mean of its tracks.
+   */
+  function alongPath(path, icrs, start, end, last, heading) {
     // The path has one of `every` steps, and the last one.
     const at = (values, i) => {
       const k = Math.min(Math.floor(i / path.every), values.length - 2), from = k * path.every;
       return values[k] + ((i - from) / (Math.min(from + path.every, last) - from)) * (values[k + 1] - values[k]);
     };
     const turned = heading - at(path.turn, start) - path.first_turn, c = Math.cos(turned), s = Math.sin(turned);
-    const forward0 = at(path.forward, start), right0 = at(path.right, start);
+    const middle = icrs ? (icrs[0] + icrs[1]) / 2 : 0, x = icrs ? icrs[2] : 0;
+    const placeAt = (i) => {
+      const psi = at(path.turn, i) + path.first_turn;
+      return [at(path.forward, i) - x * Math.cos(psi) + middle * Math.sin(psi),
+        at(path.right, i) - x * Math.sin(psi) - middle * Math.cos(psi)];
+    };
+    const [forward0, right0] = placeAt(start);
     const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
     for (let i = start; i <= end; i++) {
-      const forward = at(path.forward, i) - forward0, right = at(path.right, i) - right0;
+      const [ahead, aside] = placeAt(i), forward = ahead - forward0, right = aside - right0;
       north[i - start] = forward * c - right * s;
       east[i - start] = forward * s + right * c;
     }
@@ -56,8 +65,8 @@ const icrtoolOpenLoop = (() => {
     if (longest === null || longest > last) why = last === gap ? "a gap in the wheel data" : "the end of the log";
     const hasReference = (step) => !steps.without_reference.some(([from, to]) => from <= step && step <= to);
     const models = data.models.map((model) => {
-      const icrs = model.icrs || [series.y_right[row], series.y_left[row], series.x[row]];
-      const path = model.path ? alongPath(model.path, start, end, final, heading) : byIcrs(steps, icrs, start, end, heading);
+      const icrs = model.icrs === null ? [series.y_right[row], series.y_left[row], series.x[row]] : model.icrs;
+      const path = model.path ? alongPath(model.path, icrs, start, end, final, heading) : byIcrs(steps, icrs, start, end, heading);
       const errors = ends.map((step) => {
         if (step === null || step > end || !hasReference(step)) return null;
         const k = step - start;

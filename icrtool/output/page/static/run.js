@@ -31,7 +31,7 @@ const icrtoolPage = (() => {
       `wheels left ${series.v_left[row].toFixed(2)}, right ${series.v_right[row].toFixed(2)} m/s`,
       `ICR y right ${signed(series.y_right[row])} ± ${series.std_y_right[row].toFixed(3)}, y left ${signed(series.y_left[row])} ± ${series.std_y_left[row].toFixed(3)}, x ${signed(series.x[row])} ± ${series.std_x[row].toFixed(3)} m`];
     if (off !== null) parts.push(`filter to fix ${off < 1 ? `${(100 * off).toFixed(1)} cm` : `${off.toFixed(2)} m`}`);
-    readout.textContent = parts.join(" · ");
+    readout.textContent = parts.join(" · ").replace(/(\d) (?=m|cm|s\)|±)|± /g, (found) => found.replace(" ", "\u00a0"));
     charts.mark(t);
     map.mark(row);
   }
@@ -50,14 +50,15 @@ const icrtoolPage = (() => {
     result = icrtoolOpenLoop.drive(data, row, LENGTHS_M);
     map.drawLoop(result);
     const box = document.getElementById("loop"), table = document.createElement("table");
-    text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter`, table);
+    text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter after so many metres`, table);
     const head = text("tr", "", table.createTHead());
     text("th", "model", head, { scope: "col" });
-    for (const metres of LENGTHS_M) text("th", `after ${metres} m`, head, { scope: "col" });
+    for (const metres of LENGTHS_M) text("th", `${metres}\u00a0m`, head, { scope: "col" });
     const body = table.createTBody();
     for (const model of result.models) {
       const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
-      name.append(icrtoolCharts.sample({ ...icrtoolCharts.lookOf(model.name) }), ` ${model.label}`);
+      const look = { ...icrtoolCharts.lookOf(model.name), label: model.label };
+      name.append(icrtoolCharts.toggle(look, !map.hidesModel(model.name), (shown) => map.hideModel(model.name, !shown)));
       for (const error of model.errors) text("td", error === null ? "–" : error < 1 ? `${error.toFixed(3)} m` : `${error.toFixed(2)} m`, line);
     }
     box.replaceChildren(table);

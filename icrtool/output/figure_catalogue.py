@@ -1,0 +1,170 @@
+"""Every figure of a directory or a page, once: name, title, caption, the function that draws it, and when it does.
+
+matplotlib is imported when the first figure is drawn: a page of finished pictures needs their captions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from icrtool.dropout_analysis.report import DropoutReport
+
+Subject = Literal["run", "report", "fleet", "comparison"]
+Parts = Mapping[str, tuple[float, ...]]
+
+HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
+
+
+def _always(_: object) -> Parts:
+    return {"": ()}
+
+
+def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
+    """Return the parts of a figure that is drawn once, where there is such content."""
+    return lambda subject: {"": ()} if content(subject) else {}
+
+
+def _histograms(report: DropoutReport) -> Parts:
+    trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
+    return {f"_{metres:02.0f}m": (metres,) for metres in HISTOGRAM_HORIZONS_M if trials.get(metres)}
+
+
+class Entry(NamedTuple):
+    """A figure of the catalogue.
+
+    Attributes
+    ----------
+    of : what it is drawn of
+    title, caption : one line each: what it shows, what to see; ``{}`` is the distance in the name of the file
+    place : module and name of its function in ``icrtool.output.figures``
+    parts : what follows the name in the names of its files, with further arguments of the function; empty: no figure
+    with_place : its axes may be coordinates of a map grid
+    """
+
+    of: Subject
+    title: str
+    caption: str
+    place: str
+    parts: Callable[[Any], Parts] = _always
+    with_place: bool = False
+
+    @property
+    def draw(self) -> Callable[..., Figure]:
+        """The function that draws it."""
+        module, _, name = self.place.partition(".")
+        function: Callable[..., Figure] = getattr(import_module(f"icrtool.output.figures.{module}"), name)
+        return function
+
+
+FIGURES = {
+    "trajectory": Entry(
+        "run", "The drive from above",
+        "Filter and position reference should coincide. Odometry leaves them by what wheel speeds alone lose.",
+        "trajectory.trajectory", with_place=True,
+    ),
+    "icr_estimates": Entry(
+        "run", "ICR estimates over time", "Good: the lines settle soon and stay within their bands.",
+        "icrs.icr_estimates",
+    ),
+    "icr_clusters": Entry(
+        "run", "Where the ICRs lay",
+        "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
+        "icrs.icr_clusters",
+    ),
+    "gnss_difference": Entry(
+        "run", "Filter and position reference",
+        "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
+        "gnss_difference.gnss_difference",
+    ),
+    "examples": Entry(
+        "report", "Two trials of {} m",
+        "One of half a turn, and the straightest. The closer a coloured end is to the black one, the better its model.",
+        "dropout_paths.dropout_examples",
+        lambda report: {f"_{one.horizon_m:02.0f}m": () for one in report.examples[:1]},
+        with_place=True,
+    ),
+    "worst": Entry(
+        "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
+        "dropout_paths.dropout_worst", _where(lambda report: report.worst), with_place=True,
+    ),
+    "outages": Entry(
+        "report", "Outages",
+        "The path without GNSS, forced or real, and where the estimate was when fixes returned.",
+        "dropout_paths.dropout_outages", _where(lambda report: report.outages), with_place=True,
+    ),
+    "histogram": Entry(
+        "report", "Errors after {} m",
+        "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
+        "dropout_errors.dropout_histogram", _histograms,
+    ),
+    "summary": Entry(
+        "report", "Error over distance",
+        "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
+        "dropout_errors.dropout_summary", _where(lambda report: report.counts.trials.any()),
+    ),
+    "ladder": Entry(
+        "report", "Model comparison",
+        "Each model on distance it was not fitted to. Take the simplest of those that are about as good as the best.",
+        "model_comparison.model_comparison", _where(lambda report: report.comparison),
+    ),
+    "icrs": Entry(
+        "fleet", "Final ICRs of every log",
+        "One robot on one ground should lie on one level; a step is other ground or wear.",
+        "fleet.fleet_icrs", _where(lambda fleet: fleet.points),
+    ),
+    "errors": Entry(
+        "fleet", "Errors by robot and group", "Each point is a log: how much the logs of a group differ.",
+        "fleet.fleet_errors", _where(lambda fleet: fleet.errors_m),
+    ),
+    "failures": Entry(
+        "fleet", "Why logs failed", "The commonest reason first.",
+        "fleet.fleet_failures", _where(lambda fleet: fleet.reasons),
+    ),
+    "transfer": Entry(
+        "comparison", "The cost of a foreign calibration",
+        "Left: the darker, the larger the error. Right: an interval (95 %) that crosses zero may be chance.",
+        "transfer.transfer",
+    ),
+}  # fmt: skip
+"""By the first words of the file's name."""
+
+
+def figures_of(of: Subject, subject: object) -> Iterator[tuple[str, Figure]]:
+    """Draw each figure for which a subject has numbers; yield it with the name of its file."""
+    for name, entry in FIGURES.items():
+        if entry.of == of:
+            for part, more in entry.parts(subject).items():
+                yield f"{name}{part}", entry.draw(subject, *more)
+
+
+def draw_figures(of: Subject, subject: object, directory: Path, formats: tuple[str, ...]) -> None:
+    """Write every figure of a run or a report into a directory.
+
+    Parameters
+    ----------
+    directory : made where it is not there
+    formats : of ``png``, ``svg`` and ``pdf``
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
+    directory.mkdir(exist_ok=True)
+    from icrtool.output.figures.style import save
+
+    for name, figure in figures_of(of, subject):
+        save(figure, directory / name, formats)
+
+
+def entry_of(file: str) -> tuple[Entry, str] | None:
+    """Return the entry of a picture by the name of its file, and the distance in that name; None for any other file."""
+    word, _, rest = file.rpartition("_") if file not in FIGURES else (file, "", "")
+    entry = FIGURES.get(word)
+    return None if entry is None else (entry, rest.removesuffix("m").lstrip("0"))
