@@ -49,10 +49,15 @@ def _run() -> int:
             register()
         try:
             status = icrtool.main(standalone_mode=False)
-        except IcrToolError as err:
+        except (IcrToolError, OSError) as err:
+            if isinstance(err, OSError) and err.filename is None:
+                raise
             from icrtool.cli.stages import signal_word
+            from icrtool.records.text import LogText
 
-            sys.stderr.write(f"{signal_word('Error:', 'red')} {err}\n")
+            # A path that is too long, or on a disk that fails, where no command knows more about it.
+            line = f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err)
+            sys.stderr.write(f"{signal_word('Error:', 'red')} {line}\n")
             return 1
         except click.ClickException as err:
             err.show()

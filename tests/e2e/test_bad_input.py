@@ -276,6 +276,7 @@ FIXES, SAMPLES = len(drive().gnss_stamp_ns), len(drive().wheel_stamp_ns)
 
 REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "no such file": (lambda folder: [str(folder / "drive.mcap")], "no such file or directory"),
+    "a name no file may have": (lambda folder: [str(folder / ("n" * 5000))], "File name too long"),
     "a text file": (lambda folder: in_folder(folder, "notes.mcap", b"hello\n" * 99), "not a log; a log is"),
     "a picture": (lambda folder: in_folder(folder, "x.bag", b"\x89PNG\r\n\x1a\n" + bytes(999)), "not a log; a log is"),
     "an empty file": (lambda folder: in_folder(folder, "x.mcap", b""), "an empty file"),

@@ -55,7 +55,7 @@ def test_a_dropout_report_writes_the_page_unless_it_is_not_wanted(icrtool: Comma
     # The page that is made from the files is the same; it draws the pictures that are missing.
     assert icrtool("report", run_directory, "-o", "again.html", "-q") == (0, "", "")
     again = Path("again.html").read_bytes()
-    assert b"within 0.123 m" in again
+    assert "within 0.123 m" in spaced(again.decode())
     assert again.count(b"data:image/png") == written.count(b"data:image/png") + 4
 
 
