@@ -18,11 +18,12 @@ from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_pred
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.open_loop import STARTS_A_CALL
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
 from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
-from icrtool.motion.trials import STARTS_A_CALL, Trials
+from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
 from icrtool.records.run import Run, half_width_m
 
@@ -189,6 +190,7 @@ def _turned_scores(
     run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
 ) -> Iterator[ModelScore]:  # fmt: skip
     """Yield the models that turn by wheels and a measured heading; a multiplier alone gives no path."""
+    path = turned_path(run, recording)
     for name in MODELS:
         if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
             continue
@@ -196,36 +198,38 @@ def _turned_scores(
             of = FAMILY[name]
             summary = table.score(of if of == "recommended" else f"{of}_gyro").together
         else:
-            summary = summarise(_errors_along(run, recording, trials, _icrs_of(run, name)))
+            summary = summarise(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
         yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    held = recording.held_s
+    held, last = recording.held_s, len(recording.t_s) - 1
     psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
-    mean = (run.table.v_left_mps + run.table.v_right_mps) / 2.0
-    middle = np.exp(0.5j * (psi + np.append(psi[1:], psi[-1])))
-    return psi, np.concatenate([[0.0], np.cumsum(held * mean * middle)[:-1]])
+    moved = held * (run.table.v_left_mps + run.table.v_right_mps) / 2.0
+    place = np.zeros(last + 1, np.complex128)
+    for lo in range(0, last, STARTS_A_CALL):
+        hi = min(lo + STARTS_A_CALL, last)
+        place[lo + 1 : hi + 1] = moved[lo:hi] * np.exp(0.5j * (psi[lo:hi] + psi[lo + 1 : hi + 1]))
+    return psi, np.cumsum(place, out=place)
 
 
-def _errors_along(run: Run, recording: Recording, trials: Trials, icrs: FrozenIcrs) -> Floats:
-    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the measured turn rate.
+def _errors_along(path: tuple[Floats, Complexes], drive: Drive, trials: Trials, icrs: FrozenIcrs) -> Floats:
+    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the path of `turned_path`.
 
     Notes
     -----
     With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
     ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
-    drive = recording.drive
-    psi, place = turned_path(run, recording)
-    lever, turn = -1j * np.exp(1j * psi), np.exp(1j * (drive.heading - psi))
-    arm = (icrs.y_icr_right + icrs.y_icr_left) / 2.0 - 1j * icrs.x_icr
-    reference = drive.north + 1j * drive.east
+    psi, place = path
     errors: Floats = np.full(trials.ends.shape, np.nan)
     for h in range(trials.ends.shape[1]):
         some = trials.ends[:, h] >= 0
         s, e = trials.starts[some], trials.ends[some, h]
-        moved = place[e] - place[s] + (arm if len(arm) == 1 else arm[s]) * (lever[e] - lever[s])
-        errors[some, h] = np.abs(turn[s] * moved - (reference[e] - reference[s]))
+        right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
+        arm = (right + left) / 2.0 - 1j * x
+        moved = place[e] - place[s] - 1j * arm * (np.exp(1j * psi[e]) - np.exp(1j * psi[s]))
+        driven = drive.north[e] - drive.north[s] + 1j * (drive.east[e] - drive.east[s])
+        errors[some, h] = np.abs(np.exp(1j * (drive.heading[s] - psi[s])) * moved - driven)
     return errors

@@ -252,8 +252,9 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"{failed_gates} gates failed"] if failed_gates else []
-    files = "fleet.csv, failures.csv, calibrations/, plots/, runs/"
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {files}"
+    files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
+    written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
+    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {written}"
 
 
 def shown(text: str, keep: str = "") -> str:

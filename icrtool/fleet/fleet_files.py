@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
-from icrtool.fleet.roll_up import PooledCalibration
-from icrtool.fleet.row import SHOWN_ERROR, Row, columns_of
+from icrtool.fleet.roll_up import MOST_POOLED, PooledCalibration
+from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
 from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
@@ -84,7 +84,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
         name = ", ".join(part for part in (one.robot, one.group) if part) or "all logs"
         head = f"{name}: {len(one.logs)} {'log' if len(one.logs) == 1 else 'logs'}"
         if one.left_out:
-            head += f", {len(one.left_out)} not usable or copies"
+            head += f", {len(one.left_out)} not used (not usable, copies, or more than {MOST_POOLED})"
         if one.reason:
             parts.append(f"{head}: no calibration: {one.reason}")
             continue
@@ -130,16 +130,16 @@ def reason_of(row: Row) -> str:
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:
     import pyarrow as pa
+    import pyarrow.json as pj
     import pyarrow.parquet as pq
 
     texts = {"log", "status", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
     counts = {"events", "outages", "warnings", "gates_failed"}
-    arrays = {}
-    for name in columns:
-        kind = pa.string() if name in texts else pa.int64() if name in counts else pa.float64()
-        values = [row.get(name) for row in rows]
-        if name in texts:
-            # Names of files need not be text.
-            values = [str(value).encode("utf-8", errors="backslashreplace").decode() for value in values]
-        arrays[name] = pa.array(values, kind)
-    pq.write_table(pa.table(arrays), file)
+    kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in columns}
+    # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.
+    cells = ({name: as_text(row[name]) if name in texts else row.get(name) for name in columns} for row in rows)
+    lines = b"\n".join(map(msgspec.json.encode, cells))
+    table = pj.read_json(
+        pa.BufferReader(lines), pj.ReadOptions(block_size=len(lines) + 1), pj.ParseOptions(pa.schema(kinds))
+    )
+    pq.write_table(table, file)

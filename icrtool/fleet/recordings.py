@@ -16,9 +16,8 @@ from icrtool.logs.containers.mcap_file import is_mcap
 from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, natural_order, storage_files
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.ros1_bag import is_ros1_bag
-from icrtool.logs.containers.split_files import NumberedFile, numbered_file, split_files, split_path
+from icrtool.logs.containers.split_files import NumberedFile, log_name, numbered_file, split_files, split_path
 from icrtool.logs.containers.sqlite_bag import is_sqlite
-from icrtool.logs.read_log import log_name
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
@@ -132,11 +131,11 @@ def _extent(path: Path) -> Extent | None:
     except LogError:
         return None
     try:
-        begin_ns, end_ns = container.begin_ns(), container.end_ns()
+        span = container.span_ns()
         topics = frozenset((channel.topic, channel.message_type) for channel in container.channels)
     finally:
         container.close()
-    return Extent(begin_ns, end_ns, topics) if begin_ns is not None and end_ns is not None else None
+    return Extent(*span, topics) if span is not None else None
 
 
 def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:

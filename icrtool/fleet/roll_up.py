@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import IcrToolError
@@ -22,6 +23,10 @@ from icrtool.records.run import Run
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
 
+MOST_POOLED = 12
+"""Logs of a robot and group that are calibrated together: evenly spaced over all by time. Time and memory grow faster
+than their number, and what is not known of the parameters shrinks with its root only."""
+
 
 @dataclass(frozen=True, slots=True)
 class PooledCalibration:
@@ -30,7 +35,7 @@ class PooledCalibration:
     Attributes
     ----------
     logs : that it is fitted to
-    left_out : logs that are not usable
+    left_out : logs that are not usable, copies, or more than `MOST_POOLED`
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
     recommended, multiplier, multiplier_std : of the calibration
     table : leave-one-log-out table as text
@@ -110,30 +115,32 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     from icrtool.output.tables.held_out import held_out_blocks
     from icrtool.output.text_blocks import Text
 
-    left_out, seen = [], set()
+    # A copy of a log would be tested on itself.
+    distinct = {tuple(sorted(file.sha256 for file in row.inputs)): row for row in reversed(members)}
+    ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
+    spaced = {
+        ordered[i].log for i in np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_POOLED)).round().astype(int)
+    }
+    used: list[str] = []
 
     def usable() -> Iterator[Run]:
         for row in members:
-            run = open_run(directory / row.run)
-            files = tuple(file["sha256"] for file in run.summary["inputs"])
-            # A copy of a log would be tested on itself.
-            if not run.usable or files in seen:
-                left_out.append(row.log)
-                continue
-            seen.add(files)
-            yield run
+            if row.log in spaced and (run := open_run(directory / row.run)).usable:
+                used.append(row.log)
+                yield run
 
     try:
         result = calibrate_runs(usable())
     except IcrToolError as err:
-        return replace(one, left_out=tuple(left_out), reason=str(err))
+        left_out = tuple(log for log in one.logs if log not in used)
+        return replace(one, left_out=left_out, reason=str(err))
     (directory / CALIBRATIONS).mkdir(exist_ok=True)
     file = f"{CALIBRATIONS}/{name}.json"
     write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.wheels)))
     return replace(
-        one, logs=tuple(log for log in one.logs if log not in left_out), left_out=tuple(left_out), file=file,
+        one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
     )  # fmt: skip

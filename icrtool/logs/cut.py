@@ -122,9 +122,8 @@ def _between(samples: Any, begin_ns: int, end_ns: int) -> Any:  # noqa: ANN401 -
 
 def _first_ns(container: Container) -> int:
     """Return the log time of the first message [ns]; without an index all messages are read for it."""
-    begin = container.begin_ns()
-    if begin is not None:
-        return begin
+    if (span := container.span_ns()) is not None:
+        return span[0]
     numbers = frozenset(channel.id for channel in container.channels)
     begins = (int(block.log_time_ns.min()) for block in container.blocks(numbers) if len(block.log_time_ns))
     return min(begins, default=0)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,9 +16,9 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut
+from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.split_files import split_files
+from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -104,11 +103,11 @@ def survey_log(
     container = open_log(path)
     ended = Event()
     try:
-        with ThreadPoolExecutor(2) as pool:
+        with ThreadPoolExecutor(1) as pool:
             try:
                 hashes = [pool.submit(_fingerprint, file, ended) for file in container.files]
                 cut = cut_of(container, begin, stop, path)
-                tables, unread = _collect(container, config, pool, progress, cut)
+                tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
                 inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
             except BaseException:
@@ -172,17 +171,6 @@ def read_log(
     if is_table(Path(path)):
         return read_table(Path(path), start, end)
     return assemble(survey_log(path, config, progress, start=start, end=end), config)
-
-
-def log_name(path: Path) -> str:
-    """Return a log's name: that of its (first) file without suffix, or of the directory; ``log`` where it is only dots.
-
-    Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
-    """
-    files = split_files(path)
-    named = Path(os.path.normpath((files[0] if files else path).absolute()))
-    name = named.name if named.is_dir() else named.stem
-    return name if name.strip(".") else "log"
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
@@ -275,7 +263,7 @@ def _place_in_words(antenna: tuple[float, float] | None) -> str:
 
 
 def _collect(
-    container: Container, config: Config, pool: ThreadPoolExecutor, progress: Progress | None, cut: Cut
+    container: Container, config: Config, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Return the columns of all channels that some role may need, read in one pass over the log."""
     unread: dict[str, str] = {}
@@ -285,7 +273,7 @@ def _collect(
     static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
     wanted |= static
     cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
-    for whole in _ahead(container.blocks(frozenset(wanted), cut), pool):
+    for whole in container.blocks(frozenset(wanted), cut):
         block = cut.of(whole)
         for number in np.unique(block.channel).tolist():
             if number not in wanted:
@@ -308,14 +296,6 @@ def _collect(
 
 def _empty_table(channel: Channel) -> TopicTable:
     return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0, "")
-
-
-def _ahead(blocks: Iterator[Block], pool: ThreadPoolExecutor) -> Iterator[Block]:
-    """Yield blocks; the next one is read and decompressed while the caller decodes this one."""
-    pending: Future[Block | None] = pool.submit(next, blocks, None)
-    while (block := pending.result()) is not None:
-        pending = pool.submit(next, blocks, None)
-        yield block
 
 
 def _fingerprint(file: Path, ended: Event) -> str:

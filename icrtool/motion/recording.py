@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.open_loop import trial_ends
+from icrtool.kernels.open_loop import ends_from
 from icrtool.kernels.trials import Drive
 
 WINDOWS_M = (5.0, 10.0)
@@ -186,7 +186,7 @@ def cut_windows(
     every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
     begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
-    ends = trial_ends(drive, np.array(lengths_m, np.float64))[begins]
+    ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
     row, column = np.nonzero(ends.T >= 0)[::-1]
     if len(row) < FEWEST_WINDOWS:
         why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop import trial_ends
+from icrtool.kernels.open_loop import ends_from
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     MOVING_MPS,
@@ -19,9 +19,6 @@ from icrtool.motion.recording import (
     joined_steps,
     samples_a_step,
 )
-
-STARTS_A_CALL = 1 << 16
-"""States of which the trials are cut, or driven, at a time."""
 
 
 class Trials(NamedTuple):
@@ -51,13 +48,7 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
         moving = np.append(np.diff(drive.distance) > MOVING_MPS * drive.dt_s[:-1], False)
         every = samples_a_step(recording)
         starts = np.flatnonzero(moving)[::every]
-    horizons, ends = np.array(horizons_m, np.float64), np.empty((len(starts), len(horizons_m)), np.int64)
-    # A table of the ends of all states would be the largest of the analysis.
-    for lo in range(0, len(drive.distance), STARTS_A_CALL):
-        some = slice(*np.searchsorted(starts, [lo, lo + STARTS_A_CALL]))
-        found = trial_ends(drive, horizons, lo, min(lo + STARTS_A_CALL, len(drive.distance)))
-        ends[some] = found[starts[some] - lo]
-    return Trials(starts, ends)
+    return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
 
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]

@@ -5,7 +5,7 @@ The wheel samples from the first recorded state on are columns of the states; on
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, cast
@@ -67,8 +67,10 @@ def write_measurements(run: Run, path: Path) -> None:
 
 def read_measurements(
     path: Path, table: States, document: RunDocument
-) -> tuple[SensorData, MeasurementOutcome, MeasurementOutcome]:
+) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
     """Read what `write_measurements` wrote: the sensors, and what became of fixes and headings.
+
+    The states come back with the columns of the wheels in the wheels' memory.
 
     Parameters
     ----------
@@ -115,7 +117,9 @@ def read_measurements(
         ]
     except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
-    return sensors, outcomes[0], outcomes[1]
+    first = len(stamps) - len(table)
+    states = replace(table, stamp_ns=stamps[first:], v_left_mps=left[first:], v_right_mps=right[first:])
+    return states, sensors, outcomes[0], outcomes[1]
 
 
 def _array(stored: ZipFile, member: ZipInfo) -> NDArray[Any]:

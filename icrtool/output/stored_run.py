@@ -75,7 +75,7 @@ def open_run(path: str | Path) -> Run:
         if table.fault:
             raise ValueError(table.fault)
         _check_sum(directory, MEASUREMENTS_FILE, sums)
-        sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, run_document)
+        table, sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, run_document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -83,3 +84,10 @@ def controller_text(numbers: Mapping[str, Any]) -> str:
         f"wheel_separation_multiplier {numbers['multiplier']:.2f} ± {numbers['multiplier_std']:.2f}, left/right wheel "
         f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"
     )
+
+
+def error_text(metres: float) -> str:
+    """Return an error [m] with three digits or to the millimetre."""
+    if not math.isfinite(metres):
+        return "-"
+    return f"{metres:.3f} m" if metres < 1 else f"{metres:.2f} m"

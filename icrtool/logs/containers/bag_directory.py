@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,17 +83,13 @@ class BagDirectory:
             self._scratch.cleanup()
             unfinished.end(Path(self._scratch.name))
 
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message of all files, None where one of them has no index."""
-        begins = [part.begin_ns() for part in self._parts]
-        known = [begin for begin in begins if begin is not None]
-        return min(known) if known and len(known) == len(begins) else None
-
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message of all files, None where one of them has no index."""
-        ends = [part.end_ns() for part in self._parts]
-        known = [end for end in ends if end is not None]
-        return max(known) if known and len(known) == len(ends) else None
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return first and last log time of all files, None where one of them has no index."""
+        known = [span for part in self._parts if (span := part.span_ns()) is not None]
+        if not known or len(known) < len(self._parts):
+            return None
+        begins, ends = zip(*known, strict=True)
+        return min(begins), max(ends)
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file.
@@ -234,54 +231,36 @@ def _metadata(text: str) -> _Metadata:
     )
 
 
-def _plain_yaml(text: str) -> object:  # noqa: PLR0912 - one branch for each kind of event
-    """Return a YAML text as dicts, lists and strings.
-
-    An alias lets a short text stand for gigabytes: it is refused. Merge keys are ordinary keys here.
+def _plain_yaml(text: str) -> object:
+    """Return a YAML text as dicts, lists and strings; merge keys are ordinary keys.
 
     Raises
     ------
     ValueError
-        The text is not YAML, has an alias, or has a key that is not a text.
+        The text is not YAML, is nested too deeply, has a key that is no text, or an alias: by aliases a short text
+        stands for gigabytes.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import (
-        AliasEvent,
-        CollectionEndEvent,
-        CollectionStartEvent,
-        MappingStartEvent,
-        ScalarEvent,
-    )
+    from ruamel.yaml.events import CollectionEndEvent, MappingStartEvent, NodeEvent, ScalarEvent, SequenceStartEvent
 
-    open_ones: list[tuple[dict[str, object] | list[object], list[str]]] = [([], [])]
+    def value(event: Any, depth: int) -> object:  # noqa: ANN401 - an event of the library
+        if isinstance(event, ScalarEvent):
+            return str(event.value)
+        if not isinstance(event, MappingStartEvent | SequenceStartEvent) or depth == _DEEPEST:
+            raise ValueError("has an alias, or is nested too deeply")
+        parts: list[Any] = []
+        while not isinstance(inner := next(events), CollectionEndEvent):
+            parts.append(value(inner, depth + 1))
+        if isinstance(event, SequenceStartEvent):
+            return parts
+        if not all(isinstance(key, str) for key in parts[::2]):
+            raise ValueError("a key is no text")
+        return dict(zip(parts[::2], parts[1::2], strict=True))
+
     try:
-        for event in YAML(typ="safe").parse(text):
-            if isinstance(event, AliasEvent):
-                raise ValueError("has an alias")  # noqa: TRY004 - of the text
-            if isinstance(event, CollectionEndEvent):
-                open_ones.pop()
-                continue
-            if isinstance(event, CollectionStartEvent):
-                value: object = {} if isinstance(event, MappingStartEvent) else []
-            elif isinstance(event, ScalarEvent):
-                value = event.value
-            else:
-                continue
-            parent, key = open_ones[-1]
-            if isinstance(parent, list):
-                parent.append(value)
-            elif key:
-                parent[key.pop()] = value
-            elif isinstance(value, str):
-                key.append(value)
-            else:
-                raise ValueError("a key is no text")
-            if isinstance(value, dict | list):
-                open_ones.append((value, []))
-                if len(open_ones) > _DEEPEST:
-                    raise ValueError("nested too deeply")
+        events = iter(YAML(typ="safe").parse(text))
+        first = next((event for event in events if isinstance(event, NodeEvent)), None)
+        return None if first is None else value(first, 0)
     except YAMLError as err:
         raise ValueError("no YAML") from err
-    documents = open_ones[0][0]
-    return documents[0] if isinstance(documents, list) and documents else None

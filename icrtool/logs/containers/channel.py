@@ -99,6 +99,16 @@ class Block(NamedTuple):
     end: Ints
 
 
+def joined(blocks: Sequence[Block]) -> Block:
+    """Return the messages of several blocks as one that has memory of its own."""
+    data, channel, times, start, end = zip(*blocks, strict=True)
+    shift = np.cumsum([0, *map(len, data[:-1])])
+    starts, ends = (np.concatenate([at + by for at, by in zip(column, shift, strict=True)]) for column in (start, end))
+    bytes_ = np.concatenate(data)
+    bytes_.flags.writeable = False
+    return Block(bytes_, np.concatenate(channel), np.concatenate(times), starts, ends)
+
+
 class Container(Protocol):
     """A log file or directory, opened."""
 
@@ -124,12 +134,8 @@ class Container(Protocol):
         """
         ...
 
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message, None where only reading the log shows it."""
-        ...
-
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message, None where only reading the log shows it."""
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return the log times of the first and the last message, None where only reading the log shows them."""
         ...
 
     def share_read(self) -> float:

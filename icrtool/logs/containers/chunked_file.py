@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from icrtool.logs.containers.channel import Problems
-from icrtool.logs.containers.decompress import Inflation
-from icrtool.logs.containers.record_table import RecordTable
+import numpy as np
+
+from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space
+
+MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
+BAG_MESSAGE, BAG_CONNECTION = 2, 7
+"""Operation codes of records."""
+
+MOST_ROWS = 1 << 18
+"""Records that a scan finds at a time."""
 
 
 class IndexedChunk(Protocol):
@@ -25,19 +35,51 @@ class IndexedChunk(Protocol):
         ...
 
 
-class ChunkedFile:
-    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
+class ChunkedFile(ABC):
+    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
+
+    Parameters
+    ----------
+    message : operation code of a record that is a message
+    """
 
     _chunks: Sequence[IndexedChunk] | None = None
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, message: int) -> None:
         self._path = path
         self.files = [path]
         self.problems = Problems(path.name)
-        self._table = RecordTable()
-        self._inflation = Inflation()
+        self._message = message
+        self._rows: Ints = np.empty((MOST_ROWS, 5), np.int64)
+        self._inflation, self._space = Inflation(), Space()
         self._stream = path.open("rb")
         self._size = path.stat().st_size
+
+    @abstractmethod
+    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+        """Yield the messages of the wanted channels by the index."""
+
+    @abstractmethod
+    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
+        """Yield the messages by reading the records one after the other, as far as they can be read.
+
+        Parameters
+        ----------
+        learn : remember what other records state about channels
+        """
+
+    @abstractmethod
+    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+        """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
+
+    @abstractmethod
+    def _learn(self, row: Ints, data: Bytes) -> None:
+        """Remember a record that is no message; `row` is that of the scan of `data`."""
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+        """Yield the messages of the wanted channels, chunk by chunk."""
+        if wanted:
+            yield from self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -47,10 +89,52 @@ class ChunkedFile:
         """Release the file."""
         self._stream.close()
 
-    def begin_ns(self) -> int | None:
-        """Return the log time of the first message by the index, None without one."""
-        return min((chunk.begin_ns for chunk in self._chunks or () if chunk.begin_ns), default=None)
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return first and last log time by the index, None without one."""
+        known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
+        return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
-    def end_ns(self) -> int | None:
-        """Return the log time of the last message by the index, None without one."""
-        return max((chunk.end_ns for chunk in self._chunks or () if chunk.end_ns), default=None)
+    def _read(self, at: int, length: int) -> memoryview:
+        """Return bytes of the file, valid until the next call."""
+        self._stream.seek(at)
+        space = self._space.of(length).data
+        return space[: self._stream.readinto(space)]
+
+    def _chunk(
+        self, at: int, length: int, place: int, unpack: Callable[[memoryview], Bytes], *, learn: bool, cut: bool
+    ) -> Iterator[Block]:
+        """Yield the messages of a chunk.
+
+        Parameters
+        ----------
+        at, length : of its content in the file
+        place : byte of the file at which its record begins
+        unpack : returns the records in its content
+        cut : the content is cut off
+        """
+        try:
+            if length > LARGEST_CHUNK_BYTES:
+                raise DecompressionError(f"it claims {length} bytes")
+            data = unpack(self._read(at, length))
+        except DecompressionError as err:
+            if not cut:
+                self.problems.add(f"chunk at byte {place} left out: {err.args[0]}")
+            return
+        stop, begin = 0, -1
+        while begin < stop < len(data):
+            begin = stop
+            block, stop = self._scanned(data, begin, learn=learn)
+            yield block
+        if stop < len(data) and not cut:
+            self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+
+    def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
+        """Return the messages among the records from `begin`, and the first byte not consumed."""
+        count, stop = self._scan(data, begin, self._rows)
+        rows = self._rows[:count]
+        is_message = rows[:, 0] == self._message
+        if learn:
+            for row in rows[~is_message]:
+                self._learn(row, data)
+        _, *columns = rows[is_message].T
+        return with_possible_times(Block(data, *map(np.ascontiguousarray, columns)), self.problems), stop

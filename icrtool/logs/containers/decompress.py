@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bytes
 from icrtool.logs.containers.channel import Block
-
-Buffer = bytes | bytearray
 
 LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
 """An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; two are in memory at a time."""
@@ -30,40 +29,77 @@ class DecompressionError(Exception):
     """A chunk that cannot be decompressed; `args[0]` is the reason."""
 
 
+class Space:
+    """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
+
+    def __init__(self) -> None:
+        self._bytes: Bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before as far as they reach."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size, np.uint8)
+        return self._bytes[:size]
+
+
 class Inflation:
     """Decompresses the chunks of a log, and limits them all to a multiple of their size in the file."""
 
     def __init__(self) -> None:
         self._left = FREE_BYTES
+        self._space = Space()
 
-    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> Buffer:
+    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> Bytes:
         """Decompress a chunk.
 
         Parameters
         ----------
         compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
         size : decompressed size stated in the log [bytes]
-        partial : the data is cut off; return the part that can be decompressed
+        partial : the data is cut off, or `size` is only a part of it; return what can be decompressed
+
+        Returns
+        -------
+        uint8, valid until the next call.
 
         Raises
         ------
         DecompressionError
             Damaged data, a size other than `size`, an unknown compression, or more than the log may take.
         """
-        if compression in ("", "none"):
-            self.count(len(data), len(data))
-            return bytes(data)
-        decoder = _DECODERS.get(compression)
-        if decoder is None:
-            raise DecompressionError(f"compression {compression!r} is not known")
-        self.count(len(data), size)
+        stored = compression in ("", "none")
+        self.count(len(data), len(data) if stored else size)
         try:
-            out = decoder(data, size, partial)
+            match compression:
+                case "" | "none":
+                    out = np.frombuffer(data, np.uint8)
+                case "zstd":
+                    out = self._zstd(data, size, partial=partial)
+                case "lz4":
+                    import lz4.frame
+
+                    out = _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
+                case "bz2":
+                    out = _in_pieces(bz2.BZ2Decompressor(), data, size)
+                case _:
+                    raise DecompressionError(f"compression {compression!r} is not known")
         except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
             raise DecompressionError(str(err) or "not enough memory") from err
-        if len(out) != size and not partial:
+        if len(out) != size and not partial and not stored:
             raise DecompressionError(f"{len(out)} bytes instead of {size}")
+        out.flags.writeable = False  # as that of a database: the kernels are compiled once
         return out
+
+    def _zstd(self, data: bytes | memoryview, size: int, *, partial: bool) -> Bytes:
+        import zstandard
+
+        out = self._space.of(size + 1)
+        try:
+            # Where the space holds all of a frame, zstd decompresses straight into it.
+            with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
+                return out[: reader.readinto(out if not partial else out[:size])]
+        except zstandard.ZstdError as err:
+            raise DecompressionError(str(err)) from err
 
     def count(self, packed: int, unpacked: int) -> None:
         """Count what is decompressed [bytes].
@@ -83,41 +119,16 @@ class Inflation:
         self._left = left
 
 
-def _lz4(data: bytes | memoryview, size: int, _: bool) -> Buffer:
-    import lz4.frame
-
-    return _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
-
-
-def _bz2(data: bytes | memoryview, size: int, _: bool) -> Buffer:
-    return _in_pieces(bz2.BZ2Decompressor(), data, size)
-
-
-def _in_pieces(decoder: Any, data: bytes | memoryview, size: int) -> Buffer:  # noqa: ANN401 - of two libraries
+def _in_pieces(decoder: Any, data: bytes | memoryview, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
     """Decompress up to `size` bytes and one more, a piece at a time."""
-    out = decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES))
-    if len(out) < _PIECE_BYTES:
-        return bytes(out)
-    out = bytearray(out)
-    while not decoder.eof and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES))):
+    out = bytearray(decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES)))
+    while (
+        len(out) >= _PIECE_BYTES
+        and not decoder.eof
+        and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES)))
+    ):
         out += piece
-    return out
-
-
-def _zstd(data: bytes | memoryview, size: int, partial: bool) -> Buffer:
-    import zstandard
-
-    decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
-    try:
-        if not partial and zstandard.frame_content_size(data) == size:
-            return decompressor.decompress(data)
-        with decompressor.stream_reader(data) as reader:
-            return bytes(reader.read(size + 1))
-    except zstandard.ZstdError as err:
-        raise DecompressionError(str(err)) from err
-
-
-_DECODERS = {"lz4": _lz4, "zstd": _zstd, "bz2": _bz2}
+    return np.frombuffer(out, np.uint8)
 
 
 def unpack_messages(

@@ -9,20 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.errors import LogError
-from icrtool.kernels.arrays import Bytes
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name, with_possible_times
-from icrtool.logs.containers.chunked_file import ChunkedFile
+from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, joined, ros_type_name
+from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, ChunkedFile
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
-    Buffer,
     DecompressionError,
     Inflation,
     unpack_messages,
 )
-from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -50,6 +47,10 @@ Of a chunk with images that is a few percent, and most recorders close a chunk b
 """
 
 
+JOINED_BYTES = 1 << 20
+"""Such parts are handed on together once they have so many bytes: each block has a cost of its own."""
+
+
 class _Chunk(NamedTuple):
     """Where a chunk record's content is in the file: offset and length; and its entry in the index.
 
@@ -59,6 +60,7 @@ class _Chunk(NamedTuple):
     index_length : length of the message index records that follow it
     begin_ns, end_ns : first and last log time in it, 0 without an entry
     size : of its records, decompressed
+    stored : they are not compressed
     """
 
     at: int
@@ -68,6 +70,7 @@ class _Chunk(NamedTuple):
     begin_ns: int = 0
     end_ns: int = 0
     size: int = 0
+    stored: bool = False
 
 
 class McapFile(ChunkedFile):
@@ -84,7 +87,7 @@ class McapFile(ChunkedFile):
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
-        super().__init__(path)
+        super().__init__(path, MCAP_MESSAGE)
         self._message_compression = message_compression
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
@@ -103,56 +106,72 @@ class McapFile(ChunkedFile):
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
         """Yield the messages of the wanted channels, chunk by chunk."""
-        if not wanted:
-            return
-        blocks = self._read_in_order() if self._chunks is None else self._indexed(self._chunks, wanted, cut)
+        blocks = super().blocks(wanted, cut)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
-    def _indexed(self, chunks: list[_Chunk], wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        for chunk in chunks:
+    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+        small: list[Block] = []
+        for chunk in self._chunks or ():
             if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
                 needed = self._needed(chunk, wanted)
                 part = self._read_part(chunk, needed) if needed is not None else None
                 if part is not None:
-                    yield part
-                else:
+                    small.append(part._replace(data=part.data.copy()))
+                if small and (part is None or sum(len(one.data) for one in small) > JOINED_BYTES):
+                    yield joined(small)
+                    small = []
+                if part is None:
                     yield from self._read_chunk(chunk)
+        if small:
+            yield joined(small)
 
-    def _needed(self, chunk: _Chunk, wanted: frozenset[int]) -> int | None:
-        """Return where in a chunk the last wanted message ends, by its message index; None where most is wanted."""
+    def _needed(self, chunk: _Chunk, wanted: frozenset[int]) -> Ints | None:
+        """Return where the wanted messages of a chunk begin and end (n, 2), by its index; None where most is wanted."""
         if chunk.channels is None or chunk.channels <= wanted or chunk.index_length > LARGEST_CHUNK_BYTES:
             return None
-        self._stream.seek(chunk.at + chunk.length)
-        index, at = self._stream.read(chunk.index_length), 0
-        found = []
+        index, at = bytes(self._read(chunk.at + chunk.length, chunk.index_length)), 0
+        offsets, flags = [], []
         while at + _INDEX_HEAD_BYTES <= len(index):
             opcode, length, channel = struct.unpack_from("<BQH", index, at)
             at += _HEAD_BYTES + length
             if opcode != _MESSAGE_INDEX or length < _INDEX_HEAD_BYTES - _HEAD_BYTES or at > len(index):
                 return None
             count = (length - _INDEX_HEAD_BYTES + _HEAD_BYTES) // 16
-            offsets = np.frombuffer(index, "<u8", 2 * count, at - 16 * count)[1::2]
-            found.append(np.stack([offsets, np.full(count, channel in wanted, np.uint64)]))
-        if not found or not chunk.size:
+            offsets.append(np.frombuffer(index, "<i8", 2 * count, at - 16 * count)[1::2])
+            flags.append(np.full(count, channel in wanted))
+        if not offsets or not chunk.size:
             return None
-        begin, is_wanted = np.concatenate(found, axis=1)
+        begin = np.concatenate(offsets)
         order = np.argsort(begin)
-        end = np.append(begin[order][1:], np.uint64(chunk.size))
-        sizes = np.where(is_wanted[order], end - begin[order], 0)
-        return int(end[sizes > 0].max(initial=0)) if sizes.sum() < SMALL_PART * chunk.size else None
+        edges = np.append(begin[order], chunk.size)
+        places = np.column_stack([edges[:-1], edges[1:]])[np.concatenate(flags)[order]]
+        sizes = places[:, 1] - places[:, 0]
+        sound = edges[0] >= 0 and sizes.min(initial=1) > 0
+        return places if sound and sizes.sum() < SMALL_PART * chunk.size else None
 
-    def _read_part(self, chunk: _Chunk, needed: int) -> Block | None:
-        """Return the messages in the first `needed` bytes of a chunk; None where all of it has to be read for them."""
-        self._stream.seek(chunk.at)
-        content = self._stream.read(min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
+    def _read_part(self, chunk: _Chunk, places: Ints) -> Block | None:
+        """Return the messages at some places of a chunk; None where all of it has to be read for them.
+
+        What is compressed is read up to the last of them, of other chunks nothing else is read.
+        """
+        needed = int(places.max(initial=0))
         try:
-            records = np.frombuffer(_chunk_records(content, self._inflation, cut=True, needed=needed), np.uint8)
+            if chunk.stored:
+                first, parts = chunk.at + chunk.length - chunk.size, []
+                gaps = np.flatnonzero(places[1:, 0] > places[:-1, 1])
+                for begin, end in zip(places[np.append(0, gaps + 1), 0], places[np.append(gaps, -1), 1], strict=True):
+                    parts.append(bytes(self._read(first + int(begin), int(end - begin))))
+                records = np.frombuffer(b"".join(parts), np.uint8)
+                needed = int(np.diff(places).sum())
+            else:
+                content = self._read(chunk.at, min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
+                records = _chunk_records(content, self._inflation, cut=True, needed=needed)
         except DecompressionError:
             return None
-        rows, stop = self._table.scan_mcap(records)
-        return self._messages(records, rows, learn=False) if stop >= needed else None
+        block, stop = self._scanned(records)
+        return block if stop >= needed else None
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -190,7 +209,8 @@ class McapFile(ChunkedFile):
                     start, length = index.chunk_start_offset + _HEAD_BYTES, index.chunk_length - _HEAD_BYTES
                     times = index.message_start_time, index.message_end_time
                     size = index.uncompressed_size
-                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times, size))
+                    stored = index.compression in ("", "none") and size <= length
+                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times, size, stored))
                 case None:
                     return None
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
@@ -279,12 +299,6 @@ class McapFile(ChunkedFile):
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
-        """Yield the messages by reading the records one after the other, as far as they can be read.
-
-        Parameters
-        ----------
-        learn : remember schemas and channels
-        """
         at = len(MAGIC)
         while True:
             opcode, length = self._head(at)
@@ -309,46 +323,28 @@ class McapFile(ChunkedFile):
         if length <= LARGEST_CHUNK_BYTES:
             self._stream.seek(at)
             piece = np.frombuffer(self._stream.read(max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
-            rows, stop = self._table.scan_mcap(piece)
+            block, stop = self._scanned(piece, learn=learn)
             if stop:
-                return self._messages(piece, rows, learn=learn), stop - _HEAD_BYTES
+                return block, stop - _HEAD_BYTES
         self.problems.add(f"record at byte {at} left out: damaged")
         return None, length
 
     def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        try:
-            if chunk.length > LARGEST_CHUNK_BYTES:
-                raise DecompressionError(f"it claims {chunk.length} bytes")
-            self._stream.seek(chunk.at)
-            records = np.frombuffer(_chunk_records(self._stream.read(chunk.length), self._inflation, cut=cut), np.uint8)
-        except DecompressionError as err:
-            if not cut:
-                self.problems.add(f"chunk at byte {chunk.at - _HEAD_BYTES} left out: {err.args[0]}")
-            return
-        stop, begin = 0, -1
-        while begin < stop < len(records):
-            begin = stop
-            rows, stop = self._table.scan_mcap(records, begin)
-            yield self._messages(records, rows, learn=learn)
-        if stop < len(records) and not cut:
-            lost = f"{len(records) - stop} of {len(records)} bytes left out, damaged"
-            self.problems.add(f"chunk at byte {chunk.at - _HEAD_BYTES}: {lost}")
+        def unpack(content: memoryview) -> Bytes:
+            return _chunk_records(content, self._inflation, cut=cut)
 
-    def _messages(self, data: Bytes, rows: NDArray[np.int64], *, learn: bool) -> Block:
-        is_message = rows[:, 0] == MCAP_MESSAGE
-        if learn:
-            for row in rows[~is_message]:
-                self._learn(int(row[0]), bytes(data[row[3] : row[4]]))
-        rows = rows[is_message]
-        block = Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
-        return with_possible_times(block, self.problems)
+        return self._chunk(chunk.at, chunk.length, chunk.at - _HEAD_BYTES, unpack, learn=learn, cut=cut)
 
-    def _learn(self, opcode: int, content: bytes) -> None:
-        """Remember a schema or channel record."""
+    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+        from icrtool.logs.containers.record_table import scan_mcap
+
+        return scan_mcap(data, begin, rows)
+
+    def _learn(self, row: Ints, data: Bytes) -> None:
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema
 
-        record = _parse(opcode, content)
+        record = _parse(int(row[0]), bytes(data[row[3] : row[4]]))
         if isinstance(record, Schema):
             known = self._schemas.setdefault(record.id, record) == record
         elif isinstance(record, McapChannel):
@@ -383,7 +379,7 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     return record
 
 
-def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Buffer:
+def _chunk_records(content: memoryview, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Bytes:
     """Return the records of a chunk record's content, decompressed and checked against its checksum.
 
     Parameters
@@ -396,15 +392,15 @@ def _chunk_records(content: bytes, inflation: Inflation, *, cut: bool, needed: i
     size = int.from_bytes(content[16:24], "little")
     checksum = int.from_bytes(content[24:28], "little")
     name_end = 32 + int.from_bytes(content[28:32], "little")
-    compression = content[32 : min(name_end, 32 + 64)].decode("ascii", "replace")
+    compression = bytes(content[32 : min(name_end, 32 + 64)]).decode("ascii", "replace")
     if name_end + 8 > len(content):
         raise DecompressionError("its header is damaged")
     length = int.from_bytes(content[name_end : name_end + 8], "little")
-    packed = memoryview(content)[name_end + 8 : name_end + 8 + length]
+    packed = content[name_end + 8 : name_end + 8 + length]
     if len(packed) < length and not cut:
         raise DecompressionError("its header is damaged")
     data = inflation.decompress(packed, compression, min(size, needed) if cut else size, partial=cut)
-    if checksum and not cut and zlib.crc32(data) != checksum:
+    if checksum and not cut and zlib.crc32(data.data) != checksum:
         raise DecompressionError("its checksum is wrong")
     return data
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.kernels.arrays import Bytes
 from icrtool.kernels.compiled import njit
-
-MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
-BAG_MESSAGE, BAG_CONNECTION = 2, 7
-MOST_ROWS = 1 << 18
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, BAG_MESSAGE, MCAP_MESSAGE, MCAP_SCHEMA
 
 
 @njit
@@ -97,20 +94,3 @@ def scan_bag(data: Bytes, begin: int, rows: NDArray[np.int64]) -> tuple[int, int
             count += 1
         at = content + length
     return count, at
-
-
-class RecordTable:
-    """A reusable table for the rows of a scan. A scan stops when the table is full, and can be continued."""
-
-    def __init__(self) -> None:
-        self._rows: Ints = np.empty((MOST_ROWS, 5), np.int64)
-
-    def scan_mcap(self, data: Bytes, begin: int = 0) -> tuple[Ints, int]:
-        """Return the rows of the records from `begin`, and the first byte not consumed."""
-        count, stop = scan_mcap(data, begin, self._rows)
-        return self._rows[:count], stop
-
-    def scan_bag(self, data: Bytes, begin: int = 0) -> tuple[Ints, int]:
-        """Return the rows of the records from `begin`, and the first byte not consumed."""
-        count, stop = scan_bag(data, begin, self._rows)
-        return self._rows[:count], stop

@@ -11,10 +11,8 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import ChunkedFile
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError
-from icrtool.logs.containers.record_table import BAG_CONNECTION, BAG_MESSAGE
+from icrtool.logs.containers.channel import Block, Channel, Cut, ros_type_name
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, BAG_MESSAGE, ChunkedFile
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -66,7 +64,7 @@ class Ros1Bag(ChunkedFile):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path)
+        super().__init__(path, BAG_MESSAGE)
         self._connections: dict[int, Channel] = {}
         try:
             self._check_start()
@@ -80,14 +78,8 @@ class Ros1Bag(ChunkedFile):
             raise
         self.channels = list(self._connections.values())
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
-        """Yield the messages of the wanted connections, chunk by chunk."""
-        if not wanted:
-            return
-        if self._chunks is None:
-            yield from self._read_in_order()
-            return
-        for chunk in self._chunks:
+    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+        for chunk in self._chunks or ():
             if not cut.needs(chunk.connections, chunk.begin_ns, chunk.end_ns, wanted):
                 continue
             record = self._record(chunk.at)
@@ -136,7 +128,7 @@ class Ros1Bag(ChunkedFile):
             self._stream.seek(record.at)
             content = self._stream.read(record.length)
             if record.op == BAG_CONNECTION:
-                self._learn(record.number(b"conn"), record.text(b"topic"), content)
+                self._connect(record.number(b"conn"), record.text(b"topic"), content)
             elif record.op == _CHUNK_INFO:
                 held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
                 for connection, count in held:
@@ -155,12 +147,6 @@ class Ros1Bag(ChunkedFile):
         return sorted(chunks.values(), key=lambda chunk: chunk.at)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
-        """Yield the messages by reading the records one after the other, as far as they can be read.
-
-        Parameters
-        ----------
-        learn : remember connections
-        """
         at = len(MAGIC)
         while at < self._size:
             record = self._record(at)
@@ -173,41 +159,29 @@ class Ros1Bag(ChunkedFile):
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 self._stream.seek(record.at)
-                self._learn(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
+                self._connect(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
             at = record.at + record.length
         if at < self._size:
             self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        size = record.number(b"size")
-        try:
-            if record.length > LARGEST_CHUNK_BYTES:
-                raise DecompressionError(f"it claims {record.length} bytes")
-            self._stream.seek(record.at)
-            packed = self._stream.read(record.length)
-            records = self._inflation.decompress(packed, record.text(b"compression"), size, partial=cut)
-            data = np.frombuffer(records, np.uint8)
-        except DecompressionError as err:
-            if not cut:
-                self.problems.add(f"chunk at byte {record.at} left out: {err.args[0]}")
-            return
-        stop, begin = 0, -1
-        while begin < stop < len(data):
-            begin = stop
-            rows, stop = self._table.scan_bag(data, begin)
-            yield self._messages(data, rows, learn=learn)
-        if stop < len(data) and not cut:
-            self.problems.add(f"chunk at byte {record.at}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+        def unpack(content: memoryview) -> Bytes:
+            size = record.number(b"size")
+            return self._inflation.decompress(content, record.text(b"compression"), size, partial=cut)
 
-    def _messages(self, data: Bytes, rows: Ints, *, learn: bool) -> Block:
-        if learn:
-            for _, number, header, start, end in rows[rows[:, 0] == BAG_CONNECTION].tolist():
-                topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
-                self._learn(number, topic, bytes(data[start:end]))
-        rows = rows[rows[:, 0] == BAG_MESSAGE]
-        return Block(data, rows[:, 1].copy(), rows[:, 2].copy(), rows[:, 3].copy(), rows[:, 4].copy())
+        return self._chunk(record.at, record.length, record.at, unpack, learn=learn, cut=cut)
 
-    def _learn(self, number: int, topic: str, content: bytes) -> None:
+    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+        from icrtool.logs.containers.record_table import scan_bag
+
+        return scan_bag(data, begin, rows)
+
+    def _learn(self, row: Ints, data: Bytes) -> None:
+        _, number, header, start, end = row.tolist()
+        topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
+        self._connect(number, topic, bytes(data[start:end]))
+
+    def _connect(self, number: int, topic: str, content: bytes) -> None:
         """Remember a connection record; `content` is the header that the publisher sent."""
         fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
         if number in self._connections or b"type" not in fields:

@@ -6,6 +6,7 @@ a path like any other: commands take it, tables show it.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -79,3 +80,14 @@ def files_of_log(path: Path) -> list[Path]:
     if path.is_dir():
         return sorted(file for file in path.iterdir() if file.is_file())
     return split_files(path) or [path]
+
+
+def log_name(path: Path) -> str:
+    """Return a log's name: that of its (first) file without suffix, or of the directory; ``log`` where it is only dots.
+
+    Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
+    """
+    files = split_files(path)
+    named = Path(os.path.normpath((files[0] if files else path).absolute()))
+    name = named.name if named.is_dir() else named.stem
+    return name if name.strip(".") else "log"

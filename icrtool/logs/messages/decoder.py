@@ -13,7 +13,6 @@ from icrtool.logs.messages.schema import (
     BEGIN_LOOP,
     END_LOOP,
     SKIP,
-    SKIP_SEQUENCE,
     SKIP_STRING,
     TAKE,
     TAKE_SEQUENCE,
@@ -142,142 +141,154 @@ def fill_row(
 
 
 @njit
-def decode(
-    data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools
-) -> None:
-    """Fill a row of `table` (n, columns) per message, and `readable` (n,): whether the message fits the program.
-
-    Nothing is read outside [start, end); a message that is shorter than its layout, or of an encapsulation that is
-    not plain CDR, is not readable.
-    """
-    decode_new_shapes(data, start, end, program, cdr, table, readable, np.empty(len(start), np.bool_))
+def take_numbers(
+    data: Bytes, at: int, size: int, count: int, big: int, table: NDArray[np.uint64], m: int, column: int,
+    begin: int, taken: Ints, columns: int,
+) -> int:  # fmt: skip
+    """Copy `count` numbers to row m, and remember their offsets; return how many columns are used now."""
+    for i in range(count):
+        table[m, column + i] = read_word(data, at + i * size, size, big)
+        columns = remember_column(taken, columns, at + i * size - begin, size, column + i)
+    return columns
 
 
 @njit
-def decode_new_shapes(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
+def take_text(
+    data: Bytes, at: int, length: int, table: NDArray[np.uint64], m: int, column: int, begin: int, taken: Ints,
+    columns: int,
+) -> int:  # fmt: skip
+    """Put offset, length and hash of a text into row m, and remember them; return how many columns are used now."""
+    table[m, column], table[m, column + 1] = np.uint64(at), np.uint64(length)
+    table[m, column + 2] = hash_text(data, at, length)
+    columns = remember_column(taken, columns, at - begin, _ITS_PLACE, column)
+    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + 1)
+    return remember_column(taken, columns, _ZERO, _AS_BEFORE, column + 2)
+
+
+@njit
+def run_program(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
+    data: Bytes, begin: int, base: int, stop: int, program: Ints, cdr: bool, big: int,
+    table: NDArray[np.uint64], m: int, same: Ints, ranges: int, taken: Ints, loops: Ints,
+) -> tuple[bool, int, int]:  # fmt: skip
+    """Run the program over one message.
+
+    Parameters
+    ----------
+    begin, base, stop : where the message begins, where its fields do, and where it ends in `data`
+    table : of `decode_new_shapes`; row m is filled
+    same, ranges, taken : filled with the ranges of bytes that make the message's shape, and where its numbers are
+    loops : (4, `_MAX_NESTING`) space for the loops around a field: first operation, elements left, column, element
+
+    Returns
+    -------
+    Whether the message fits the program; how many ranges and columns it uses.
+    """
+    returns, left, column_base, iteration = loops
+    at, depth, shift, taking, step, columns = base, 0, 0, True, 0, _ZERO
+    steps_left = min(_STEPS_PER_BYTE * (stop - at) + _LEAST_STEPS + 2 * len(program), MOST_STEPS)
+    while step < len(program):
+        steps_left -= 1
+        if steps_left < 0:
+            return False, ranges, columns
+        operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
+        capacity, behind = program[step, 4], program[step, 6]
+        step += 1
+        if operation == END_LOOP:
+            loop = returns[depth - 1]
+            left[depth - 1] -= 1
+            iteration[depth - 1] += 1
+            if left[depth - 1] > 0:
+                step = loop + 1
+                if program[loop, 4] > 0:
+                    shift = column_base[depth - 1] + iteration[depth - 1] * program[loop, 5]
+                    taking = iteration[depth - 1] < program[loop, 4]
+            else:
+                depth -= 1
+                shift = column_base[depth]
+                taking = depth == 0 or iteration[depth - 1] < max(program[returns[depth - 1], 4], 1)
+            continue
+        if operation >= SKIP_STRING and (operation != BEGIN_LOOP or count < 0):
+            at += (base - at) & 3 if cdr else 0
+            if at + 4 > stop:
+                return False, ranges, columns
+            count = np.int64(read_word(data, at, _FOUR, big))
+            ranges = remember_same(same, ranges, at - begin, at - begin + 4)
+            at += 4
+            if count > stop - at:
+                return False, ranges, columns
+            if operation in (TAKE_SEQUENCE, BEGIN_LOOP) and column >= 0 and taking:
+                table[m, column + shift] = np.uint64(count)
+                columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift)
+        if operation == BEGIN_LOOP:
+            # Count at least one byte for an element: a loop over elements without fields must end, too.
+            if count > 0 and (depth >= _MAX_NESTING or count > stop - at):
+                return False, ranges, columns
+            if count > 0:
+                returns[depth], left[depth], column_base[depth], iteration[depth] = step - 1, count, shift, 0
+                depth += 1
+            else:
+                step = behind
+        elif operation in (SKIP_STRING, TAKE_STRING):
+            if operation == TAKE_STRING and taking:
+                length = count - 1 if cdr and count > 0 else count
+                columns = take_text(data, at, length, table, m, column + shift, begin, taken, columns)
+                ranges = remember_same(same, ranges, at - begin, at - begin + length)
+            at += count
+        else:
+            if cdr and (count > 0 or operation in (SKIP, TAKE)):
+                at += (base - at) & (size - 1)
+            if at + size * count > stop:
+                return False, ranges, columns
+            if operation == TAKE and taking:
+                columns = take_numbers(data, at, size, count, big, table, m, column + shift, begin, taken, columns)
+            elif operation == TAKE_SEQUENCE and taking:
+                count_taken = min(count, capacity)
+                columns = take_numbers(
+                    data, at, size, count_taken, big, table, m, column + shift + 1, begin, taken, columns
+                )
+            at += size * count
+    return True, ranges, columns
+
+
+@njit
+def decode_new_shapes(
     data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools,
     new_shape: Bools,
 ) -> None:  # fmt: skip
-    """Decode as `decode` does; `new_shape` (n,) is set for the messages that the program was run over.
+    """Fill a row of `table` (n, columns) per message, and `readable` (n,): whether the message fits the program.
+
+    Nothing is read outside [start, end); a message that is shorter than its layout, or of an encapsulation that is
+    not plain CDR, is not readable. `new_shape` (n,) is set for the messages that the program was run over.
 
     The messages of a topic are alike: most have the same strings, and sequences of the same lengths, as the message
     before. The bytes that hold them are remembered while the program runs over a message. Where the next message has
     the same bytes there, its numbers are at the same offsets, and are copied from there.
     """
-    returns, left, column_base, iteration = (
-        np.zeros(_MAX_NESTING, np.int64), np.zeros(_MAX_NESTING, np.int64),
-        np.zeros(_MAX_NESTING, np.int64), np.zeros(_MAX_NESTING, np.int64),
-    )  # fmt: skip
+    loops = np.zeros((4, _MAX_NESTING), np.int64)
     same, taken = np.empty((_MOST_REMEMBERED, 2), np.int64), np.empty((_MOST_REMEMBERED, 3), np.int64)
     ranges, columns, model, big = _ZERO, _ZERO, _AS_BEFORE, _ZERO
     for m in range(len(start)):
-        at, stop, base = start[m], end[m], start[m]
-        new_shape[m] = False
+        begin, base, stop = start[m], start[m], end[m]
         readable[m] = True
-        if model >= 0 and stop - at >= end[model] - start[model] and has_shape(data, at, start[model], same, ranges):
-            fill_row(data, at, big, taken, columns, model, m, table)
+        new_shape[m] = not (
+            model >= 0
+            and stop - begin >= end[model] - start[model]
+            and has_shape(data, begin, start[model], same, ranges)
+        )
+        if not new_shape[m]:
+            fill_row(data, begin, big, taken, columns, model, m, table)
             continue
-        new_shape[m] = True
         ranges, columns, model, big = _ZERO, _ZERO, m, _ZERO
         if cdr:
-            if stop - at < 4 or data[at] != 0 or data[at + 1] > _CDR_LITTLE:
+            if stop - begin < 4 or data[begin] != 0 or data[begin + 1] > _CDR_LITTLE:
                 readable[m], model = False, -1
                 continue
-            big = _ZERO + (data[at + 1] == _CDR_BIG)
+            big = _ZERO + (data[begin + 1] == _CDR_BIG)
             ranges = remember_same(same, ranges, _ZERO, _FOUR)
-            at += 4
-            base = at
-        depth, shift, taking, step = 0, 0, True, 0
-        steps_left = min(_STEPS_PER_BYTE * (stop - at) + _LEAST_STEPS + 2 * len(program), MOST_STEPS)
-        while step < len(program):
-            steps_left -= 1
-            if steps_left < 0:
-                readable[m] = False
-                break
-            operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
-            capacity = program[step, 4]
-            if operation in (SKIP, TAKE):
-                if cdr:
-                    at += (base - at) & (size - 1)
-                if at + size * count > stop:
-                    readable[m] = False
-                    break
-                if operation == TAKE and taking:
-                    for i in range(count):
-                        table[m, column + shift + i] = read_word(data, at + i * size, size, big)
-                        columns = remember_column(taken, columns, at + i * size - start[m], size, column + shift + i)
-                at += size * count
-                step += 1
-                continue
-            if operation == END_LOOP:
-                left[depth - 1] -= 1
-                if left[depth - 1] > 0:
-                    loop = returns[depth - 1]
-                    iteration[depth - 1] += 1
-                    if program[loop, 4] > 0:
-                        shift = column_base[depth - 1] + iteration[depth - 1] * program[loop, 5]
-                        taking = iteration[depth - 1] < program[loop, 4]
-                    step = loop + 1
-                    continue
-                depth -= 1
-                shift = column_base[depth]
-                taking = depth == 0 or iteration[depth - 1] < max(program[returns[depth - 1], 4], 1)
-                step += 1
-                continue
-            if operation in (SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE) or (
-                operation == BEGIN_LOOP and count < 0
-            ):
-                if cdr:
-                    at += (base - at) & 3
-                if at + 4 > stop:
-                    readable[m] = False
-                    break
-                count = np.int64(read_word(data, at, _FOUR, big))
-                ranges = remember_same(same, ranges, at - start[m], at - start[m] + 4)
-                at += 4
-                if count > stop - at:
-                    readable[m] = False
-                    break
-                if operation in (TAKE_SEQUENCE, BEGIN_LOOP) and column >= 0 and taking:
-                    table[m, column + shift] = np.uint64(count)
-                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift)
-            if operation == BEGIN_LOOP:
-                if count == 0:
-                    step = program[step, 6]
-                    continue
-                # Count at least one byte for an element: a loop over elements without fields must end, too.
-                if depth >= _MAX_NESTING or count > stop - at:
-                    readable[m] = False
-                    break
-                returns[depth], left[depth], column_base[depth], iteration[depth] = step, count, shift, 0
-                depth += 1
-                step += 1
-                continue
-            if operation in (SKIP_STRING, TAKE_STRING):
-                if operation == TAKE_STRING and taking:
-                    length = count - 1 if cdr and count > 0 else count
-                    code = hash_text(data, at, length)
-                    table[m, column + shift] = np.uint64(at)
-                    table[m, column + shift + 1] = np.uint64(length)
-                    table[m, column + shift + 2] = code
-                    ranges = remember_same(same, ranges, at - start[m], at - start[m] + length)
-                    columns = remember_column(taken, columns, at - start[m], _ITS_PLACE, column + shift)
-                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift + 1)
-                    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift + 2)
-                at += count
-                step += 1
-                continue
-            if count > 0 and cdr:
-                at += (base - at) & (size - 1)
-            if at + size * count > stop:
-                readable[m] = False
-                break
-            if operation == TAKE_SEQUENCE and taking:
-                for i in range(min(count, capacity)):
-                    table[m, column + shift + 1 + i] = read_word(data, at + i * size, size, big)
-                    columns = remember_column(taken, columns, at + i * size - start[m], size, column + shift + 1 + i)
-            at += size * count
-            step += 1
+            base += 4
+        readable[m], ranges, columns = run_program(
+            data, begin, base, stop, program, cdr, big, table, m, same, ranges, taken, loops
+        )
         if not readable[m] or ranges > _MOST_REMEMBERED or columns > _MOST_REMEMBERED:
             model = -1
 

@@ -13,8 +13,8 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import write_file
-from icrtool.output.tables.dropout import budget_lines, metres_text, percent_text, ratio_text, shown_horizons
-from icrtool.output.text_format import run_title, xml_text
+from icrtool.output.tables.dropout import budget_lines, percent_text, ratio_text, shown_horizons
+from icrtool.output.text_format import error_text, run_title, xml_text
 from icrtool.records.dropout import Verdict
 
 Outcome = DropoutReport | IcrToolError
@@ -88,7 +88,7 @@ def format_markdown(report: DropoutReport) -> str:
     for result in report.results:
         for label, column in (("95 %", result.summary.p95), ("expected", result.summary.expected)):
             cells = [
-                f"{metres_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
+                f"{error_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
                 for h in shown
             ]
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
@@ -108,7 +108,7 @@ def format_markdown(report: DropoutReport) -> str:
     if report.outages:
         rows = [
             [one.kind, f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s", f"{one.distance_m:.1f} m",
-             metres_text(one.end_error_m), metres_text(one.max_error_m)]
+             error_text(one.end_error_m), error_text(one.max_error_m)]
             for one in report.outages
         ]  # fmt: skip
         lines += ["", *markdown_table(("outage", "from", "length", "distance", "end error", "max error"), rows)]
@@ -141,7 +141,7 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
                 half = difference_half_width(
                     sums, row.sums if row is not None else None, metric, 1.0, same_recording=same
                 )
-                interval = f" ± {metres_text(half)}" if math.isfinite(half) else ""
+                interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
                 cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
     return [*lines, *markdown_table(head, rows), *([""] if changes else []), *changes]

@@ -10,7 +10,8 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.dropout import metres_text, reach_text
+from icrtool.output.tables.dropout import reach_text
+from icrtool.output.text_format import error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run import ICR_WORDS
 
@@ -192,7 +193,7 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
     real = [one for one in report["outages"] if one["kind"] == "real"]
     if real:
         worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
-        error = f"{metres_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
+        error = f"{error_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
         found.append(Check("fact", f"{_count(len(real), 'real outage')}: in the worst the filter was {error}."))
     of = gnss["used"] + gnss["rejected"]
     if of:
@@ -222,8 +223,8 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
         )
     )
     if own is not None and p95 is not None:
-        share = f"Up to {metres_text(own)}" if own < p95 else "All"
-        what = f"the {metres_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
+        share = f"Up to {error_text(own)}" if own < p95 else "All"
+        what = f"the {error_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
         found.append(Check("fact", f"{share} of {what} can be the position reference's own."))
     return found
 

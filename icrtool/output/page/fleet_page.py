@@ -11,8 +11,7 @@ from icrtool.output.atomic_file import write_file
 from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
-from icrtool.output.tables.dropout import metres_text
-from icrtool.output.text_format import distance_text, duration_text
+from icrtool.output.text_format import distance_text, duration_text, error_text
 
 PLOTS = "plots"
 
@@ -102,7 +101,7 @@ def _search_text(log: Mapping[str, Any]) -> str:
 def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
     icr, errors = log["icr"], log["errors"]
     for name in (*budgets, *(f"{model}_p95_{HORIZON_M:g}m_m" for model in MODELS)):
-        yield _cell(errors.get(name), metres_text)
+        yield _cell(errors.get(name), error_text)
     yield _with_std(log["multiplier"], log["multiplier_std"], "")
     for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
         yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from icrtool import __version__
 from icrtool.output import text_format
-from icrtool.output.tables.dropout import metres_text
+from icrtool.output.text_format import error_text
 from icrtool.records.plain_data import plain
 from icrtool.records.text import escaped
 
@@ -79,7 +79,7 @@ def _environment() -> Environment:
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
     environment.filters |= {
-        "metres": lambda value: "–" if value is None else _with_units(metres_text(value)),
+        "metres": lambda value: "–" if value is None else _with_units(error_text(value)),
         "metric": lambda value: _with_units(text_format.length_text(value)),
         "distance": lambda value: _with_units(text_format.distance_text(value)),
         "duration": lambda value: _with_units(text_format.duration_text(value)),

@@ -14,6 +14,7 @@ from icrtool.output.text_format import (
     controller_text,
     distance_text,
     duration_text,
+    error_text,
     model_text,
     run_title,
     unusable_lines,
@@ -124,13 +125,6 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     return lines
 
 
-def metres_text(metres: float) -> str:
-    """Return an error [m] with three digits or to the millimetre."""
-    if not math.isfinite(metres):
-        return "-"
-    return f"{metres:.3f} m" if metres < 1 else f"{metres:.2f} m"
-
-
 def percent_text(percent: float) -> str:
     """Return an error in percent of the distance."""
     return f"{percent:.1f} %" if math.isfinite(percent) else "-"
@@ -184,7 +178,7 @@ def _ratio_rows(report: DropoutReport) -> Rows:
 def _turning_line(split: TurningSplit) -> str:
     kind = "straight" if split.straight else "turning"
     labels = {"icr": "ICR", "no_slip": "no slip"}
-    errors = ", ".join(f"{labels[name]} {metres_text(error)}" for name, error in split.expected_m.items())
+    errors = ", ".join(f"{labels[name]} {error_text(error)}" for name, error in split.expected_m.items())
     return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
 
 
@@ -227,7 +221,7 @@ def _event_lines(report: DropoutReport) -> list[str]:
     h = int(both[-1])
     before, after = cost.with_events["icr"], icr.summary
     errors = [
-        f"{name} {metres_text(float(after_m[h]))} instead of {metres_text(float(before_m[h]))}"
+        f"{name} {error_text(float(after_m[h]))} instead of {error_text(float(before_m[h]))}"
         for name, after_m, before_m in (
             ("95 %", after.p95, before.p95), ("expected", after.expected, before.expected),
         )
@@ -283,7 +277,7 @@ def _reference_lines(report: DropoutReport) -> list[str]:
     if own is None or icr is None or not np.isfinite(own.p95).any():
         return []
     h = int(np.argmin(np.where(np.isfinite(own.p95), np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
-    whole, part = metres_text(float(icr.summary.p95[h])), metres_text(float(own.p95[h]))
+    whole, part = error_text(float(icr.summary.p95[h])), error_text(float(own.p95[h]))
     what = f"the {whole} of the momentary ICRs (95 %, {report.horizons_m[h]:g} m)"
     return [f"of {what} up to {part} can be the reference's own error"]
 
@@ -314,22 +308,22 @@ def _outage_table(outages: Sequence[Outage], report: DropoutReport) -> Table:
         rows.append(
             (
                 f"{number} {one.kind}", f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s",
-                f"{one.distance_m:.1f} m", metres_text(one.end_error_m), metres_text(one.max_error_m),
-                metres_text(usual) if usual is not None else "-",
+                f"{one.distance_m:.1f} m", error_text(one.end_error_m), error_text(one.max_error_m),
+                error_text(usual) if usual is not None else "-",
             )
         )  # fmt: skip
     return Table("lr", rows, ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials"))
 
 
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
-    return f"{metres_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
+    return f"{error_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
 
 
 def _span_text(low_m: float, high_m: float) -> str:
     if not math.isfinite(low_m):
         return "too short"
-    return f"{metres_text(low_m).removesuffix(' m')}-{metres_text(high_m)}"
+    return f"{error_text(low_m).removesuffix(' m')}-{error_text(high_m)}"
 
 
 def _bare(metres: float) -> str:
-    return metres_text(float(metres)).removesuffix(" m")
+    return error_text(float(metres)).removesuffix(" m")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.model_comparison import ModelComparison, _errors_along, compare_models
+from icrtool.calibration.model_comparison import ModelComparison, _errors_along, compare_models, turned_path
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import parse_config
 from icrtool.errors import DataError
@@ -44,7 +44,8 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     run = replace(run, table=replace(table, heading_rad=turned))
     recording = recording_of(run, MeasuredHeading("gyro", turned))
     trials = cut_trials(recording, (5.0,))
-    found = _errors_along(run, recording, trials, FrozenIcrs.constant(0.5, -0.6, 0.1))
+    icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
+    found = _errors_along(turned_path(run, recording), recording.drive, trials, icrs)
     ahead = (0.5 * table.v_left_mps + 0.6 * table.v_right_mps) / width
     aside = -0.1 * (table.v_left_mps - table.v_right_mps) / width
     step = (dt * (ahead + 1j * aside))[:-1] * np.exp(0.5j * (turned[1:] + turned[:-1]))

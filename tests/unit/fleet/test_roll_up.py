@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from icrtool.cli.compare import _groups
-from icrtool.errors import LogError
+from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
-from icrtool.fleet.row import Row
+from icrtool.fleet.row import File, Row
 from icrtool.output.calibration_file import open_calibration
 from icrtool.records.run import Run
 
@@ -34,8 +34,15 @@ def place(run: Run, make_run: Callable[..., Run], tmp_path_factory: pytest.TempP
     return place
 
 
+CONTENT = {"a": "1", "b": "2", "copy": "1", "c": "3"}
+
+
 def rows(*names: str, group: str = "grass", **values: object) -> list[Row]:
-    return [Row(name, f"runs/{name}", "done", robot="barn", group=group, key="k", **values) for name in names]
+    return [
+        Row(name, f"runs/{name}", "done", robot="barn", group=group, key="k",
+            inputs=(File(name, 1, 1, CONTENT.get(name, name)),), **values)
+        for name in names
+    ]  # fmt: skip
 
 
 def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,6 +63,12 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
         list(pooled_calibrations(logs[:1], place))
 
 
+def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("icrtool.fleet.roll_up.MOST_POOLED", 1)
+    (one,) = pooled_calibrations(rows("a", "b", "copy"), place)
+    assert (one.logs, one.left_out, one.reason) == (("a",), ("b", "copy"), "")
+
+
 def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     logs = [*rows("a"), *rows("b", "copy", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
@@ -63,7 +76,7 @@ def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
     write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice")], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
-    with pytest.raises(LogError):
+    with pytest.raises(RunError):
         runs_of_fleet(place / "runs")
 
 

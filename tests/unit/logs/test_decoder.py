@@ -13,6 +13,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.kernels.compiled import njit
+from icrtool.logs.containers import chunked_file
 from icrtool.logs.containers import record_table as records
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.messages import decoder
@@ -154,7 +155,7 @@ def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
     assert whole.all()
     damaged = [mutated(rng, messages[row % len(messages)]) for row in range(MUTATIONS)]
     damaged += [mutated(rng, message) for message in damaged]
-    python = as_python(decoder.decode)
+    python = as_python(decoder.decode_new_shapes)
     for message in damaged:
         data, start, end = joined([message])
         table, readable = decode_messages(layout, data, start, end)
@@ -162,7 +163,10 @@ def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
         # Only the message is there: a read before or behind it is a read outside.
         only = Guarded(data[start[0] : end[0]])
         with np.errstate(over="ignore"):
-            python(only, start - start[0], end - start[0], layout.program, cdr, Guarded(plain), Guarded(plain_readable))
+            python(
+                only, start - start[0], end - start[0], layout.program, cdr, Guarded(plain), Guarded(plain_readable),
+                Guarded(np.zeros(1, np.bool_)),
+            )  # fmt: skip
         np.testing.assert_array_equal(plain_readable, readable)
         texts = [slot.column for slot in layout.slots.values() if slot.kind == "string"]
         if readable[0] and not texts:
@@ -273,7 +277,7 @@ def test_scan_refuses_a_length_that_the_chunk_does_not_have(kind, number):
 
 
 def test_a_chunk_of_more_records_than_the_table_has_rows_is_scanned_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr(records, "MOST_ROWS", 7)
+    monkeypatch.setattr(chunked_file, "MOST_ROWS", 7)
     path = tmp_path / "log.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)

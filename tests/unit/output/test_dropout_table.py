@@ -19,8 +19,8 @@ from icrtool.output.atomic_file import check_place
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
 from icrtool.output.tables.dropout import (
     budget_lines,
+    error_text,
     format_dropout,
-    metres_text,
     p95_at,
     shown_horizons,
     why_no_trial,
@@ -107,7 +107,7 @@ def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutR
     line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
     assert f"{outage.end_error_m:.3f} m" in line
     assert usual > 0
-    assert line.endswith(metres_text(usual))
+    assert line.endswith(error_text(usual))
 
 
 def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
