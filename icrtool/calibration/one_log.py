@@ -53,6 +53,9 @@ WEAK = 3.0
 SHOWN_STRAIGHT = ("left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg")
 """What driving straight on shows."""
 
+DELAYS = ("gnss_delay_s", "heading_delay_s", "gnss_delay_against_heading_s")
+RESPONSE_PART = "the robot's own response to its wheels is part of it"
+
 STEADY = 0.15
 """A speed is steady where its standard deviation is less than this share of its mean."""
 
@@ -215,8 +218,8 @@ def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
     elif std <= WEAK * kind.useful:
         verdict = "weak"
     note = "" if verdict == "shown" else _reason(kind, facts)
-    if kind.key in {"gnss_delay_s", "heading_delay_s"} and verdict == "shown":
-        note = f"the robot's own response is in it: up to ± {RESPONSE_S:g} s where the clocks agree"
+    if kind.key in DELAYS and verdict == "shown":
+        note = RESPONSE_PART
     return Parameter(kind.key, kind.label, value, std, verdict, note)
 
 
@@ -228,6 +231,8 @@ def _reason(kind: _Kind, facts: DriveFacts) -> str:
     lacks = lacking_turns(right, left)
     if lacks and (kind.key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
         return lacks
+    if kind.key in DELAYS:
+        return RESPONSE_PART
     return f"too short a drive for this noise: {facts.distance_m:.0f} m"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.model_comparison import _errors_along, _icrs_of
+from icrtool.calibration.model_comparison import _errors_along, _icrs_of, turned_path
 from icrtool.calibration.pooled import (
     gyro_recording_of,
     heading_recording_of,
@@ -185,8 +185,9 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
         along[row] = table_errors(
             turned, trials, predicted_path(turned, *in_recording(compared.fits[of or row], turned))
         )
+    turned_path_of_run = turned_path(run, turned)
     for name in ("icr", "icr_final"):
-        along[f"{name}_heading"] = _errors_along(run, turned, trials, _icrs_of(run, name))
+        along[f"{name}_heading"] = _errors_along(turned_path_of_run, drive, trials, _icrs_of(run, name))
     final = (table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
     # Every state of so short a drive is a row of the series.
     assert page.evaluate("icrtoolPage.data.series.step.length") == len(table)
