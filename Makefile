@@ -14,6 +14,9 @@ BIN   := $(VENV)/bin
 READY := $(VENV)/.ready
 PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
+# Python then keeps its compiled modules: the commands that the tests run would each compile numpy and numba again.
+export PYTHONDONTWRITEBYTECODE =
+
 .DEFAULT_GOAL := help
 AXE           = $(VENV)/axe-core/axe.min.js
 AXE_VERSION   = 4.14.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import re
 import subprocess
 import tomllib
@@ -97,3 +99,14 @@ def test_constraints_hold_names_versions_and_hashes_only() -> None:
     allowed = re.compile(r"[a-z0-9-]+==[\w.]+(?: ; [\w .<>=!'\"()]+)? \\|    --hash=sha256:[0-9a-f]{64}(?: \\)?")
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     assert [line for line in lines if not allowed.fullmatch(line)] == []
+
+
+@pytest.mark.parametrize(
+    "script", [*ROOT.glob("benchmarks/*.py"), *ROOT.glob("scripts/*.py")], ids=lambda one: one.name
+)
+def test_a_script_finds_what_it_imports_from_icrtool(script: Path) -> None:
+    for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "icrtool":
+            module = importlib.import_module(str(node.module))
+            for one in node.names:
+                assert hasattr(module, one.name) or importlib.util.find_spec(f"{node.module}.{one.name}"), one.name

@@ -13,6 +13,7 @@ from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
+from icrtool.motion.trials import Trials
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""
@@ -95,6 +96,19 @@ def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro:
     place = drive.north + 1j * drive.east
     heading = float(drive.heading[0])
     return _along(calibration, steps, recording.t_s, place, drive.distance, heading, with_gyro=with_gyro)
+
+
+def forecast_trials(
+    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
+) -> tuple[Floats, Floats]:
+    """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
+    steps = joined_steps(recording, samples_a_step(recording))
+    some, t = trials.ends >= 0, recording.t_s
+    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
+    _, expected, p95 = _errors(calibration, steps, begin, t[trials.ends[some]], with_gyro=with_gyro)
+    found = np.full((2, *trials.ends.shape), np.nan)
+    found[0][some], found[1][some] = expected, p95
+    return found[0], found[1]
 
 
 def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:

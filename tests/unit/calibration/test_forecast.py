@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
-from icrtool.calibration.forecast import _errors, forecast_drive, forecast_plan, wheel_speeds
+from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, IcrToolError, RunError
-from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import MODELS, FittedModel, wheel_motion
-from icrtool.motion.recording import Recording, joined_steps, samples_a_step
-from icrtool.motion.trials import Trials, cut_trials
+from icrtool.motion.trials import cut_trials
 from icrtool.output.tables.forecast import forecast_csv, reach, read_plan
 from support.recordings import WIDTH_M, draw_parameters, make_recording
 
@@ -38,19 +36,6 @@ def calibrated(seed: int) -> Calibration:
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     return calibrated(0)
-
-
-def forecast_trials(
-    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
-) -> tuple[Floats, Floats]:
-    """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
-    steps = joined_steps(recording, samples_a_step(recording))
-    some, t = trials.ends >= 0, recording.t_s
-    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
-    _, expected, p95 = _errors(calibration, steps, begin, t[trials.ends[some]], with_gyro=with_gyro)
-    found = np.full((2, *trials.ends.shape), np.nan)
-    found[0][some], found[1][some] = expected, p95
-    return found[0], found[1]
 
 
 def only(calibration: Calibration, **variances: float) -> Calibration:
