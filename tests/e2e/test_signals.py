@@ -30,7 +30,7 @@ ROBOT = ("--robot", "segway-rmp400")
 COMMANDS = {
     "fit": ("fit", "{log}", *ROBOT, "-o", "run"),
     "fit again": ("fit", "{log}", *ROBOT, "-o", "{run}"),
-    "dropout-report": ("dropout-report", "{run}", "-o", "report"),
+    "dropout-report": ("dropout-report", "{log}", *ROBOT, "-o", "run"),
     "calibrate": ("calibrate", "{run}", "-o", "calibration.json"),
     "batch": ("batch", "{folder}", *ROBOT, "-o", "season", "-j", "2"),
     "study": ("study", "consistency", "--runs", "400", "-o", "study"),

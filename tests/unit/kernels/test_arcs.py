@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrtool.kernels import arcs as simulate
@@ -51,6 +51,7 @@ def test_equal_speeds_drive_straight() -> None:
     np.testing.assert_allclose(pose[-1], [4 * math.cos(0.3), 4 * math.sin(0.3), 0.3], atol=EXACT)
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # its first draw loads modules
 @given(
     st.floats(-2, 2), st.floats(-2, 2), st.floats(1e-4, 5.0), st.floats(0.01, 0.99), st.floats(-7, 7)
 )  # fmt: skip
