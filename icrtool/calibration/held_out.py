@@ -141,6 +141,8 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
     folds : of `plan_folds`
     start_m, end_m : path lengths (k,) at the trials' starts and ends
     """
+    if not len(start_m):
+        return
     mine = [fold for fold in folds if fold.recording == recording]
     if mine[0].whole:
         yield mine[0], np.arange(len(start_m))
