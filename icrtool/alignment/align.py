@@ -78,7 +78,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         sections={
             "wheels": wheels.summary() | window_summary(found.fit),
             "heading": heading.summary() | delays.heading_summary(),
-            "gnss": delays.gnss_summary(),
+            "gnss": delays.gnss.summary(),
         },
         streams=found.log.streams,
         fix_statistics=quality.statistics,

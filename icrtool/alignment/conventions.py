@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_chords
+from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveArrays, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
 from icrtool.records.tables import RobotLog
@@ -43,7 +43,7 @@ ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
 MOST_WINDOWS = 4000
-LEAST_CHORD_M, CHORD_IN_POSITION_STD = 0.3, 4.0
+CHORD_IN_POSITION_STD = 4.0
 """Without a heading, distances are compared where the robot moves clearly."""
 
 

@@ -164,11 +164,11 @@ def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStream
         drive, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, drive), mirror_allowed=free
     )
     named = apply_convention(log, decision.convention)
-    if derived is not None and named is not log:
-        # it was made with wheels whose sides are exchanged, or run backwards
-        derived = _derived_heading(named, width_m)
-        named = derived.apply(named)
     if named is not log:
+        if derived is not None:
+            # it was made with wheels whose sides are exchanged, or run backwards
+            derived = _derived_heading(named, width_m)
+            named = derived.apply(named)
         drive = drive_arrays(named, None if derived is None else derived.smoothed)
         windows = cut_windows(drive)
     notes = [

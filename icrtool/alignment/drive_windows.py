@@ -31,8 +31,8 @@ UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be used instead."""
 
 
-CHORD_S = 2.0
-"""Without a heading, distances are compared over this time."""
+CHORD_S, LEAST_CHORD_M = 2.0, 0.3
+"""Without a heading, distances are compared over this time, and where the chord is so long [m]."""
 
 MOST_WHEEL_SAMPLES = 100_000
 """The samples of a longer drive are joined to about so many: 1 h at 28 Hz, where windows last seconds."""

@@ -24,6 +24,7 @@ import numpy as np
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
+from icrtool.records.measurements import RESPONSE_S
 
 NAMES = (
     "scale",
@@ -62,8 +63,8 @@ SMOOTH_S = 0.2
 OVERLAP = 1.0
 """Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
 
-RESPONSE_STD_S = 0.1 / math.sqrt(12.0)
-"""A robot lags its wheels by up to 0.1 s, which no drive separates from a delay of the streams."""
+RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
+"""No drive separates the response from a delay of the streams."""
 
 CLOCK_S_PER_M = 0.1
 """A body follows a change of speed later than a turn, which looks as if its position lagged its heading: in parts of b,
@@ -168,7 +169,7 @@ class AlignmentFit(NamedTuple):
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
-        turned = _Model(self.drive, self.windows, self.width_m).turned
+        turned = _turned(self.drive, self.windows)
         return float(self.fit.scale[-1]) / max(math.sqrt(float(np.mean(turned**2))), LEAST_TURN_RAD)
 
     @property
@@ -280,6 +281,12 @@ def _smooth(t: Floats, angle: Floats) -> Floats:
     return np.where(reach > 0.0, mean, angle)
 
 
+def _turned(drive: DriveArrays, windows: DriveWindows) -> Floats:
+    """Return the turn of the heading in each short window (m,) [rad]."""
+    begin, end = (np.interp(at, drive.heading_t, drive.heading) for at in (windows.turn_begin, windows.turn_end))
+    return np.asarray(end - begin)
+
+
 class _Model:
     """Residuals of the windows and their Jacobian."""
 
@@ -290,9 +297,7 @@ class _Model:
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
         self.smooth_heading = _smooth(drive.heading_t, drive.heading)
         self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
-        self.turned = np.interp(windows.turn_end, drive.heading_t, drive.heading) - np.interp(
-            windows.turn_begin, drive.heading_t, drive.heading
-        )
+        self.turned = _turned(drive, windows)
 
     def first_offset(self) -> float | None:
         """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""

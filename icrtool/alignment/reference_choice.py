@@ -82,7 +82,8 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     windows = cut_windows(drive, LENGTH_M)
     free = config.frames.heading == "auto"
     decision = decide_conventions(drive, windows, metric=log.datum is None and free, mirror_allowed=free)
-    found = estimate_alignment(drive_arrays(apply_convention(log, decision.convention)), windows, width)
+    named = apply_convention(log, decision.convention)
+    found = estimate_alignment(drive if named is log else drive_arrays(named), windows, width)
     if found is None:
         return NONE
     count = len(windows.begin)

@@ -90,10 +90,6 @@ class StreamDelays:
         """Return the heading's numbers for run.json."""
         return self.heading.summary() | {"applied_delay_s": self.applied_heading_s}
 
-    def gnss_summary(self) -> dict[str, Any]:
-        """Return the fixes' numbers for run.json; what was applied stands with the filter, as reference_delay_s."""
-        return self.gnss.summary()
-
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
     """Return the delays of heading and positions against the wheels, and which of them are corrected."""

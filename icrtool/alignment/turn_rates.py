@@ -10,13 +10,11 @@ from icrtool.alignment.courses import TurnRate, course_changes
 from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
 """Skid-steer robots turn about this much of what their wheels would without slip."""
-
-RESPONSE_S = 0.1
-"""How much later robots answer their wheels, on rigid-body simulated drives."""
 
 ALONG_AN_AXIS = 0.95
 """A sensor whose axis is this near to the vertical (cosine) is mounted along it."""

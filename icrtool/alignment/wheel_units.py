@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import CHORD_S, cut_chords, join_streams
+from icrtool.alignment.drive_windows import CHORD_S, LEAST_CHORD_M, cut_chords, join_streams
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -15,7 +15,6 @@ from icrtool.kernels.robust import mad_std
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 
-LEAST_MOVE_M = 0.3
 FEWEST_WINDOWS = 8
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
 """The distance by the position reference is compared with that of the wheels over spans of time: straight
@@ -144,7 +143,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     chords = cut_chords(join_streams(WheelSamples(stamps, left, right), gnss, nothing, same_clock=False))
     sides, chord = (np.abs(chords.left), np.abs(chords.right)), np.abs(chords.step)
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
-    usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_MOVE_M) & (distance > 0)
+    usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
     if np.count_nonzero(straight) < FEWEST_WINDOWS:
         bend = np.full(len(chord), np.inf)

@@ -103,8 +103,7 @@ def _fold_errors(
     path = predicted_path(recording, fitted, own, windows.steps.around(begin, finish))
     (theta, place), (turned, moved) = path(begin), path(finish)
     error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
-    row = np.searchsorted(recording.t_s, windows.knot_t)
-    turn = recording.drive.heading[row[e]] - recording.drive.heading[row[s]]
+    turn = windows.turned[some]
     columns = error.real, error.imag, turned - theta - turn, finish - begin, turn, windows.length_m[some]
     return np.column_stack(columns)
 

@@ -203,7 +203,6 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
         except DataError:
             continue
         begin, end = windows.knot_t[windows.start], windows.knot_t[windows.end]
-        turn = np.subtract(*(np.interp(at, recording.t_s, recording.drive.heading) for at in (end, begin)))
         tested = np.zeros(len(begin), np.bool_)
         for fold, some in left_out(table.folds, i, windows.start_m, windows.end_m):
             if (predicted := table.without(fold)) is None:
@@ -212,7 +211,8 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
             steps = windows.steps.around(begin[some], end[some])
             errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
             reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
-            found.append((windows.length_m[some], errors, errors.turned - turn[some], errors.moved - reference))
+            turn = errors.turned - windows.turned[some]
+            found.append((windows.length_m[some], errors, turn, errors.moved - reference))
             tested[some] = True
         for metres in LENGTHS_M:
             starts = windows.start_m[tested & (windows.length_m == metres)]

@@ -31,7 +31,7 @@ from icrtool.motion.models import (
     typical_drive,
     wheel_motion,
 )
-from icrtool.motion.recording import Recording, Steps, cut_windows, joined_steps
+from icrtool.motion.recording import Recording, Steps, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -141,6 +141,8 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
     folds : of `plan_folds`
     start_m, end_m : path lengths (k,) at the trials' starts and ends
     """
+    if not len(start_m):
+        return
     mine = [fold for fold in folds if fold.recording == recording]
     if mine[0].whole:
         yield mine[0], np.arange(len(start_m))
@@ -160,23 +162,23 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
 
 def errors_without(
     recording: Recording, trials: Trials, folds: Sequence[Fold], i: int, without: Callable[[Fold], Prediction | None],
-    steps: Steps | None = None,
+    steps: Steps,
 ) -> Floats:  # fmt: skip
     """Return the errors (k, h) [m] of trials of recording i, each predicted without its fold; NaN where that is none.
 
     Parameters
     ----------
     without : gives the model for a fold, None where too little is left to fit it
-    steps : the wheel samples joined; default single samples
+    steps : the wheel samples, joined or single
     """
     distance = recording.drive.distance
     errors: Floats = np.full(trials.ends.shape, np.nan)
     row, column = np.nonzero(trials.ends >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
-    joined, t = steps if steps is not None else joined_steps(recording, 1), recording.t_s
+    t = recording.t_s
     for fold, some in left_out(folds, i, distance[start], distance[end]):
         if (found := without(fold)) is not None:
-            path = predicted_path(recording, *found, joined.around(t[start[some]], t[end[some]]))
+            path = predicted_path(recording, *found, steps.around(t[start[some]], t[end[some]]))
             errors[row[some], column[some]] = trial_errors(recording, start[some], end[some], path)
     return errors
 
@@ -268,8 +270,11 @@ class _Tester:
         self._recordings, self._horizons_m = recordings, tuple(horizons_m)
         windows = [cut_windows(one, pooled=recordings) for one in recordings]
         self.pool = Pool(windows, [one.width_m for one in recordings])
-        for fold in self._folds:
-            if np.count_nonzero(self.pool.clear_of(fold)) < FEWEST_RESIDUALS:
+        self._clear = [self.pool.clear_of(fold) for fold in self._folds]
+        choosing = self.pool.length_m == CHOICE_HORIZON_M
+        self._tested = [np.flatnonzero(self.pool.within(fold) & choosing) for fold in self._folds]
+        for fold, clear in zip(self._folds, self._clear, strict=True):
+            if np.count_nonzero(clear) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
         self._trials = [cut_trials(one, horizons_m) for one in recordings] if len(horizons_m) else []
@@ -293,24 +298,15 @@ class _Tester:
 
     def _inner_errors(self, fit: PooledFit) -> Floats:
         """Return the expected error [m] (folds, folds) of the windows of fold g, fitted without f and g."""
-        count, clear = len(self._folds), [self.pool.clear_of(fold) for fold in self._folds]
+        count, clear, tested = len(self._folds), self._clear, self._tested
         inner = np.full((count, count), np.nan)
         for f in range(count):
             for g in range(f, count):
                 if f == g or count >= FEWEST_TO_CHOOSE:
                     x = fit.nearly_without(~(clear[f] & clear[g]))
-                    inner[f, g] = self._window_error(fit, self._folds[g], x)
-                    inner[g, f] = self._window_error(fit, self._folds[f], x)
+                    inner[f, g] = _window_error(fit, tested[g], x)
+                    inner[g, f] = _window_error(fit, tested[f], x)
         return inner
-
-    def _window_error(self, fit: PooledFit, fold: Fold, x: Floats) -> float:
-        """Return the expected error [m] of a fold's windows of `CHOICE_HORIZON_M`, for all parameters x near a fit."""
-        at, rows = fit.solution, self.pool.within(fold) & (self.pool.length_m == CHOICE_HORIZON_M)
-        residuals = at.residuals[rows] + at.jacobian[rows] @ (x - at.x)
-        half = len(residuals) // 2
-        if not half:
-            return float("nan")
-        return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
     def table(self, tested: Sequence[_Tested], choice: Choice) -> HeldOut:
         """Return the table of models that were tested in the same trials."""
@@ -345,6 +341,16 @@ class _Tester:
         last = np.cumsum([len(trials.starts) for trials in self._trials])
         for trials, some in zip(self._trials, np.split(errors, last[:-1]), strict=True):
             yield Trials(trials.starts, np.where(np.isfinite(some), trials.ends, -1))
+
+
+def _window_error(fit: PooledFit, rows: Ints, x: Floats) -> float:
+    """Return the expected error [m] of windows of `CHOICE_HORIZON_M`, by rows, for all parameters x near a fit."""
+    at = fit.solution
+    residuals = at.residuals[rows] + at.jacobian[rows] @ (x - at.x)
+    half = len(residuals) // 2
+    if not half:
+        return float("nan")
+    return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
 
 
 def _over(function: Callable[[Floats], Any], folds: Sequence[Summary], column: str, h: int) -> float:

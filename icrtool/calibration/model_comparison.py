@@ -30,6 +30,8 @@ from icrtool.records.run import Run, half_width_m
 FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
 """Names of the table's rows (public) and of the models of the family that they are."""
 
+ROWS = {of: row for row, of in FAMILY.items()}
+
 MODELS = ("no_slip", "multiplier", "icr", "icr_final", "window", "extended")
 """In the order of the table. Each but the multiplier may come again with a measured heading, ``_gyro`` or ``_heading``
 behind its name."""
@@ -109,7 +111,7 @@ def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> Compar
     filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
     recording, heading, notes = _with_heading(run, headings)
-    wheels, turned = hold_out([recording], horizons_m=HORIZONS_M)
+    wheels, turned = hold_out([recording])
     (trials,) = wheels.trials
     scores = list(_wheels_scores(run, recording, trials, wheels))
     if turned is not None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
+from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import Run
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
@@ -60,8 +61,6 @@ STEADY = 0.15
 """A speed is steady where its standard deviation is less than this share of its mean."""
 
 MOVING_MPS = 0.05
-RESPONSE_S = 0.1
-"""A robot's own response to its wheels looks like a delay of up to this [s]."""
 
 SETTING_SIGMAS = 3.0
 

@@ -127,7 +127,7 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]
 
 
 def calibrate(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
-    """Fit every model to all recordings, test each without a recording or block in turn, recommend one.
+    """Fit every model to all recordings, test each on what it was not fitted to, recommend one.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Command
+from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Command, add_options
 
 PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
@@ -99,15 +99,15 @@ def drive_options(**defaults: object) -> Callable[[Command], Command]:
 
     def add(command: Command) -> Command:
         text = "The ICRs become these after T seconds; repeatable."
-        command = click.option("--change", "changes", metavar="T:YR,YL,X", type=change_text, multiple=True, help=text)(
-            command
-        )
-        for name, (field, metavar, kind, text) in reversed(OPTIONS.items()):
-            default = defaults.get(field)
-            command = click.option(
-                name, field, metavar=metavar, type=kind, default=default, show_default=default is not None, help=text
-            )(command)
-        return command
+        change = click.option("--change", "changes", metavar="T:YR,YL,X", type=change_text, multiple=True, help=text)
+        fields = [
+            click.option(
+                name, field, metavar=metavar, type=kind, default=defaults.get(field),
+                show_default=defaults.get(field) is not None, help=text,
+            )
+            for name, (field, metavar, kind, text) in OPTIONS.items()
+        ]  # fmt: skip
+        return add_options(command, *fields, change)
 
     return add
 

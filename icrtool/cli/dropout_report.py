@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -256,7 +255,7 @@ def _read(directory: Path) -> Run:
 
 def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
     """Compute the report of a run and write it."""
-    from icrtool.dropout_analysis.dropout_report import dropout_report, forced_lengths_s
+    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
     from icrtool.fleet.fit_and_report import report_and_write
 
     dropout, given = request.config.dropout, request.config.given
@@ -268,7 +267,7 @@ def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
     with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
         report = report_and_write(
             run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
-            analyse=partial(dropout_report, horizons_m=horizons, outage_s=outages, **request.further),
+            further={**request.further, "horizons_m": horizons, "outage_s": outages},
         )  # fmt: skip
     if baseline is not None:
         options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)

@@ -35,8 +35,6 @@ LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LO
 
 FILE = click.Path(path_type=Path)
 
-PLOT_FORMATS = ("png", "svg", "pdf")
-
 
 def configuration(command: Command) -> Command:
     """Add --config, --robot and --set."""
@@ -47,10 +45,10 @@ def configuration(command: Command) -> Command:
         click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
                      help="Set a configuration key; icrtool config lists them; repeatable."),
     )  # fmt: skip
-    return _with(command, *options)
+    return add_options(command, *options)
 
 
-def _with(command: Command, *options: Callable[[Command], Command]) -> Command:
+def add_options(command: Command, *options: Callable[[Command], Command]) -> Command:
     """Add options to a command, in this order."""
     for option in reversed(options):
         command = option(command)
@@ -71,7 +69,7 @@ def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 
 def place(command: Command) -> Command:
     """Add -o, --into and --overwrite, as `output`, `into` and `overwrite`."""
-    return _with(
+    return add_options(
         command,
         click.option("-o", "--output", metavar="DIR", type=FILE,
                      help="Run directory of a log; of several logs: its parent."),
@@ -91,6 +89,8 @@ def plot_formats(text: str) -> tuple[str, ...]:
     formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
     if formats == ("none",):
         return ()
+    from icrtool.output.run_directory import PLOT_FORMATS
+
     unknown = [part for part in formats if part not in PLOT_FORMATS]
     if unknown or not formats:
         raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(PLOT_FORMATS)}, none")
@@ -130,7 +130,7 @@ def report(command: Command) -> Command:
         asked = ReportOptions(plots, gates, budgets, ladder, strict, page)
         return command(asked=asked, junit=junit, markdown=markdown, **others)
 
-    return _with(
+    return add_options(
         cast("Command", with_options),
         budgets,
         click.option("--gate", "gates", metavar="TEXT", multiple=True,
@@ -178,7 +178,7 @@ def check_compared(verdicts: Iterable[Verdict]) -> None:
 def cut(command: Command) -> Command:
     """Add --from and --to, as `start` and `end`."""
     what = "seconds since the log's first message, or a time in ISO 8601 (UTC without a zone)"
-    return _with(
+    return add_options(
         command,
         click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}."),
         click.option("--to", "end", metavar="TIME", help="Read the log up to here."),
@@ -192,7 +192,7 @@ def quiet(command: Command) -> Command:
 
 def verbosity(command: Command) -> Command:
     """Add -q and -v."""
-    return _with(
+    return add_options(
         command,
         click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings."),
         click.option("-v", "--verbose", is_flag=True, help="Print more details."),

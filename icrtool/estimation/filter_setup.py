@@ -15,7 +15,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter_records import FilterParameters, Measurements
 from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import IcrStart, SensorData
+from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
 
 
@@ -65,8 +65,8 @@ TURN_WANDER_RAD = math.radians(1.2)
 """How far a body turns more or less than its wheels show, a random walk [rad/sqrt(s)]: the errors of an attitude
 sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow it."""
 
-RESPONSE_S, CHANGE_S = 0.1, 0.5
-"""Rigid-body simulated robots answer their wheels by up to this much later; a change of the turn rate takes so long."""
+CHANGE_S = 0.5
+"""A change of the turn rate takes so long."""
 
 MEMORY_S = 0.5
 """Estimated headings of 0.1 deg are averaged over this time: followed sample by sample, they teach the ICRs of the
@@ -320,11 +320,6 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
 
 
-def _travel_difference(data: Measurements) -> Floats:
-    """Return how much further the left side has travelled than the right, since the first sample (n,) [m]."""
-    return np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(data.wheel_t))])
-
-
 def _response_variance(data: Measurements, width_m: float) -> Floats:
     """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
 
@@ -332,7 +327,8 @@ def _response_variance(data: Measurements, width_m: float) -> Floats:
     heading by up to `RESPONSE_S` times that change. Within a change these errors have one sign, so that white noise as
     large as a step's own error would leave most of it to the ICRs. `width_m` is the ICRs' separation.
     """
-    t, turned = data.wheel_t, _travel_difference(data) / width_m
+    t = data.wheel_t
+    turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
     before, now, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, 0.0, CHANGE_S))
     change = (after - 2.0 * now + before) / CHANGE_S
     return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,8 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
+from icrtool.records.run_document import Excited
 from icrtool.records.tables import States
-
-Excited = Literal["shown", "weak", "not shown"]
 
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
 

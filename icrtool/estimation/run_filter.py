@@ -24,7 +24,7 @@ from icrtool.kernels.ekf_step import PLACES
 from icrtool.kernels.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
-from icrtool.records.samples import HeadingSamples, WheelSamples
+from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import States
 
 OUTAGE_S = 2.0
@@ -105,8 +105,7 @@ def run_filter(
         sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
         output.heading_innovation,
     )  # fmt: skip
-    if sensors.heading_is_estimated:
-        table = carry_headings(table, sensors.headings, heading.used)
+    table = carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
         table=table,
@@ -178,13 +177,14 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
     )
 
 
-def carry_headings(table: States, headings: HeadingSamples, used: Bools) -> States:
-    """Return states with the estimated headings (h,), where they are `used` (h,), carried on by the wheels' turn.
+def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
+    """Return states with the headings (h,), where they are estimated and `used` (h,), carried on by the wheels' turn.
 
     The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
     """
-    if not used.any():
+    if not (sensors.heading_is_estimated and used.any()):
         return table
+    headings = sensors.headings
     stamps, psi = headings.stamp_ns[used], table.heading_rad
     t, seen = ((one - table.stamp_ns[0]) / 1e9 for one in (table.stamp_ns, stamps))
     last = np.searchsorted(seen, t, side="right") - 1

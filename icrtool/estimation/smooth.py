@@ -40,7 +40,7 @@ def smooth(run: Run) -> States:
         columns[f"std_{name}"] = np.ascontiguousarray(std[:, i])
     kept = {field.name: getattr(run.table, field.name) for field in fields(States) if field.name not in columns}
     table = States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
-    return carry_headings(table, run.sensors.headings, run.heading.used) if run.sensors.heading_is_estimated else table
+    return carry_headings(table, run.sensors, run.heading.used)
 
 
 def _distance(run: Run, x: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
@@ -20,11 +21,11 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import RECOVERED
-from icrtool.records.events import EVENT_COLUMNS, SlipEvent
+from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive
-from icrtool.records.run_document import IcrColumn, RunDocument
+from icrtool.records.run_document import EVENT_COLUMNS, IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
 
@@ -73,7 +74,7 @@ def summarise(
             "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": _warnings(measurements, filtered, config, multiplier, excitation),
+            "warnings": _warnings(measurements, filtered, config, multiplier, excitation, changes_s),
             "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
@@ -104,8 +105,9 @@ def summarise(
 
 
 def _warnings(
-    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation
-) -> list[str]:
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation,
+    changes_s: Sequence[float],
+) -> list[str]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found."""
     name, table = filtered.sensors.name, filtered.table
     end_s = float(table.t_s[-1])
@@ -116,7 +118,7 @@ def _warnings(
         *(
             f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
             for t in filtered.changes_s
-            if not 0.0 < t < end_s
+            if t not in changes_s
         ),
         *noise_warnings(name, config, filtered.noise),
         *(f"{name}: {sentence}" for sentence in excitation.sentences),

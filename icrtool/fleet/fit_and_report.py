@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -89,7 +89,7 @@ def report_and_write(
     begin: Stage,
     *,
     baseline: BaselineReport | None,
-    analyse: Callable[..., DropoutReport] | None = None,
+    further: Mapping[str, Any] | None = None,
     trials: bool = False,
 ) -> DropoutReport:
     """Analyse a run and write its dropout report, and its page, into its directory.
@@ -97,7 +97,7 @@ def report_and_write(
     Parameters
     ----------
     baseline : earlier report of the same log
-    analyse : `icrtool.dropout_report`, or that with further arguments bound
+    further : arguments of `icrtool.dropout_report`
     trials : write every single trial to trials.parquet
     """
     from icrtool.dropout_analysis.dropout_report import dropout_report
@@ -106,9 +106,9 @@ def report_and_write(
 
     def analysed(sink: ErrorSink | None) -> DropoutReport:
         begin("dropout analysis")
-        report = (analyse or dropout_report)(
+        report = dropout_report(
             run, budgets_m=options.budgets_m, gates=options.gates, comparison=options.ladder, baseline=baseline,
-            strict=options.strict, sink=sink,
+            strict=options.strict, sink=sink, **(further or {}),
         )  # fmt: skip
         begin("dropout report, pictures" if options.plots else "dropout report")
         return report

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -59,10 +58,14 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line of a manifest: the files and folders that its pattern matches, and what holds for them."""
+    """One line of a manifest: the files and folders that its pattern matches, and what holds for them.
+
+    `targets` are the places with links followed.
+    """
 
     places: tuple[Path, ...]
     about: About
+    targets: frozenset[Path]
 
 
 def is_manifest(path: Path) -> bool:
@@ -100,14 +103,9 @@ def about(path: Path, entries: Sequence[Entry]) -> About:
     whole = path.resolve()
     around = {whole, *whole.parents}
     for entry in entries:
-        if not around.isdisjoint(map(_resolved, entry.places)):
+        if not around.isdisjoint(entry.targets):
             found = found.updated(entry.about)
     return found
-
-
-@cache
-def _resolved(place: Path) -> Path:
-    return place.resolve()
 
 
 def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
@@ -137,7 +135,9 @@ def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
         what = f"each line has a log or a pattern, and texts; of {', '.join(COLUMNS)}"
         raise ConfigError(f"{path}: log", what, str(err)) from err
     config = path.parent / line.config.strip() if line.config.strip() else None
-    return Entry(_matching(path, line.log), About(line.robot.strip(), config, line.group.strip(), tuple(line.tags)))
+    about = About(line.robot.strip(), config, line.group.strip(), tuple(line.tags))
+    places = _matching(path, line.log)
+    return Entry(places, about, frozenset(place.resolve() for place in places))
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:

@@ -17,7 +17,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions, Stage, fit_and_write, report_and_write
 from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
-from icrtool.logs.containers.split_files import files_of_log
+from icrtool.logs.containers.split_files import file_sha256, files_of_log
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
 
@@ -100,14 +100,11 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
 
 def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File, ...]:
     """Return the files of a log with their sha256; those in `hashes`, by path, are not read again."""
-    import hashlib
-
     found = []
     for file in files_of_log(path):
         digest = (hashes or {}).get(str(file))
         if digest is None:
-            with file.open("rb") as stream:
-                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest = file_sha256(file)
         status = file.stat()
         found.append(File(as_text(file), status.st_size, status.st_mtime_ns, digest))
     return tuple(found)

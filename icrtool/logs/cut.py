@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from icrtool.errors import DataError, LogError
 from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Container, Cut
+from icrtool.records.samples import Samples
 from icrtool.records.tables import RobotLog
 
 PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
@@ -89,7 +90,7 @@ def longest_part(log: RobotLog) -> RobotLog:
     begins = np.append(0, ends[:-1] + 1)
     positions = np.searchsorted(fixes, stamps[ends], side="right") - np.searchsorted(fixes, stamps[begins])
     longest = int(np.argmax((ends - begins) * (positions > 1)))
-    parts = {}
+    parts: dict[str, Any] = {}
     for role, margin_s in (("wheels", 0.0), ("gnss", LONGEST_PAUSE_S), ("heading", LONGEST_PAUSE_S)):
         margin_ns = int(margin_s * 1e9)
         first, last = stamps[begins[longest]] - margin_ns, stamps[ends[longest]] + margin_ns
@@ -110,14 +111,10 @@ def longest_part(log: RobotLog) -> RobotLog:
     return replace(log, warnings=tuple(warnings), **parts)
 
 
-def _between(samples: Any, begin_ns: int, end_ns: int) -> Any:  # noqa: ANN401 - samples of any sensor
+def _between(samples: Samples, begin_ns: int, end_ns: int) -> Samples:
     """Return the samples with stamps in [begin_ns, end_ns]."""
     inside = (samples.stamp_ns >= begin_ns) & (samples.stamp_ns <= end_ns)
-    if inside.all():
-        return samples
-    columns = {field.name: getattr(samples, field.name) for field in fields(samples)}
-    rows = {name: column[inside] for name, column in columns.items() if isinstance(column, np.ndarray)}
-    return replace(samples, **rows)
+    return samples if inside.all() else samples.cut(inside)
 
 
 def _first_ns(container: Container) -> int:

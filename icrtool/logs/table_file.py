@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from icrtool.errors import LogError
+from icrtool.logs.containers.split_files import file_sha256
 from icrtool.logs.cut import Moment, longest_part, moment, nanoseconds
 from icrtool.records.samples import InputFile
 from icrtool.records.tables import RobotLog
@@ -63,8 +63,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
 
     begin, stop = moment(start, "start"), moment(end, "end")
     try:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest = file_sha256(path)
         table = csv_frame(path)
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err

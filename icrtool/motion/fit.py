@@ -273,11 +273,12 @@ class Pool:
         parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)]
         k, own = len(model.terms), len(constant_std(model))
         mean, std = self.prior(model)
+        edges = np.searchsorted(self.recording, np.arange(len(parts) + 1)).tolist()
 
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
             residuals, jacobian = np.empty(len(self.group)), np.zeros((len(self.group), len(x)))
             for i, part in enumerate(parts):
-                rows, columns = self.recording == i, slice(k + own * i, k + own * (i + 1))
+                rows, columns = slice(edges[i], edges[i + 1]), slice(k + own * i, k + own * (i + 1))
                 residuals[rows], by = part(x[:k], x[columns])
                 jacobian[rows, :k], jacobian[rows, columns] = by[:, :k], by[:, k:]
             return residuals, jacobian

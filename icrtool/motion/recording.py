@@ -153,6 +153,7 @@ class Windows(NamedTuple):
     start, end : (w,) rows of `knot_t`
     start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
     reference : complex (w,), displacement forward + j right in the body frame of the start [m]
+    turned : (w,) turn of the reference [rad]
     """
 
     steps: Steps
@@ -163,6 +164,7 @@ class Windows(NamedTuple):
     end_m: Floats
     length_m: Floats
     reference: Complexes
+    turned: Floats
 
 
 def cut_windows(
@@ -202,6 +204,7 @@ def cut_windows(
         end_m=drive.distance[end],
         length_m=np.asarray(lengths_m, np.float64)[column],
         reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
+        turned=drive.heading[end] - drive.heading[start],
     )
 
 

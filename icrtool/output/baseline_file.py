@@ -36,14 +36,19 @@ class Baseline:
     ----------
     path : as it was named
     reports : report.json by name of the log
-    sha256 : of each log's files, where it is known without reading the report
-    digest : changes with the content
+    sha256 : of each log's files
+    sources : the files that name the reports: fleet.json of a batch, else the reports
     """
 
     path: Path
     reports: Mapping[str, Path]
     sha256: Mapping[str, tuple[str, ...]]
-    digest: str
+    sources: tuple[Path, ...]
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        return sha256(b"".join(file.read_bytes() for file in self.sources)).hexdigest()
 
     def missing(self, logs: Iterable[str]) -> list[str]:
         """Return the logs of the baseline that are not among some others, by name."""
@@ -74,6 +79,8 @@ def open_baseline(path: Path) -> Baseline:
     ------
     ConfigError
         There is none, or one cannot be read.
+    RunError
+        The fleet.json of a batch cannot be read.
     """
     if not path.is_file() and (path / FLEET_FILE).is_file():
         return _fleet_baseline(path)
@@ -87,8 +94,7 @@ def open_baseline(path: Path) -> Baseline:
         reports[one.log], files[one.log] = file, one.sha256
     if not reports:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
-    digest = sha256(b"".join(file.read_bytes() for file in reports.values())).hexdigest()
-    return Baseline(path, reports, files, digest)
+    return Baseline(path, reports, files, tuple(reports.values()))
 
 
 def read_report(path: Path, log: str = "") -> BaselineReport:
@@ -157,8 +163,7 @@ def _fleet_baseline(path: Path) -> Baseline:
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
     files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
-    digest = sha256((path / FLEET_FILE).read_bytes()).hexdigest()
-    return Baseline(path, {log: file for log, (file, _) in present.items()}, files, digest)
+    return Baseline(path, {log: file for log, (file, _) in present.items()}, files, (path / FLEET_FILE,))
 
 
 def _report_files(path: Path) -> list[Path]:

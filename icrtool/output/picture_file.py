@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from icrtool.errors import OutputError
-from icrtool.output.atomic_file import atomic_file, check_place
+from icrtool.output.atomic_file import check_place, write_file
 from icrtool.output.run_directory import PLOT_FORMATS
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ def save_picture(figure: Figure, file: Path) -> None:
         The file cannot be written.
     """
     form = file.suffix.removeprefix(".").lower()
-    from icrtool.output.figures.style import save
+    from icrtool.output.figures.style import picture_bytes
 
-    with atomic_file(file) as partial:
-        save(figure, partial.with_suffix(""), (form,))
+    write_file(file, picture_bytes(figure, form))

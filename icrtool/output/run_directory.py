@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -11,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from icrtool.errors import OutputError
-from icrtool.logs.containers.split_files import files_of_log
+from icrtool.logs.containers.split_files import file_sha256, files_of_log
 from icrtool.output.atomic_directory import atomic_directory, check_directory
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes, schema_of
 from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.own_files import made_from
 from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
-from icrtool.records.events import EVENT_COLUMNS
 from icrtool.records.run import Run
+from icrtool.records.run_document import EVENT_COLUMNS
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -75,12 +74,6 @@ def _is_made_from(directory: Path, log: Path) -> bool:
         any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)
         for one in inputs
     )
-
-
-def file_sha256(file: Path) -> str:
-    """Return the SHA-256 of a file (hex)."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_run(

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
+MODEL_WORDS = {"icr": "ICR", "no_slip": "no slip"}
+
 FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
 """What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
 

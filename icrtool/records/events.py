@@ -8,12 +8,6 @@ SlipKind = Literal["immobilised", "slip", "skid", "spin"]
 """Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
 
 
-EVENT_COLUMNS = (
-    "kind", "begin_s", "end_s", "begin_ns", "end_ns", "north_m", "east_m", "distance_m", "severity", "confidence",
-)  # fmt: skip
-"""The columns of events.csv; seconds count from the first recorded state."""
-
-
 class SlipEvent(NamedTuple):
     """One span in which the robot did not do what its wheels did.
 

@@ -11,6 +11,9 @@ from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.events import SlipEvent
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
+RESPONSE_S = 0.1
+"""A robot answers its wheels by up to so much later, on rigid-body simulated drives."""
+
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
 

@@ -9,8 +9,10 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 
+from icrtool.records.events import SlipKind
 from icrtool.records.samples import Role
 
+Excited = Literal["shown", "weak", "not shown"]
 IcrColumn = Literal["y_icr_right_m", "y_icr_left_m", "x_icr_m"]
 Spans = list[tuple[int, int]]
 Triple = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
@@ -113,7 +115,7 @@ class SegmentDocument(TypedDict):
 class EventDocument(TypedDict):
     """A slip event."""
 
-    kind: Literal["immobilised", "slip", "skid", "spin"]
+    kind: SlipKind
     begin_s: float
     end_s: float
     begin_ns: int
@@ -123,6 +125,10 @@ class EventDocument(TypedDict):
     distance_m: float
     severity: float
     confidence: float
+
+
+EVENT_COLUMNS = tuple(EventDocument.__annotations__)
+"""The columns of events.csv; seconds count from the first recorded state."""
 
 
 class ClassDocument(TypedDict):
@@ -214,9 +220,9 @@ class FilterDocument(TypedDict):
 class VerdictsByIcr(TypedDict):
     """Whether each ICR was shown."""
 
-    y_icr_right_m: Literal["shown", "weak", "not shown"]
-    y_icr_left_m: Literal["shown", "weak", "not shown"]
-    x_icr_m: Literal["shown", "weak", "not shown"]
+    y_icr_right_m: Excited
+    y_icr_left_m: Excited
+    x_icr_m: Excited
 
 
 class ExcitationDocument(TypedDict):

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Bytes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 
 Role = Literal["wheels", "gnss", "heading"]
 
@@ -33,7 +33,7 @@ class Samples:
         if any(length != len(self.stamp_ns) for length in lengths.values()):
             raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(self.stamp_ns)}")
 
-    def cut(self, rows: slice) -> Self:
+    def cut(self, rows: slice | Bools) -> Self:
         """Return the samples of some rows."""
         part: Self = replace(cast(Any, self), **{name: column[rows] for name, column in self._columns().items()})
         return part

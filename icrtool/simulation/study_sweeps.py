@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -42,10 +42,9 @@ Value = TypeVar("Value", bound=float | str)
 
 
 def levels_of(
-    request: StudyRequest, values: Iterable[Value], change: Callable[[Scenario, Value], Scenario]
+    request: StudyRequest, values: Collection[Value], change: Callable[[Scenario, Value], Scenario]
 ) -> list[Level]:
     """Return a level for each preset and value, with what `change` makes of the preset's scenario."""
-    values = tuple(values)
     return [
         Level(preset, value, change(base_scenario(request, preset), value))
         for preset in request.presets

@@ -288,7 +288,7 @@ def mcap_bombs() -> dict[str, bytes]:
         "chunk of 4 GB that claims 128 MB": mcap_of(Chunk("zstd", rle_bomb(4000), 0, 0, 0, 1 << 27)),
         "chunk that claims 1 TB": mcap_of(Chunk("zstd", rle_bomb(1), 0, 0, 0, 1 << 40)),
         "lz4 chunk that claims 128 MB": mcap_of(Chunk("lz4", b"\x04\x22\x4d\x18" + bytes(99), 0, 0, 0, 1 << 27)),
-        "many chunks that claim 256 MB": mcap_of(*[Chunk("zstd", rle_bomb(1), 0, 0, 0, 1 << 27)] * 40),
+        "many chunks that claim 128 MB": mcap_of(*[Chunk("zstd", rle_bomb(1), 0, 0, 0, 1 << 27)] * 40),
         "messages of nothing": mcap_of(small.end() * 20),
         **{f"record {op} of 2^{power}": mcap_of(claim(op, 1 << power)) for op in (3, 5, 6, 9) for power in (40, 62)},
         "statistics of 4 GB": mcap_of() + bytes(lie) + footer(summary),

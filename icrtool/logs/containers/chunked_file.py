@@ -80,6 +80,18 @@ class ChunkedFile(ABC):
         """Yield the messages of the wanted channels, chunk by chunk."""
         if wanted:
             yield from self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
+            self._free()
+
+    def _learn_all(self) -> None:
+        """Read a file without an index for what its records state about channels."""
+        for _ in self._read_in_order(learn=True):
+            pass
+        self._free()
+
+    def _free(self) -> None:
+        """Give back the memory of chunks: a directory holds many files open."""
+        self._space.free()
+        self._inflation.free()
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -95,7 +107,10 @@ class ChunkedFile(ABC):
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
     def _read(self, at: int, length: int) -> memoryview:
-        """Return bytes of the file, valid until the next call."""
+        """Return bytes of the file, as many as there are, valid until the next call."""
+        length = min(length, self._size - at)
+        if length <= 0:
+            return memoryview(b"")
         self._stream.seek(at)
         space = self._space.of(length).data
         return space[: self._stream.readinto(space)]

@@ -41,6 +41,10 @@ class Space:
             self._bytes = np.empty(size, np.uint8)
         return self._bytes[:size]
 
+    def free(self) -> None:
+        """Give the memory back."""
+        self._bytes = np.empty(0, np.uint8)
+
 
 class Inflation:
     """Decompresses the chunks of a log, and limits them all to a multiple of their size in the file."""
@@ -89,6 +93,10 @@ class Inflation:
             raise DecompressionError(f"{len(out)} bytes instead of {size}")
         out.flags.writeable = False  # as that of a database: the kernels are compiled once
         return out
+
+    def free(self) -> None:
+        """Give the memory of chunks back."""
+        self._space.free()
 
     def _zstd(self, data: bytes | memoryview, size: int, *, partial: bool) -> Bytes:
         import zstandard

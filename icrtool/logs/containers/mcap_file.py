@@ -97,8 +97,7 @@ class McapFile(ChunkedFile):
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
             self._chunks: list[_Chunk] | None = self._read_index()
             if self._chunks is None:
-                for _ in self._read_in_order(learn=True):
-                    pass
+                self._learn_all()
         except BaseException:
             self.close()
             raise
@@ -113,17 +112,22 @@ class McapFile(ChunkedFile):
 
     def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         small: list[Block] = []
+        held = 0
         for chunk in self._chunks or ():
             if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
                 needed = self._needed(chunk, wanted)
                 part = self._read_part(chunk, needed) if needed is not None else None
-                if part is not None:
+                is_small = part is not None and len(part.data) <= JOINED_BYTES
+                if part is not None and is_small:
                     small.append(part._replace(data=part.data.copy()))
-                if small and (part is None or sum(len(one.data) for one in small) > JOINED_BYTES):
+                    held += len(part.data)
+                if small and (not is_small or held > JOINED_BYTES):
                     yield joined(small)
-                    small = []
+                    small, held = [], 0
                 if part is None:
                     yield from self._read_chunk(chunk)
+                elif not is_small:
+                    yield part
         if small:
             yield joined(small)
 
@@ -147,9 +151,8 @@ class McapFile(ChunkedFile):
         order = np.argsort(begin)
         edges = np.append(begin[order], chunk.size)
         places = np.column_stack([edges[:-1], edges[1:]])[np.concatenate(flags)[order]]
-        sizes = places[:, 1] - places[:, 0]
-        sound = edges[0] >= 0 and sizes.min(initial=1) > 0
-        return places if sound and sizes.sum() < SMALL_PART * chunk.size else None
+        sound = len(places) and edges[0] >= 0 and np.diff(edges).min() > 0
+        return places if sound and np.diff(places).sum() < SMALL_PART * chunk.size else None
 
     def _read_part(self, chunk: _Chunk, places: Ints) -> Block | None:
         """Return the messages at some places of a chunk; None where all of it has to be read for them.

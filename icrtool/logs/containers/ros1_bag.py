@@ -71,8 +71,7 @@ class Ros1Bag(ChunkedFile):
             self._chunks: list[_Chunk] | None = self._read_index()
             if self._chunks is None:
                 self.problems.add("has no index (not closed, or cut off); read from start to end")
-                for _ in self._read_in_order(learn=True):
-                    pass
+                self._learn_all()
         except BaseException:
             self.close()
             raise

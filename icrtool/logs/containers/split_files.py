@@ -91,3 +91,11 @@ def log_name(path: Path) -> str:
     named = Path(os.path.normpath((files[0] if files else path).absolute()))
     name = named.name if named.is_dir() else named.stem
     return name if name.strip(".") else "log"
+
+
+def file_sha256(file: Path) -> str:
+    """Return the SHA-256 of a file (hex)."""
+    import hashlib
+
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

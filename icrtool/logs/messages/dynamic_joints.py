@@ -19,7 +19,7 @@ from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
-from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables, set_back
+from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables, time_order
 from icrtool.records.text import LogText
 
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
@@ -104,7 +104,7 @@ class DynamicJointCollector:
         topic, message_type = self._channel.topic, self._channel.message_type
         nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
         merged = merge_tables([nothing, *self._tables])[0]
-        return replace(merged, set_back=set_back(np.concatenate(self._times or [nothing.log_time_ns])))
+        return replace(merged, set_back=time_order(np.concatenate(self._times or [nothing.log_time_ns]))[0])
 
     def _collector(self, joints: int) -> TopicCollector:
         if joints not in self._collectors:

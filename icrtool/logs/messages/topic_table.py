@@ -298,8 +298,7 @@ class TopicCollector:
         self._settle()
         times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
         self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
-        back = set_back(times)
-        order = np.argsort(times, kind="stable") if back.step_ns > 0 else None
+        back, order = time_order(times)
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path in [*gathered]:
@@ -319,15 +318,18 @@ class TopicCollector:
         )
 
 
-def set_back(times: Ints) -> SetBack:
-    """Return how stored log times (n,) go back, and what sorting them does to the stretches between."""
+def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
+    """Return how stored log times (n,) go back and what sorting does to the stretches between, and the order (n,).
+
+    The order is None where they do not go back.
+    """
     steps = np.diff(times)
     if not (steps < 0).any():
-        return NOT_SET_BACK
+        return NOT_SET_BACK, None
     order = np.argsort(times, kind="stable")
     stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
-    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1)))
+    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1))), order
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:

@@ -93,7 +93,7 @@ def _matrix(q: Floats) -> Floats:
 
 
 def _in_roots(transforms: Transforms) -> Transforms:
-    """Return each frame's root, and its origin and axes in it; in a circle of frames one of them is the root."""
+    """Return each frame's root, and its origin and axes in it; a frame in a circle of frames is its own root."""
     placed: Transforms = {}
     for name in transforms:
         chain: dict[str, None] = {}
@@ -101,8 +101,13 @@ def _in_roots(transforms: Transforms) -> Transforms:
         while frame in transforms and frame not in placed and frame not in chain:
             chain[frame] = None
             frame = transforms[frame][0]
+        below = list(chain)
+        if frame in chain:
+            circle = below.index(frame)
+            placed |= {one: (one, np.zeros(3), np.eye(3)) for one in below[circle:]}
+            del below[circle:]
         root, origin, rotation = placed.setdefault(frame, (frame, np.zeros(3), np.eye(3)))
-        for one in reversed(chain):
+        for one in reversed(below):
             _, translation, turn = transforms[one]
             origin, rotation = rotation @ translation + origin, rotation @ turn
             placed[one] = (root, origin, rotation)

@@ -12,7 +12,6 @@ from icrtool.output.figures.style import (
     ICR,
     LABEL_BOX,
     MEAN,
-    MODEL_WORDS,
     NO_SLIP,
     Pen,
     add_legend,
@@ -20,7 +19,7 @@ from icrtool.output.figures.style import (
     new_figure,
     styled,
 )
-from icrtool.output.text_format import metres_text, run_title
+from icrtool.output.text_format import MODEL_WORDS, metres_text, run_title
 from icrtool.records.dropout import ModelResult
 
 if TYPE_CHECKING:

@@ -20,7 +20,6 @@ from icrtool.output.figures.style import (
     FORCED,
     ICR,
     LABEL_BOX,
-    MODEL_WORDS,
     NO_SLIP,
     REAL,
     WIDTH_IN,
@@ -30,7 +29,7 @@ from icrtool.output.figures.style import (
     spot,
     styled,
 )
-from icrtool.output.text_format import duration_text, metres_text, run_title
+from icrtool.output.text_format import MODEL_WORDS, duration_text, metres_text, run_title
 from icrtool.records.dropout import ExampleTrial, Outage
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, shortened, styled
+from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, styled
+from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.kernels.arrays import Floats
-from icrtool.records.text import escaped
+from icrtool.records.text import escaped, shortened
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -111,7 +111,6 @@ ICR_LOOKS: dict[str, dict[str, Any]] = {
 }
 """Of the three ICRs where they share a panel, by `icrtool.simulation.study_measures.ICR_NAMES`."""
 
-MODEL_WORDS = {"icr": "ICR", "no_slip": "no slip"}
 
 LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
 """Behind text that lies on lines."""
@@ -164,11 +163,6 @@ def new_figure(
     return figure
 
 
-def shortened(text: str, most: int) -> str:
-    """Return a text of so many characters at most, its middle left out: names differ at their ends."""
-    return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most - most // 2 - 1) :]}"
-
-
 def add_legend(figure: Figure, **layout: Any) -> None:
     """Add a legend below all axes with each label once; in one row where `layout` has no number of columns."""
     found: dict[str, Artist] = {}
@@ -196,13 +190,18 @@ def drawable(text: str) -> str:
     )
 
 
-def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
-    """Write a figure as ``stem.format`` in each of `formats`; the bytes depend on the figure alone."""
+def picture_bytes(figure: Figure, form: str) -> bytes:
+    """Return a figure as a file of a format; the bytes depend on the figure alone."""
+    memory = BytesIO()
     with style():
-        for form in formats:
-            memory = BytesIO()
-            figure.savefig(memory, format=form, **SAVE[form])
-            stem.with_name(f"{stem.name}.{form}").write_bytes(memory.getbuffer())
+        figure.savefig(memory, format=form, **SAVE[form])
+    return memory.getvalue()
+
+
+def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
+    """Write a figure as ``stem.format`` in each of `formats`."""
+    for form in formats:
+        stem.with_name(f"{stem.name}.{form}").write_bytes(picture_bytes(figure, form))
 
 
 def time_unit(span_s: float) -> tuple[str, float]:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, new_figure, shortened, styled
+from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, new_figure, styled
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

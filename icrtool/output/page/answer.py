@@ -131,8 +131,10 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
                 "right_wheel_radius_multiplier", _with_std(one.right_radius, one.right_radius_std), f"right {share}"
             ),
         ]
-    elif icr["separation_multiplier"] is not None:
-        text = _with_std(icr["separation_multiplier"], icr["separation_multiplier_std"])
+    elif (multiplier := icr["separation_multiplier"]) is not None and (
+        std := icr["separation_multiplier_std"]
+    ) is not None:
+        text = _with_std(multiplier, std)
         numbers = [Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")]
     why_none = "" if numbers else "The drive shows none of them."
     if width is None:
@@ -140,9 +142,7 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
     return tuple(numbers), why_none
 
 
-def _with_std(value: float, std: float | None) -> str:
-    if std is None:
-        return f"{value:.3f}"
+def _with_std(value: float, std: float) -> str:
     return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f} ± less than 0.001"
 
 

@@ -6,20 +6,23 @@ open-loop path that the page integrates ends where the library's does.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import FAMILY, turned_path
-from icrtool.calibration.pooled import calibrated, gyro_recording_of, heading_recording_of, in_recording
+from icrtool.calibration.model_comparison import FAMILY, ROWS, turned_path
+from icrtool.calibration.pooled import calibrated, heading_recording_of
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.motion.fit import own_constants
 from icrtool.motion.models import MODELS, FittedModel, MotionModel
+from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
@@ -208,8 +211,9 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
     models: list[dict[str, Any]] = [
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
-    paths = list(_calibrated(run, report, labels))
-    paths += _compared(run, report["ladder"], {*labels, *(one.name for one in paths)})
+    recording = cache(lambda kind: heading_recording_of(run, kind, width_m=2.0 * half_width_m(b)))
+    paths = list(_calibrated(recording, report, labels))
+    paths += _compared(run, recording, report["ladder"], {*labels, *(one.name for one in paths)})
     every = max(-(-len(paths) * len(steps.rows) // MOST_STEPS), 1)
     rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
     for one in paths:
@@ -227,13 +231,15 @@ def _last_icrs(run: Run) -> list[float]:
     return [float(getattr(run.table, column)[-1]) for column in ICR_COLUMNS]
 
 
-def _calibrated(run: Run, report: Mapping[str, Any], labels: Mapping[str, str]) -> Iterator[Path]:
+def _calibrated(
+    recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str]
+) -> Iterator[Path]:
     """Yield the path of each calibration of the report, its own first; with the gyro too where there is one."""
     wanted = [(one["name"], one["label"], one["calibration"], one["with_gyro"]) for one in report["calibrations"]]
     if (own := report["recommended"]) is not None and (label := labels.get("recommended")):
         gyro = [("recommended_gyro", f"{label} + gyro", own, True)] if own["gyro"] is not None else []
         wanted = [("recommended", label, own, False), *gyro, *wanted]
-    recording = gyro_recording_of(run) if wanted else None
+    recording = recording_of("gyro") if wanted else None
     for name, label, document, with_gyro in wanted:
         if recording is not None and document and not (with_gyro and recording.gyro_radps is None):
             # Too short a drive to find the delay of its wheels has no path.
@@ -242,12 +248,15 @@ def _calibrated(run: Run, report: Mapping[str, Any], labels: Mapping[str, str]) 
                 yield Path(name, label, *predicted_path(recording, *model)(recording.t_s))
 
 
-def _compared(run: Run, ladder: Mapping[str, Any], known: set[str]) -> Iterator[Path]:
+def _compared(
+    run: Run, recording_of: Callable[[str], Recording], ladder: Mapping[str, Any], known: set[str]
+) -> Iterator[Path]:
     """Yield the path of each model of the comparison that is not `known`, as fitted to the whole drive."""
     if "left_out" in ladder:
         return
     kind = ladder["heading"] or ""
-    recording = heading_recording_of(run, kind, width_m=2.0 * half_width_m(run.track_width_m))
+    recording = recording_of(kind)
+    windows, path_turned = cache(partial(cut_windows, recording)), cache(partial(turned_path, run, recording))
     for row in ladder["models"]:
         name, turned = row["name"], row["heading"] != "wheels"
         base = name.removesuffix(f"_{kind}") if turned else name
@@ -256,20 +265,20 @@ def _compared(run: Run, ladder: Mapping[str, Any], known: set[str]) -> Iterator[
             continue
         with suppress(DataError):
             if base in FAMILY:
-                model = in_recording(_fitted(ladder, base, turned=turned), recording)
-                yield Path(name, row["label"], *predicted_path(recording, *model)(recording.t_s))
+                fitted = _fitted(ladder, base, turned=turned)
+                own = own_constants(windows(), fitted, recording.width_m)
+                yield Path(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s))
             else:
                 icrs = None if base == "icr" else _last_icrs(run)
-                yield Path(name, row["label"], *turned_path(run, recording), icrs)
+                yield Path(name, row["label"], *path_turned(), icrs)
 
 
 def _fitted(ladder: Mapping[str, Any], row: str, *, turned: bool) -> FittedModel:
     """Return the model of a row as it was fitted to the whole drive; with wheels and a measured turn rate."""
     family = ladder["best"] if row == "extended" else FAMILY[row]
-    names = {of: name for name, of in FAMILY.items()}
 
     def fit(model: MotionModel, suffix: str) -> FittedModel:
-        value = ladder["fits"][f"{names.get(family, family)}{suffix}"]["value"]
+        value = ladder["fits"][f"{ROWS.get(family, family)}{suffix}"]["value"]
         return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((0, 0)))
 
     wheels = fit(MODELS[family], "")

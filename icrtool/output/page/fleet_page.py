@@ -11,7 +11,7 @@ from icrtool.output.atomic_file import write_file
 from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
-from icrtool.output.text_format import distance_text, duration_text, error_text
+from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
 
 PLOTS = "plots"
 
@@ -20,7 +20,7 @@ FLEET_FAMILY = "icrtool/fleet/"
 HORIZON_M = 10.0
 """At this distance the table shows the errors of each model."""
 
-MODELS = {"recommended": "recommended", "icr": "ICR", "no_slip": "no slip"}
+MODELS = {"recommended": "recommended", **MODEL_WORDS}
 
 
 class Cell(NamedTuple):

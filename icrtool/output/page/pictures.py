@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Iterable
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,13 +29,9 @@ class Picture(NamedTuple):
 
 def drawn_pictures(figures: Iterable[tuple[str, Figure]]) -> dict[str, Picture]:
     """Return figures as pictures, by name."""
-    return pictures_of((name, _png(figure)) for name, figure in figures)
+    from icrtool.output.figures.style import picture_bytes
 
-
-def _png(figure: Figure) -> bytes:
-    image = BytesIO()
-    figure.savefig(image, format="png")
-    return image.getvalue()
+    return pictures_of((name, picture_bytes(figure, "png")) for name, figure in figures)
 
 
 def pictures_in(directory: Path) -> dict[str, Picture]:

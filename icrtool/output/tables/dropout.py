@@ -11,6 +11,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
+    MODEL_WORDS,
     controller_text,
     distance_text,
     duration_text,
@@ -177,8 +178,7 @@ def _ratio_rows(report: DropoutReport) -> Rows:
 
 def _turning_line(split: TurningSplit) -> str:
     kind = "straight" if split.straight else "turning"
-    labels = {"icr": "ICR", "no_slip": "no slip"}
-    errors = ", ".join(f"{labels[name]} {error_text(error)}" for name, error in split.expected_m.items())
+    errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
     return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import FAMILY, ModelComparison
+from icrtool.calibration.model_comparison import ROWS, ModelComparison
 from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
 from icrtool.output.text_format import FITTED
@@ -86,7 +86,7 @@ def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
 def _fit_name(name: str, comparison: ModelComparison) -> str:
     """Return the name of a fit: that of its row; ``icr`` is the filter's row."""
     base = name.removesuffix("_gyro")
-    row = next((row for row, of in FAMILY.items() if of == base), base)
+    row = ROWS.get(base, base)
     return row if base == name else f"{row}_{comparison.heading}"
 
 

@@ -218,13 +218,13 @@ def test_an_edited_fleet_is_refused_in_one_line_or_used(report: DropoutReport, t
     report.write(tmp_path / "runs" / "a" / "dropout", plots=())
     document = fleet_document([Row("a", "runs/a", "done", robot="r", inputs=(File("a", 1, 1, "sum-a"),))])
     found, refusals = 0, []
-    for _, changed in edited(json.loads(json.dumps(document))):
-        for place in (changed, {**changed, "logs": [{**changed["logs"][0], "run": "n" * 300}]} if found == 1 else {}):
-            (tmp_path / "fleet.json").write_text(json.dumps(place), encoding="utf-8")
-            try:
-                found += open_baseline(tmp_path).find("a", [{"sha256": "sum-a"}]) is not None
-                runs_of_fleet(tmp_path)
-            except IcrToolError as err:
-                refusals.append(str(err))
+    long_name = {**document, "logs": [{**document["logs"][0], "run": "n" * 300}]}
+    for _, place in (*edited(json.loads(json.dumps(document))), ("", long_name)):
+        (tmp_path / "fleet.json").write_text(json.dumps(place), encoding="utf-8")
+        try:
+            found += open_baseline(tmp_path).find("a", [{"sha256": "sum-a"}]) is not None
+            runs_of_fleet(tmp_path)
+        except IcrToolError as err:
+            refusals.append(str(err))
     assert found > 1
     assert not [text for text in refusals if not text.isprintable()]

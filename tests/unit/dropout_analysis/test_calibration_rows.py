@@ -14,6 +14,7 @@ import pytest
 import icrtool
 from icrtool.calibration.pooled import predictor, recording_of
 from icrtool.calibration.record import Calibration
+from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
@@ -59,6 +60,20 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
         np.testing.assert_array_equal(result.summary.trials, report.counts.trials)
         np.testing.assert_allclose(result.summary.p95, expected.p95)
         assert np.all(result.intervals.p95_low[:1] < result.summary.p95[:1])
+
+
+def test_ranges_of_starts_without_a_trial_have_no_errors(
+    drive: Run, own: Calibration, report: DropoutReport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the last metres of a drive no trial starts."""
+    monkeypatch.setattr(trials, "STARTS_A_CALL", 100)
+    pieces = dropout_report(drive, horizons_m=HORIZONS, calibrations=[replace(own, name="own")], starts="all")
+    for name, known in (("recommended", "recommended"), ("calibration", "calibration:own")):
+        ours, theirs = pieces.result(name), report.result(known)
+        assert ours is not None
+        assert theirs is not None
+        np.testing.assert_array_equal(ours.summary.trials, theirs.summary.trials)
+        np.testing.assert_allclose(ours.summary.p95, theirs.summary.p95, rtol=1e-6)
 
 
 def test_the_report_states_whether_the_log_was_fitted_to(report: DropoutReport) -> None:

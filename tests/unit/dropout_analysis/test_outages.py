@@ -223,7 +223,7 @@ def test_the_end_error_of_a_real_outage_is_near_the_truth(shared_logs: Path) -> 
     run = fit(read_log(log, config), config)
     outage = max(real_outages(run), key=lambda one: one.end_s - one.begin_s)
     truth = np.load(log.with_name(f"{log.name}.truth.npz"))
-    # Fixes and truth have the same axes; the datum is where they differ.
+    # Fixes and truth have the same axes; the datum is where they differ, and fixes wander by 0.2 m about it.
     fixes, seconds = run.sensors.fixes, (run.sensors.fixes.stamp_ns - run.table.stamp_ns[0]) / 1e9
     before = (run.gnss.code == USED) & (seconds < outage.begin_s)
     off = []
@@ -231,4 +231,4 @@ def test_the_end_error_of_a_real_outage_is_near_the_truth(shared_logs: Path) -> 
         datum = np.median(measured[before] - np.interp(seconds[before], truth["t"], truth[name]))
         off.append(path[-1] - datum - np.interp(outage.end_s, truth["t"], truth[name]))
     assert np.hypot(*off) > 0.5
-    assert outage.end_error_m == pytest.approx(np.hypot(*off), rel=0.1)
+    assert outage.end_error_m == pytest.approx(np.hypot(*off), abs=0.2)

@@ -84,6 +84,28 @@ def test_without_message_index_all_is_read(tmp_path: Path) -> None:
     assert (len(found), size > IMAGES * IMAGE_BYTES) == (20 * IMAGES, True)
 
 
+CHANNEL_AT, OFFSET_AT = 9, 23
+"""Where the channel and the first message's offset stand in a record of a message index."""
+
+
+@pytest.mark.parametrize(("at", "value"), [(CHANNEL_AT, 77), (OFFSET_AT + 3, 99), (OFFSET_AT + 7, 99)])
+def test_a_message_index_that_contradicts_its_chunk_is_not_used(tmp_path: Path, at: int, value: int) -> None:
+    """Of the small messages: a channel that the file lacks, an offset behind the chunk, a negative one."""
+    log = write(tmp_path / "log.mcap", CompressionType.NONE)
+    whole, content = by_library(log), bytearray(log.read_bytes())
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[2]
+    (small,) = (number for number, one in summary.channels.items() if one.topic == "/small")
+    record = chunk.message_index_offsets[small]
+    content[record + at] = value
+    log.write_bytes(content)
+    found, problems, _ = small_messages(log)
+    assert found == whole
+    assert not problems
+
+
 @pytest.mark.parametrize("damage", ["index", "messages"])
 def test_damage_is_found_as_in_any_chunk(tmp_path: Path, damage: str) -> None:
     """A wrong message index, or a damaged record header: the whole chunk is read, and its checksum decides."""

@@ -100,6 +100,16 @@ def test_transforms_in_a_circle_give_nothing(tmp_path: Path) -> None:
     assert place(log) is None
 
 
+def test_base_and_antenna_in_one_circle_give_nothing(tmp_path: Path) -> None:
+    circle = [
+        ("gps", "base_link", (0.1, 0.0, 0.0), (0, 0, 0, 1)),
+        ("base_link", "mast", (0.2, 0.0, 0.0), (0, 0, 0, 1)),
+        ("mast", "gps", (0.3, 0.0, 0.0), (0, 0, 0, 1)),
+    ]
+    assert place(write(tmp_path / "log", circle)) is None
+    assert place(write(tmp_path / "open", circle[1:])) == pytest.approx((0.5, 0.0))
+
+
 def test_a_long_chain_of_frames_is_followed_once() -> None:
     step, turn = np.array([1.0, 0.0, 0.0]), np.eye(3)
     chain = {f"f{k}/base_link": (f"f{k + 1}/base_link", step, turn) for k in range(20_000)}

@@ -14,6 +14,7 @@ from icrtool.estimation.odometry import odometry
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
+from icrtool.output.page.pictures import drawn_pictures
 from icrtool.records.run import Run
 from support.barn import configured, simulate
 
@@ -204,8 +205,10 @@ def test_line_styles_differ_in_grey() -> None:
 
 def test_a_users_settings_change_nothing(tmp_path, run: Run) -> None:
     save(gnss_difference(run), tmp_path / "plain", ("png",))
+    in_page = drawn_pictures([("gnss_difference", gnss_difference(run))])
     with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "savefig.dpi": 20, "text.usetex": True}):
         save(gnss_difference(run), tmp_path / "set", ("png",))
+        assert drawn_pictures([("gnss_difference", gnss_difference(run))]) == in_page
         assert mpl.rcParams["font.size"] == 30.0
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "set.png").read_bytes()
 
