@@ -132,7 +132,11 @@ def final_covariance(
     weight = np.tile(np.exp((windows.end_s - windows.end_s[-1]) / memory_s), 3)
     scale = scale_by_kind(windows.residuals, np.repeat(np.arange(3), len(windows.length_m))) / np.sqrt(weight)
     covariance, _, _ = sandwich_covariance(
-        windows.residuals, windows.jacobian, scale, np.tile(windows.stretch, 3), prior_std(width_m) ** -2.0
+        windows.residuals,
+        windows.jacobian,
+        scale,
+        np.tile(windows.stretch, 3),
+        np.diag(prior_std(width_m) ** -2.0),
     )
     added: Floats = filter_covariance + covariance[:3, :3]
     return added
