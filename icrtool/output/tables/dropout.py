@@ -12,6 +12,7 @@ from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
     MODEL_WORDS,
+    controller_error_text,
     controller_text,
     distance_text,
     duration_text,
@@ -99,10 +100,11 @@ def headline(report: DropoutReport) -> list[str]:
     interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
+    alone = controller_error_text(calibration.controller)
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
         f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
-        f"Controller: {controller_text(numbers._asdict())}.",
+        f"Controller: {controller_text(numbers._asdict())}{f'; {alone}' if alone else ''}.",
     ]
 
 
