@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 @click.command("batch")
 @click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
 @click.option("-o", "--output", metavar="DIR", required=True, type=options.FILE,
-              help="Folder of the tables and, under runs/, of the run directories.")  # fmt: skip
+              help="Folder for the tables; the run directories go to runs/ in it.")  # fmt: skip
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
-              help="Logs at the same time; default: cores, fewer where memory would not hold them.")  # fmt: skip
+              help="Logs at the same time; default: one per core, fewer where memory is short.")  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
 @click.option("--timeout", "timeout_s", metavar="SECONDS", type=options.POSITIVE, default=1800.0, show_default=True,
-              help="End a log that takes longer.")  # fmt: skip
-@click.option("--redo", is_flag=True, help="Process logs again that are done.")
+              help="Stop a log that takes longer.")  # fmt: skip
+@click.option("--redo", is_flag=True, help="Also process logs that are done.")
 @click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
 @options.report
 @json_option
@@ -53,7 +53,7 @@ def command(
     group and tags. A log that fails, hangs or ends its process does not affect the others. The same command continues
     an interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
 
-    Exit status: 3 if a gate failed, else 1 if a log could not be used.
+    Exit status: 3 if an acceptance limit was not met, else 1 if a log could not be used.
 
     \b
     Example:
@@ -199,7 +199,7 @@ class View:
         self._clear()
         if row.status == "failed":
             if self._reports:
-                click.echo(f"Error: {LogText(row.log)}: {escaped(row.reason)}", err=True)
+                click.echo(options.error_line(escaped(row.reason), row.log), err=True)
                 if self._verbose and row.details:
                     click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
         elif self._prints:
@@ -251,7 +251,7 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     counts = Counter(row.status for row in rows)
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
-    parts += [f"{failed_gates} gates failed"] if failed_gates else []
+    parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
     return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"

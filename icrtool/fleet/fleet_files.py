@@ -90,7 +90,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue
         multiplier = f"multiplier {one.multiplier:.3f} ± {one.multiplier_std:.3f}"
-        parts.append(f"{head}: recommended {one.recommended}, {multiplier}, in {one.file}\n{one.table}")
+        parts.append(f"{head}: recommended model {one.recommended}, {multiplier}, in {one.file}\n{one.table}")
     return "\n\n".join(parts) + "\n"
 
 

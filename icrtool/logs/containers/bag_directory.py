@@ -183,7 +183,9 @@ class BagDirectory:
                     sink.write(piece)
                     left -= len(piece)
             if left <= 0:
-                self._problems.add(f"{file.name}: is over {LARGEST_RATIO} times its size when decompressed; cut there")
+                self._problems.add(
+                    f"{file.name}: is more than {LARGEST_RATIO} times its size when decompressed; the rest was not read"
+                )
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
