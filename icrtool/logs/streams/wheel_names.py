@@ -45,7 +45,7 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
 
 @lru_cache(4096)
 def _side_of_wheel(name: str) -> tuple[str, bool]:
-    """Return the side of a joint that may be a wheel, empty for others, and whether its name says that it is one."""
+    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
     elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
     return "" if elsewhere else side_of(name), bool(_WHEEL_WORDS.search(name))
 
