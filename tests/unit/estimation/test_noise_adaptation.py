@@ -12,7 +12,7 @@ from icrtool.config import load_config
 from icrtool.estimation.filter_setup import FIELD_NOISE, PAPER_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import find_noise, innovation_cost
-from icrtool.estimation.run_ekf import noise_of, set_up_again
+from icrtool.estimation.run_filter import noise_of, set_up_again
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.records.run import Run
