@@ -65,7 +65,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     examples = _needed(report, report.examples, "example trials")
     horizon = examples[0].horizon_m
@@ -93,7 +93,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     worst = _needed(report, report.worst, "worst trials")
     rows = -(-(len(worst) + 1) // WORST_COLUMNS)
@@ -140,12 +140,12 @@ def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, e
 
 @styled
 def dropout_outages(report: DropoutReport) -> Figure:
-    """Return the path [m] with those of forced and real outages, and their end errors [m].
+    """Return the path [m] with its forced and real outages, and their end errors [m].
 
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     outages = _needed(report, report.outages, "outages")
     norths = np.concatenate([report.reference_north_m, *(one.north_m for one in outages)])
