@@ -19,6 +19,7 @@ from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import RobotLog
+from icrtool.records.text import counted
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
 
@@ -254,8 +255,8 @@ class Calibration:
 
     def __repr__(self) -> str:
         numbers = self.controller_numbers()
-        logs = "1 log" if len(self.logs) == 1 else f"{len(self.logs)} logs"
         p95, _ = self.held_out_m("recommended", 10.0)
+        logs = counted(len(self.logs), "log")
         return (
             f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, multiplier "
             f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, 95 % within {p95:.2f} m after 10 m, held out>"
