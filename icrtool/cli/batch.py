@@ -241,6 +241,8 @@ def line_of(row: Row) -> str:
     if right is not None and left is not None:
         std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
         parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
+    elif row.reason:
+        parts.append(shown(row.reason))
     if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
@@ -251,10 +253,10 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     counts = Counter(row.status for row in rows)
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
-    parts += [f"{failed_gates} gates failed"] if failed_gates else []
+    parts += [f"{failed_gates} gate{'s' if failed_gates > 1 else ''} failed"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {written}"
+    return f"\n{len(rows)} log{'s' if len(rows) != 1 else ''}: {', '.join(parts)}\nwritten to {output}: {written}"
 
 
 def shown(text: str, keep: str = "") -> str:

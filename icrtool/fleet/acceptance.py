@@ -30,12 +30,12 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
     counts = Counter(row.status for row in rows)
-    failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
+    shown = [(row, one) for row in rows for one in row.verdicts]
+    failed_gates = [one for _, one in shown if not one.passed]
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
-    if any(row.verdicts for row in rows):
-        lines += [f"**{len(failed_gates)} gates failed.**" if failed_gates else "All gates passed.", ""]
-    shown = [(row, one) for row in rows for one in row.verdicts]
+    if shown:
+        lines += [f"**{len(failed_gates)} of {len(shown)} gates failed.**" if failed_gates else "All gates passed.", ""]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
         limits = []
