@@ -2,7 +2,7 @@
 
 The transfer matrix holds the errors of the calibration of the row in the trials of the column's runs. On its diagonal a
 calibration would be tested on what it was fitted to; there each trial is predicted without its log or, in a group of a
-single run, without the blocks that it touches.
+single run, by a fit to the rest of the drive.
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[
 def _start_time(name: str, data: Measurements) -> float:
     """Return the first stamp by which wheel, GNSS and heading have each been seen."""
     if not (len(data.gnss_t) and len(data.heading_t)):
-        raise DataError(name, "the outages leave no fix or no heading", "take away less")
+        raise DataError(name, "the outages leave no fix or no heading", "shorten them")
     t0 = max(float(data.wheel_t[0]), float(data.gnss_t[0]), float(data.heading_t[0]))
     if t0 >= data.wheel_t[-1]:
         raise DataError(name, "no wheel sample after the first fix and the first heading", "check the streams' clocks")
@@ -259,7 +259,7 @@ def _check_warm_start(start: WarmStart) -> None:
         raise ConfigError("warm start", f"its ICRs are {found} m", f"each lies within {FARTHEST_START_M:g} m")
     sound = covariance.shape == (3, 3) and bool((np.abs(covariance) <= LARGEST_START_STD_M**2).all())
     if not sound or np.linalg.eigvalsh(covariance).min() < -1e-9 * max(1.0, float(np.abs(covariance).max())):
-        raise ConfigError("warm start", "its covariance is none", "fit the log that it comes from again")
+        raise ConfigError("warm start", "its covariance matrix is not valid", "fit the log that it comes from again")
 
 
 def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Floats]:
