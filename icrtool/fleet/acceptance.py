@@ -35,7 +35,9 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
     if shown:
-        met = f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
+        met = (
+            f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
+        )
         lines += [met, ""]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
