@@ -142,8 +142,8 @@ def compare_calibrations(
 ) -> Transfer:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
-    for (row, result), (column, other) in product(results.items(), results.items()):
-        if _of_one_robot(result.calibration, other.calibration):
+    for (row, result), (column, own) in product(results.items(), results.items()):
+        if _of_one_robot(result.calibration, own.calibration):
             tested.setdefault((row, column), _test(result, recordings[column], own=False))
         else:
             known = tested[column, column]

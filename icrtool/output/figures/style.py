@@ -199,8 +199,8 @@ def picture_bytes(figure: Figure, form: str) -> bytes:
     with style():
         if form == "png":
             canvas = FigureCanvasAgg(figure)
-            canvas.draw()
-            return _png_bytes(np.asarray(canvas.buffer_rgba())[..., :3], figure.dpi)
+            canvas.draw()  # type: ignore[no-untyped-call]
+            return _png_bytes(np.asarray(canvas.buffer_rgba())[..., :3], figure.dpi)  # type: ignore[no-untyped-call]
         figure.savefig(memory, format=form, **SAVE[form])
     return memory.getvalue()
 
@@ -214,7 +214,7 @@ def _png_bytes(rgb: NDArray[np.uint8], dpi: float) -> bytes:
         b"IHDR": pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0),
         b"tEXt": b"Software\0icrtool",
         b"pHYs": pack(">IIB", per_metre, per_metre, 1),
-        b"IDAT": compress(lines, 1),
+        b"IDAT": compress(lines.tobytes(), 1),
         b"IEND": b"",
     }
     chunks = (pack(">I", len(data)) + kind + data + pack(">I", crc32(kind + data)) for kind, data in content.items())
