@@ -28,7 +28,7 @@ from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, hel
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
+from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
@@ -198,7 +198,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool, seed: int) ->
 def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], seed: int) -> Iterator[Cell]:
     """Yield the cells of one row and column, a horizon each."""
     errors, path = tested[row, column]
-    summary = summarise(errors)
+    summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
     interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
     own, foreign = tested[column, column], tested[row, column]
