@@ -55,7 +55,8 @@ def test_a_png_picture_is_what_matplotlib_would_save() -> None:
     figure = new_figure("title", "subtitle", width_in=3.0, height_in=2.0)
     figure.subplots().plot([0.0, 1.0], [0.0, 1.0])
     saved = BytesIO()
-    figure.savefig(saved, format="png")
+    with style():
+        figure.savefig(saved, format="png")
     with Image.open(BytesIO(picture_bytes(figure, "png"))) as ours, Image.open(saved) as theirs:
         assert np.array_equal(ours.convert("RGBA"), theirs.convert("RGBA"))
         assert ours.info["dpi"] == theirs.info["dpi"]
