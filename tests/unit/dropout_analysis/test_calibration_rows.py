@@ -98,7 +98,7 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
     assert numbers == own.controller_numbers()
     assert exported["separation_multiplier"] == numbers.multiplier
     assert exported["separation_multiplier_std"] == numbers.multiplier_std
-    assert f"wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}" in " ".join(
+    assert f"wheel_separation_multiplier {numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}" in " ".join(
         format_dropout(report).split()
     )
     assert exported["left_radius_multiplier"] == numbers.left_radius
