@@ -201,7 +201,7 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             raise
         raise DataError(
             log.name,
-            f"no heading in it, and positions of ±{drive.fix_std_m:.1f} m show none over so short a drive "
-            f"({drive.travel[-1]:.0f} m)",
+            f"no heading in it, and a drive of {drive.travel[-1]:.0f} m is too short to find one from positions of "
+            f"±{drive.fix_std_m:.1f} m",
             "record an orientation (AHRS), use RTK, or drive several times as far",
         ) from error

@@ -182,23 +182,22 @@ def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: 
     notes, misreported, rows = [], quality.misreported, quality.fix_class
     if misreported.any():
         notes.append(
-            f"{_counted(misreported)} claim {_accuracy(stated[misreported], 'to be fixed')} but scatter or jump like "
-            f"RTK float{': taken as float' if changes else ''}"
+            f"{_counted(misreported)} state {_accuracy(stated[misreported], 'that they are fixed')} "
+            f"but scatter or jump like RTK float{': taken as float' if changes else ''}"
         )
     down = quality.down_weighted & ~misreported
     if down.any():
         gnss = quality.log.gnss
         given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
         notes.append(
-            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: "
-            f"given ±{np.median(given):.2g} m, as they err alike"
+            f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{np.median(given):.2g} m"
         )
     for code, name in CLASSES.items():
         if name in raised and not quality.down_weighted[rows == code].all():
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
             notes.append(
                 f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
-                f"{quality.statistics.step_std_m[name]:.2g} m: that is used"
+                f"{quality.statistics.step_std_m[name]:.2g} m: the scatter is used"
             )
     return notes
 

@@ -133,7 +133,7 @@ def dead_or_copied(log: RobotLog) -> list[str]:
         return []
     if min(total_left, total_right) < NEVER_MOVES_SHARE * most:
         side = "left" if total_left < total_right else "right"
-        meaning = "the ICRs mean nothing then; topics.wheels chooses others"
+        meaning = "if so, do not use the ICRs; topics.wheels chooses others"
         return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         return ["left and right wheels are equal throughout while the robot turns: one is a copy of the other"]
@@ -215,7 +215,7 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     if fit.slips:
         slip = (
-            f"their distance differs by {100 * fit.slip_std:.0f} % every {fit.windows.length_m:.0f} m from the robot's"
+            f"over {fit.windows.length_m:.0f} m their distance differs by {100 * fit.slip_std:.0f} % from the robot's"
         )
         turns = f"their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [f"the wheels slip: {slip}, {turns}; no scale and no delay is corrected"]

@@ -2,7 +2,7 @@
 
 The transfer matrix holds the errors of the calibration of the row in the trials of the column's runs. On its diagonal a
 calibration would be tested on what it was fitted to; there each trial is predicted without its log or, in a group of a
-single run, without the blocks that it touches.
+single run, by a fit to the rest of the drive.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, hel
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
+from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
@@ -187,7 +187,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool, seed: int) ->
 def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], seed: int) -> Iterator[Cell]:
     """Yield the cells of one row and column, a horizon each."""
     errors, path = tested[row, column]
-    summary = summarise(errors)
+    summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
     interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
     own, foreign = tested[column, column], tested[row, column]

@@ -170,7 +170,7 @@ class DropoutReport:
     def __repr__(self) -> str:
         icr, last = self.result("icr"), len(self.horizons_m) - 1
         error = f", ICR 95 % {icr.summary.p95[last]:.3g} m after {self.horizons_m[last]:g} m" if icr is not None else ""
-        limits = f", acceptance limits {'kept' if self.passed else 'MISSED'}" if self.verdicts else ""
+        limits = f", acceptance limits {'met' if self.passed else 'NOT MET'}" if self.verdicts else ""
         return f"<DropoutReport {self.name!r}: {len(self.results)} models from {self.states:,} states{error}{limits}>"
 
     def _repr_html_(self) -> str:

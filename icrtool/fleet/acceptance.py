@@ -34,7 +34,12 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
     if any(row.verdicts for row in rows):
-        lines += [f"**{len(failed_gates)} gates failed.**" if failed_gates else "All gates passed.", ""]
+        lines += [
+            f"**Acceptance limits not met: {len(failed_gates)}.**"
+            if failed_gates
+            else "All acceptance limits are met.",
+            "",
+        ]
     shown = [(row, one) for row in rows for one in row.verdicts]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
@@ -45,7 +50,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
             verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
             numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
             limits.append([escaped_markdown(row.log), escaped_markdown(one.gate.text), *numbers, interval, verdict])
-        head = ("log", "gate", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
+        head = ("log", "acceptance limit", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
         lines += [*markdown_table(head, limits, (0, 1, 7)), ""]
     errors = []
     for row in rows:

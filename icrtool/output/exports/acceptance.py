@@ -98,7 +98,7 @@ def format_markdown(report: DropoutReport) -> str:
         rows.append(["no slip : ICR, 95 %", *ratios])
     lines = [f"## {escaped_markdown(run_title(report.run_summary))}", ""]
     if report.verdicts:
-        word = "All gates passed." if report.passed else "**A gate failed.**"
+        word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
         lines += [word, "", *(f"- {escaped_markdown(verdict.line())}" for verdict in report.verdicts), ""]
     lines += [f"Open loop from each of {report.states:,} states. In words:", ""]
     lines += [f"- {escaped_markdown(line)}" for line in budget_lines(report.budgets)]

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from icrtool.kernels.arrays import Floats
-from icrtool.records.text import escaped, shortened
+from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -158,7 +158,7 @@ def new_figure(
     edge = 0.09 / width_in
     most = int(TITLE_CHARACTERS_PER_INCH * width_in)
     at: dict[str, Any] = {"va": "top", "ha": "left", "parse_math": False}
-    figure.text(edge, 1 - 0.09 / height_in, drawable(shortened(title, most)), fontsize=10.5, fontweight="bold", **at)
+    figure.text(edge, 1 - 0.09 / height_in, drawable(title, most), fontsize=10.5, fontweight="bold", **at)
     figure.text(edge, 1 - 0.30 / height_in, drawable(subtitle), fontsize=8.5, color="0.3", **at)
     return figure
 
@@ -170,7 +170,9 @@ def add_legend(figure: Figure, **layout: Any) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(str(label), handle)
     if found:
-        figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+        legend = figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+        for text in legend.get_texts():
+            text.set_parse_math(False)
 
 
 def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
@@ -178,16 +180,15 @@ def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
     return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": size}
 
 
-def drawable(text: str) -> str:
+def drawable(text: str, longest: int = LONGEST_MESSAGE) -> str:
     """Return a text from a log, a path or a configuration with a box for every character that the font lacks.
 
-    Control characters and undecodable bytes become their Python escapes. Draw it with ``parse_math=False``: a ``$`` in
-    a name begins no formula.
+    It is shortened to `longest` characters. Control characters and undecodable bytes become their Python escapes. Draw
+    it with ``parse_math=False``: a ``$`` in a name begins no formula.
     """
     regular, bold = (font_manager.get_font(font_manager.findfont(f"DejaVu Sans:{weight}")) for weight in WEIGHTS)
-    return "".join(
-        c if regular.get_char_index(ord(c)) and bold.get_char_index(ord(c)) else MISSING for c in escaped(text)
-    )
+    has = [c if regular.get_char_index(ord(c)) and bold.get_char_index(ord(c)) else MISSING for c in escaped(text)]
+    return shortened("".join(has), longest)
 
 
 def picture_bytes(figure: Figure, form: str) -> bytes:

@@ -9,7 +9,6 @@ import numpy as np
 
 from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, new_figure, styled
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +35,8 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     _draw_matrix(matrix, document, names)
     labels = []
     for y, one in enumerate(rows):
-        labels.append(f"{_short(one['calibrated_on'])} on {_short(one['tested_on'])}, {one['horizon_m']:g} m")
+        calibrated, tested = (drawable(one[key], LONGEST_NAME) for key in ("calibrated_on", "tested_on"))
+        labels.append(f"{calibrated} on {tested}, {one['horizon_m']:g} m")
         if _known(one["p95_low_m"]):
             costs.plot([one["p95_low_m"], one["p95_high_m"]], [y, y], **ICR.keywords() | {"linestyle": "-"})
         costs.plot([one["p95_m"]], [y], "o", color=ICR.color, markersize=4)
@@ -57,7 +57,7 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
     for row, column in np.ndindex(values.shape):
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [_short(name) for name in names]
+    short = [drawable(name, LONGEST_NAME) for name in names]
     axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False)
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
     axes.set_xlabel(f"tested on, after {CHOICE_HORIZON_M:g} m")
@@ -67,7 +67,3 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
 
 def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
-
-
-def _short(name: str) -> str:
-    return shortened(drawable(name), LONGEST_NAME)

@@ -83,7 +83,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
     if not summary["usable"]:
         grade, verdict = "bad", f"No: {summary['unusable_because']}."
     elif not report["passed"]:
-        grade, verdict = "bad", "No: an acceptance limit was exceeded."
+        grade, verdict = "bad", "No: an acceptance limit is not met."
     elif warnings:
         grade, verdict = "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
     else:
@@ -227,7 +227,7 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
     if own is not None and p95 is not None:
         share = f"Up to {error_text(own)}" if own < p95 else "All"
         what = f"the {error_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
-        found.append(Check("fact", f"{share} of {what} can be the position reference's own."))
+        found.append(Check("fact", f"{share} of {what} can be the error of the position reference."))
     return found
 
 

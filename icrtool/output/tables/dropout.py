@@ -29,7 +29,7 @@ LISTED_HORIZONS = 4
 """More horizons than this without a trial are printed as a range."""
 
 
-STARTS_TEXT = {"moving": "the moving ones", "all": "each"}
+STARTS_TEXT = {"moving": "each moving one", "all": "each"}
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -279,7 +279,7 @@ def _reference_lines(report: DropoutReport) -> list[str]:
     h = int(np.argmin(np.where(np.isfinite(own.p95), np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
     whole, part = error_text(float(icr.summary.p95[h])), error_text(float(own.p95[h]))
     what = f"the {whole} of the momentary ICRs (95 %, {report.horizons_m[h]:g} m)"
-    return [f"of {what} up to {part} can be the reference's own error"]
+    return [f"up to {part} of {what} can be the error of the position reference"]
 
 
 def _learned_blocks(report: DropoutReport) -> list[Block]:

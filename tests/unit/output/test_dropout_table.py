@@ -167,13 +167,13 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport, tm
     write_markdown(tmp_path / "m.md", [("barn", content), ("runs/x", RunError("runs/x", "was edited"))])
     text = (tmp_path / "m.md").read_text(encoding="utf-8")
     assert text.startswith("## barn")
-    assert "**A gate failed.**" in text
+    assert "limit is not met" in text
     assert "- stays within 50 m (95 %) for more than" in text
     assert "Could not be used: runs/x: was edited" in text
     table = [line for line in text.splitlines() if line.startswith("|")]
     columns = {line.count("|") for line in table[:8]}
     assert len(columns) == 1
-    assert "All gates passed." in format_markdown(replace(content, verdicts=content.verdicts[:1]))
+    assert "All acceptance limits are met" in format_markdown(replace(content, verdicts=content.verdicts[:1]))
 
 
 def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutReport, tmp_path: Path) -> None:
