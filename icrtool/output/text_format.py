@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from icrtool.output.text_blocks import Line
+from icrtool.records.dropout import CHOICE_HORIZON_M
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import ControllerErrors
     from icrtool.records.run_document import RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -87,6 +89,16 @@ def controller_text(numbers: Mapping[str, Any]) -> str:
     return (
         f"wheel_separation_multiplier {numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}, left/right wheel "
         f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"
+    )
+
+
+def controller_error_text(errors: ControllerErrors | None) -> str:
+    """Return the held-out error of a controller beside that of the whole model; empty where it was not measured."""
+    if errors is None or not math.isfinite(errors.p95_m):
+        return ""
+    return (
+        f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "
+        f"out), with the whole model {error_text(errors.full_p95_m)}"
     )
 
 

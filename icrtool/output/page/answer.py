@@ -11,7 +11,7 @@ from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import reach_text
-from icrtool.output.text_format import error_text
+from icrtool.output.text_format import controller_error_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run import ICR_WORDS
 
@@ -55,6 +55,7 @@ class Answer(NamedTuple):
     ----------
     grade, verdict : may the numbers be used, in one word and in one sentence
     no_numbers : reason why there is no number, or no multiplier; empty where there is one
+    with_numbers : the error with these numbers alone; empty where it was not measured
     export : configuration of a diff_drive_controller; empty without a calibration
     """
 
@@ -63,6 +64,7 @@ class Answer(NamedTuple):
     reaches: tuple[Reach, ...]
     numbers: tuple[Number, ...]
     no_numbers: str
+    with_numbers: str
     export: str
     model: str
     checks: tuple[Check, ...]
@@ -95,6 +97,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
         reaches=_reaches(report),
         numbers=numbers,
         no_numbers=no_numbers,
+        with_numbers=controller_error_text(calibration.controller) if calibration is not None else "",
         export=_export(calibration),
         model=calibration.fitted.model.label if calibration is not None else "",
         checks=tuple(_checks(summary, report)),

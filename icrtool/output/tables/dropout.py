@@ -12,6 +12,7 @@ from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
     MODEL_WORDS,
+    controller_error_text,
     controller_text,
     distance_text,
     duration_text,
@@ -29,7 +30,7 @@ LISTED_HORIZONS = 4
 """More horizons than this without a trial are printed as a range."""
 
 
-STARTS_TEXT = {"moving": "each moving one", "all": "each"}
+STARTS_TEXT = {"moving": "moving ", "all": ""}
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -46,13 +47,13 @@ def format_dropout(report: DropoutReport) -> Text:
     drive = report.run_summary["drive"]
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-    starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
+    starts = f"a trial from each {STARTS_TEXT[report.starts]}state of {report.states:,}"
     rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
     head = ("distance without GNSS", "", *_horizon_texts(report))
     blocks: list[Block] = [
         *unusable_lines(report.run_summary),
         Line(run_title(report.run_summary), "title"),
-        f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}",
+        f"{driven}; without GNSS, wheel speeds only, {starts}{reference}",
         "",
     ]
     if sentences := headline(report):
@@ -99,10 +100,11 @@ def headline(report: DropoutReport) -> list[str]:
     interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
+    alone = controller_error_text(calibration.controller)
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
         f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
-        f"Controller: {controller_text(numbers._asdict())}.",
+        f"Controller: {controller_text(numbers._asdict())}{f'; {alone}' if alone else ''}.",
     ]
 
 
