@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -111,13 +112,14 @@ def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_S
 
     Parameters
     ----------
-    groups : at least two, by name; the runs of one robot
+    groups : at least two, by name, each the runs of one robot; groups of different robots have no errors of one
+        calibration on the other (NaN)
     seed : of the bootstrap
 
     Raises
     ------
     ConfigError
-        Fewer than two groups, a log that is in two of them, or robots that differ.
+        Fewer than two groups, a log that is in two of them, or robots that differ in one group.
     DataError
         Too short a drive.
 
@@ -139,11 +141,14 @@ def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]], *, seed: int = DEFAULT_SEED
 ) -> Transfer:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
-    tested = {
-        (row, column): _test(result, recordings[column], own=row == column)
-        for row, result in results.items() for column in recordings
-    }  # fmt: skip
-    cells = (cell for row, column in tested for cell in _cells(row, column, tested, seed))
+    tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
+    for (row, result), (column, own) in product(results.items(), results.items()):
+        if _of_one_robot(result.calibration, own.calibration):
+            tested.setdefault((row, column), _test(result, recordings[column], own=False))
+        else:
+            known = tested[column, column]
+            tested[row, column] = known._replace(errors=np.full_like(known.errors, np.nan))
+    cells = (cell for row, column in product(results, results) for cell in _cells(row, column, tested, seed))
     first, *others = results
     pairs = []
     for other in others:
@@ -153,6 +158,12 @@ def compare_calibrations(
         errors = _differences(tested[first, first], tested[other, other], paired=paired, seed=seed)
         pairs.append(Pair(first, other, parameters, dict(zip(HORIZONS_M, errors, strict=True)), paired))
     return Transfer({name: one.calibration for name, one in results.items()}, tuple(pairs), tuple(cells))
+
+
+def _of_one_robot(one: Calibration, other: Calibration) -> bool:
+    """Return whether the parameters of two calibrations refer to the same track width and wheel radius."""
+    same_width = math.isclose(one.width_m, other.width_m, rel_tol=1e-3)
+    return same_width and one.robot.get("wheel_radius_m") == other.robot.get("wheel_radius_m")
 
 
 class _Tested(NamedTuple):

@@ -124,9 +124,8 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
 
 
 def reason_of(row: Row) -> str:
-    """Return why a log failed without what is particular to it: the second part of ``what: why; advice``."""
-    parts = row.reason.split(": ", 1)
-    return parts[-1].split(";")[0].split(" (tried")[0]
+    """Return why a log failed without what is particular to it: the first part of ``why; advice``."""
+    return row.reason.split(";")[0].split(" (tried")[0]
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:
