@@ -195,8 +195,8 @@ def cut_windows(
     ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
     row, column = np.nonzero(ends.T >= 0)[::-1]
     if recording.slipping is not None:
-        before = np.cumsum(recording.slipping) - recording.slipping
-        quiet = before[begins[row]] == before[ends[row, column]]
+        before: Ints = np.cumsum(recording.slipping) - recording.slipping
+        quiet: Bools = before[begins[row]] == before[ends[row, column]]
         row, column = row[quiet], column[quiet]
     if len(row) < FEWEST_WINDOWS:
         why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"
