@@ -254,12 +254,11 @@ class Calibration:
         return file
 
     def __repr__(self) -> str:
-        numbers = self.controller_numbers()
         p95, _ = self.held_out_m("recommended", 10.0)
         logs = counted(len(self.logs), "log")
         return (
-            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, multiplier "
-            f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, 95 % within {p95:.2f} m after 10 m, held out>"
+            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, "
+            f"95 % within {p95:.2f} m after 10 m, held out>"
         )
 
     def summary(self) -> dict[str, Any]:

@@ -71,6 +71,8 @@ def model_text(label: str, name: str, parameters: int) -> str:
 
 def controller_text(numbers: Mapping[str, Any]) -> str:
     """Return what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
+    if not any(value for name, value in numbers.items() if name.endswith("_std")):
+        return "keeps its constants: the recommended model estimates none of them"
     return (
         f"wheel_separation_multiplier {numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}, left/right wheel "
         f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"

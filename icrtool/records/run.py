@@ -129,6 +129,14 @@ class Run:
         return tuple(change["t_s"] for change in self.summary["terrain"]["changes"])
 
     @property
+    def slipping(self) -> Bools:
+        """Whether the interval after a state lies in a slip event (n,)."""
+        begin, end, inside = self.table.stamp_ns[:-1], self.table.stamp_ns[1:], np.zeros(len(self.table), np.bool_)
+        for event in self.sensors.events:
+            inside[:-1] |= (end > event.begin_ns) & (begin < event.end_ns)
+        return inside
+
+    @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
         spans = self.summary["icr"]["convergence_span_s"]

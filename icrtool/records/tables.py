@@ -44,6 +44,7 @@ class RobotLog:
     gyros : all inertial units with turn rates, all axes
     other_receivers : further GNSS receivers
     other_references : the same log with another position reference and its heading, where it holds one
+    slipping_ns : (k, 2) begins and ends of the slip events found in it: its wheels show nothing there
     """
 
     name: str
@@ -60,6 +61,7 @@ class RobotLog:
     gyros: tuple[GyroAxes, ...] = ()
     other_receivers: tuple[OtherReceiver, ...] = ()
     other_references: tuple[RobotLog, ...] = ()
+    slipping_ns: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def from_frames(

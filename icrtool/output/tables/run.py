@@ -116,7 +116,7 @@ def _multiplier_rows(run: Run) -> list[Row]:
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     note = "" if shown else ": not shown well enough to be used"
-    value = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
+    value = f"{multiplier:.3f} ± {std:.3f}" if std is not None else f"{multiplier:.3f}"
     return [("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
 
 
@@ -126,10 +126,10 @@ def _recommended_rows(run: Run) -> list[Row]:
     if found is None or not run.usable:
         return []
     rows = found["parameters"].items()
-    values = ", ".join(f"{name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
+    values = "".join(f", {name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
     model = model_text(found["label"], found["model"], len(rows))
     return [
-        ("model", f"recommended: {model}: {values}; what error it makes: icrtool dropout-report"),
+        ("model", f"recommended: {model}{values}; what error it makes: icrtool dropout-report"),
         ("controller", controller_text(found["controller"])),
     ]
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from icrtool.calibration.record import ControllerNumbers
 from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import distance_text, duration_text, error_text, signed
+from icrtool.output.text_format import controller_text, distance_text, duration_text, error_text, signed
 from icrtool.records.run import Run
 
 
@@ -40,7 +41,7 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
         assert (f"{rise:.1f} s" if rise is not None else "hardly moved") in line
     multiplier = line_of(text, "multiplier")
     assert (
-        f"{separation_multiplier(run.table, 0.6):.2f} ± {icr['separation_multiplier_std']:.2f} = (y right" in multiplier
+        f"{separation_multiplier(run.table, 0.6):.3f} ± {icr['separation_multiplier_std']:.3f} = (y right" in multiplier
     )
     assert multiplier.endswith("with b = 0.6 m")
     assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
@@ -79,6 +80,12 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
     assert "filter to position reference" in text
     assert "outage" not in text
     assert " 0 rejected" in text
+
+
+def test_constants_that_no_model_estimated_are_no_numbers() -> None:
+    numbers = ControllerNumbers(1.0, 0.0, 1.0, 0.0, 1.0, 0.0)
+    assert not any(one.isdigit() for one in controller_text(numbers._asdict()))
+    assert "1.482 ± 0.004" in controller_text(numbers._replace(multiplier=1.482, multiplier_std=0.004)._asdict())
 
 
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
