@@ -6,10 +6,13 @@ because its parts may come from a log.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path  # its import would be a tenth of ``icrtool --help``
 
 
 class IcrToolError(Exception):

@@ -112,7 +112,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     Raises
     ------
     DataError
-        Streams that cannot be used together, a heading that nothing explains, wheels that turn while the robot stands.
+        Streams that cannot be used together, an unexplained heading, wheels that turn while the robot stands.
     """
     corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
     as_sent = log
@@ -201,7 +201,7 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             raise
         raise DataError(
             log.name,
-            f"no heading in it, and positions of ±{drive.fix_std_m:.1f} m show none over so short a drive "
-            f"({drive.travel[-1]:.0f} m)",
+            f"no heading in it, and a drive of {drive.travel[-1]:.0f} m is too short to find one from positions of "
+            f"±{drive.fix_std_m:.1f} m",
             "record an orientation (AHRS), use RTK, or drive several times as far",
         ) from error

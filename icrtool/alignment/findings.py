@@ -56,7 +56,7 @@ def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> di
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     half_sum = np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
     middle_std = math.sqrt(max(float(half_sum @ covariance @ half_sum), 0.0))
-    place = "only the antenna's place against the ICRs is determined"
+    place = "only the position of the antenna relative to the ICRs is determined"
     scales = found.wheels.applied
     return {
         "left_scale": _finding(left_scale, std[3], scales[0], nothing=1.0),

@@ -1,7 +1,7 @@
 """Classes of the fixes: fixed, float or other by what they state and how they move; noise by class; jumps counted.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
-tens of seconds: taken for independent they would pull the filter along. Some drivers go on claiming a centimetre.
+tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ SHORTEST_LOSS_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class GnssQuality:
-    """What the fixes of a log are.
+    """Classes of the fixes of a log, and their noise.
 
     Attributes
     ----------
     log : with the variances that the fixes deserve; the given one in preset ``paper``
     fix_class : uint8 (m,), keys of `CLASSES`
-    misreported : bool (m,), fixes that claim to be fixed and are not
+    misreported : bool (m,), reported as fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
     statistics : of the classes, and the jumps
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
@@ -106,7 +106,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
-    """Return the class of each fix (m,), and which claim to be fixed and are not (m,)."""
+    """Return the class of each fix (m,), and which are reported as fixed and are not (m,)."""
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none
@@ -182,23 +182,22 @@ def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: 
     notes, misreported, rows = [], quality.misreported, quality.fix_class
     if misreported.any():
         notes.append(
-            f"{_counted(misreported)} claim {_accuracy(stated[misreported], 'to be fixed')} but scatter or jump like "
-            f"RTK float{': taken as float' if changes else ''}"
+            f"{_counted(misreported)} state {_accuracy(stated[misreported], 'that they are fixed')} "
+            f"but scatter or jump like RTK float{': taken as float' if changes else ''}"
         )
     down = quality.down_weighted & ~misreported
     if down.any():
         gnss = quality.log.gnss
         given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
         notes.append(
-            f"{_counted(down)} are no RTK fixed solution in a log where that is usual: "
-            f"given ±{np.median(given):.2g} m, as they err alike"
+            f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{np.median(given):.2g} m"
         )
     for code, name in CLASSES.items():
         if name in raised and not quality.down_weighted[rows == code].all():
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
             notes.append(
                 f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
-                f"{quality.statistics.step_std_m[name]:.2g} m: that is used"
+                f"{quality.statistics.step_std_m[name]:.2g} m: the scatter is used"
             )
     return notes
 

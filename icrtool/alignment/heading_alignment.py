@@ -201,8 +201,8 @@ def align_heading(
     noisy = corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
     if noisy:
         notes.append(
-            f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground, over whole windows: "
-            "its noise is raised accordingly"
+            f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground: "
+            "its noise is raised to that"
         )
     return replace(
         nothing, offset_rad=offset, offset_std_rad=std, scatter_rad=scatter, applied_offset_rad=applied,
@@ -256,15 +256,15 @@ def refuse_unexplained(log: RobotLog, course: CourseAngles) -> None:
     windows, scattered = len(course.angle), course.scattered
     if scattered >= FEWEST_WINDOWS and scattered > windows:
         raise _no_heading(
-            log, "scatters so much that it points nowhere", f"in {scattered} of the windows it was averaged over"
+            log, "scatters over all directions", f"in {scattered} of the windows in which it was averaged"
         )
     if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
         return
     best = max(course.agreement, course.mirrored_agreement)
     if best < EXPLAINED:
         spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
-        tried = f"ENU, NED and every offset tried in {windows} windows, scatter {spread:.0f}° at best"
-        raise _no_heading(log, "has nothing to do with the course over ground", tried)
+        tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° or more ({windows} windows)"
+        raise _no_heading(log, "does not follow the course over ground", tried)
 
 
 def refuse_stuck(log: RobotLog) -> None:
@@ -298,7 +298,7 @@ def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
-    advice = "choose another with topics.heading, or go on with --set frames.heading_offset_deg=0"
+    advice = "choose another with topics.heading, or use this one with --set frames.heading_offset_deg=0"
     return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
 
 

@@ -175,7 +175,7 @@ def _derived(
     attitude, attitude_offset = None, None
     if stated is not None:
         source = "fused"
-        parts.insert(0, f"orientation (errs by {math.degrees(attitude_error(estimate)):.1f}°)")
+        parts.insert(0, f"orientation (error {math.degrees(attitude_error(estimate)):.1f}°)")
         names.insert(0, log.topic("heading", "orientation"))
         offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
         attitude_offset = offset, float(estimate.constants_std[OFFSET])

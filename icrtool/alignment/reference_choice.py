@@ -61,8 +61,8 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     if not residual < min(BETTER * chosen.residual_m, POOR_M):
         return log
     topics = [one.topic("gnss") for one in (best, log)]
-    against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "no relation"
-    why = f"agrees with wheels and heading to {residual:.2f} m over {LENGTH_M:.0f} m, {topics[1]}: {against}"
+    against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "not comparable"
+    why = f"agrees with wheels and heading within {residual:.2f} m over {LENGTH_M:.0f} m ({topics[1]}: {against})"
     streams = tuple(
         replace(stream, why=f"{stream.why}; {why}") if stream.role == "gnss" else stream for stream in best.streams
     )

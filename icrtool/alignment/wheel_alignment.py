@@ -29,8 +29,9 @@ SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
 
 LARGEST_SCALE_CORRECTION = 0.15
-FACTOR_TWO_TOLERANCE = 0.04
-"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
+FACTOR_TWO_TOLERANCE = 2.0 * USUAL_SCALE_STD
+"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius) beside what
+wheels usually roll at."""
 
 STANDS_SHARE, STILL = 0.8, 0.2
 """The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
@@ -132,7 +133,7 @@ def dead_or_copied(log: RobotLog) -> list[str]:
         return []
     if min(total_left, total_right) < NEVER_MOVES_SHARE * most:
         side = "left" if total_left < total_right else "right"
-        meaning = "the ICRs mean nothing then; topics.wheels chooses others"
+        meaning = "if so, do not use the ICRs; topics.wheels chooses others"
         return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         return ["left and right wheels are equal throughout while the robot turns: one is a copy of the other"]
@@ -214,7 +215,7 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     if fit.slips:
         slip = (
-            f"their distance differs by {100 * fit.slip_std:.0f} % every {fit.windows.length_m:.0f} m from the robot's"
+            f"over {fit.windows.length_m:.0f} m their distance differs by {100 * fit.slip_std:.0f} % from the robot's"
         )
         turns = f"their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [f"the wheels slip: {slip}, {turns}; no scale and no delay is corrected"]

@@ -135,7 +135,8 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     Notes
     -----
     Straight spans where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
-    before and after. Senses of the wheels do not matter.
+    before and after. Senses of the wheels do not matter. The estimate of `icrtool.alignment.estimator` needs m/s and a
+    heading, which are found after this.
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
@@ -180,7 +181,7 @@ def _metres_per_unit(
     if scale is None and unit == "unknown":
         raise ConfigError(
             "wheels.quantity",
-            f"{topic} names no unit, and the log has too little driving to find it from",
+            f"{topic} names no unit, and the log has too little driving to find it",
             "drive for half a minute; where they are ticks, give --set wheels.quantity=counts",
         )
     lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
@@ -188,11 +189,15 @@ def _metres_per_unit(
         raise ConfigError(
             lacking,
             f"needed to read {topic}, which is in {unit}",
-            f"give it with --set {lacking}=…; the log has too little driving to find the scale from",
+            f"give it with --set {lacking}=…; the log has too little driving to estimate it",
         )
     how = f"{_SCALE_WORDS.get(unit, 'travel of a unit of the wheels')} {_with_std(scale)} m"
     how += " (estimated from the position reference)"
-    why = "no unit that the robot's keys know fits" if radius and counts else f"{lacking} is not given"
+    why = (
+        "neither the wheel radius nor the encoder counts fit the distance"
+        if radius and counts
+        else f"{lacking} is not given"
+    )
     return scale.value, f", {how}", [f"{why}: {how}"]
 
 

@@ -30,9 +30,9 @@ def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
     p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
     _, without = calibration.held_out_m("no_slip", POSE_AFTER_M)
     if p95 > LARGEST_SHARE * POSE_AFTER_M:
-        reasons.append(f"95 % of the held-out errors after {POSE_AFTER_M:g} m lie within {p95:.1f} m only")
+        reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out)")
     if expected >= without:
-        reasons.append(f"held out it is no better than no slip: {expected:.2f} m and {without:.2f} m expected")
+        reasons.append(f"it is no better than no slip: expected error {expected:.2f} m and {without:.2f} m, held out")
     if "omega_w" in calibration.fitted.not_shown:
         reasons.append("the driving did not show how the robot turns (omega_w)")
     return tuple(reasons)

@@ -77,4 +77,4 @@ def choose(errors: Mapping[str, Floats], sizes: Mapping[str, int], baseline: str
     if name == best:
         return name, f"least expected error after {CHOICE_HORIZON_M:g} m on what it was not fitted to"
     share = 100.0 * float(np.expm1((logs[name] - logs[best]).mean()))
-    return name, f"simplest within noise of the best: {share:.0f} % more expected error than {best}"
+    return name, f"simplest within noise of the best: {share:.0f} % more expected error than model {best}"

@@ -17,7 +17,7 @@ from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
 from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.kernels.open_loop import STARTS_A_CALL
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
@@ -171,7 +171,7 @@ def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOu
         else:
             # the filter's ICRs are those of the speeds that it saw
             drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-            summary = summarise(_errors_of_filter(drive, _icrs_of(run, name), trials))
+            summary = error_summary(_errors_of_filter(drive, _icrs_of(run, name), trials))
         yield ModelScore(name, LABELS[name], FITTED_TO[name], False, summary)
 
 
@@ -200,7 +200,7 @@ def _turned_scores(
             of = FAMILY[name]
             summary = table.score(of if of == "recommended" else f"{of}_gyro").together
         else:
-            summary = summarise(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
+            summary = error_summary(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
         yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 

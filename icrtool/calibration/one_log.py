@@ -259,7 +259,7 @@ def _derive(run: Run, direct: tuple[Parameter, ...], x_icr_m: float | None) -> t
         stds = [_finding(run, name)[1] for name in ("y_icr_right_m", "y_icr_left_m")]
         verdict = max((separation.verdict, aside.verdict), key=("given", "shown", "weak", "not shown").index)
     else:
-        middle, note = 0.0, "if the ICRs lie evenly about the body's middle"
+        middle, note = 0.0, "if the ICRs lie symmetrically about the middle of the body"
         found.append(Parameter("antenna_right_m", "antenna right", aside.value, aside.std, aside.verdict, note))
         stds, verdict = [separation.std / 2] * 2, separation.verdict
     half = separation.value / 2

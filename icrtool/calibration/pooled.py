@@ -75,6 +75,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
+        slipping=run.slipping if run.sensors.events else None,
     )
     if heading is None or not np.isfinite(heading.angle_rad).all():
         return plain

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from contextlib import suppress
 
 from icrtool.cli.interrupts import INTERRUPTED, end_in_order
 
@@ -20,6 +21,11 @@ def main() -> None:
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)
+    with suppress(ImportError, ValueError, OSError):
+        # A recording split every minute has more files than a process may open; on Windows there is no such limit.
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
     try:
         with end_in_order(main.__code__):
             from icrtool.cli.standard_streams import standard_streams

@@ -16,7 +16,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
-from icrtool.records.text import escaped
+from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 @click.command("batch")
 @click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
 @click.option("-o", "--output", metavar="DIR", required=True, type=options.FILE,
-              help="Folder of the tables and, under runs/, of the run directories.")  # fmt: skip
+              help="Folder for the tables; the run directories go to runs/ in it.")  # fmt: skip
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
-              help="Logs at the same time; default: cores, fewer where memory would not hold them.")  # fmt: skip
+              help="Logs at the same time; default: one per core, fewer where memory is short.")  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
 @click.option("--timeout", "timeout_s", metavar="SECONDS", type=options.POSITIVE, default=1800.0, show_default=True,
-              help="End a log that takes longer.")  # fmt: skip
-@click.option("--redo", is_flag=True, help="Process logs again that are done.")
+              help="Stop a log that takes longer.")  # fmt: skip
+@click.option("--redo", is_flag=True, help="Also process logs that are done.")
 @click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
 @options.report
 @json_option
@@ -53,7 +53,7 @@ def command(
     group and tags. A log that fails, hangs or ends its process does not affect the others. The same command continues
     an interrupted batch; logs that are done are skipped while input, configuration and version stay the same.
 
-    Exit status: 3 if a gate failed, else 1 if a log could not be used.
+    Exit status: 3 if an acceptance limit was not met, else 1 if a log could not be used.
 
     \b
     Example:
@@ -78,7 +78,7 @@ def command(
     if compared is not None:
         from icrtool.fleet.acceptance import changes_of
 
-        options.warn([shown(change) for change in changes_of(rows, missing)], quiet=quiet)
+        options.warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
     print_results(rows, calibrations, output, quiet=quiet, as_json=as_json)
     options.check_compared(one for row in rows for one in row.verdicts)
     missed = any(row.gates_failed for row in rows)
@@ -137,7 +137,7 @@ def print_results(
     elif not quiet:
         click.echo(summary_of(rows, output))
         if calibrations:
-            click.echo(f"\n{shown(calibrations_text(calibrations), keep=chr(10))}", nl=False)
+            click.echo(f"\n{calibrations_text(calibrations)}", nl=False)
 
 
 @contextmanager
@@ -199,14 +199,14 @@ class View:
         self._clear()
         if row.status == "failed":
             if self._reports:
-                click.echo(f"Error: {shown(row.log)}: {shown(row.reason)}", err=True)
+                click.echo(options.error_line(escaped(row.reason), row.log), err=True)
                 if self._verbose and row.details:
-                    click.echo("\n".join(shown(line) for line in row.details.splitlines()), err=True)
+                    click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
         elif self._prints:
             click.echo(line_of(row))
         for verdict in row.verdicts:
             if not verdict.passed:
-                click.echo(shown(verdict.line()), err=True)
+                click.echo(escaped(verdict.line()), err=True)
         self._show()
 
     def _show(self) -> None:
@@ -221,7 +221,7 @@ class View:
             rate = worked / elapsed
             left = (self._logs - done) / rate
             parts += [f"{60 * rate:.3g} logs/min", f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"]
-        parts += [f"{shown(log)}: {stage}" for log, stage in list(self._stages.items())]
+        parts += [f"{LogText(log)}: {stage}" for log, stage in list(self._stages.items())]
         width = shutil.get_terminal_size().columns - 1
         click.echo(f"\r\x1b[2K{'  '.join(parts)[:width]}", err=True, nl=False)
 
@@ -234,13 +234,15 @@ def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
     from icrtool.fleet.row import SHOWN_ERROR
 
-    parts = [f"{row.status:7}", shown(row.log)]
+    parts = [f"{row.status:7}", str(LogText(row.log))]
     if row.duration_s is not None and row.distance_m is not None:
         parts.append(f"{row.duration_s:.0f} s  {row.distance_m:.0f} m")
     right, left = row.icr.get("y_icr_right_m"), row.icr.get("y_icr_left_m")
     if right is not None and left is not None:
         std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
         parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
+    elif row.reason:
+        parts.append(escaped(row.reason))
     if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
@@ -251,12 +253,8 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     counts = Counter(row.status for row in rows)
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
-    parts += [f"{failed_gates} gates failed"] if failed_gates else []
+    parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {output}: {written}"
-
-
-def shown(text: str, keep: str = "") -> str:
-    """Return a text of a log's or a library's as a terminal can show it, with the letters to `keep`."""
-    return "".join(letter if letter.isprintable() or letter in keep else "?" for letter in text)
+    logs = f"{len(rows)} log{'s' if len(rows) != 1 else ''}"
+    return f"\n{logs}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"

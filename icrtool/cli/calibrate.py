@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.argument("sources", metavar="LOG|RUN...", nargs=-1, required=True, type=options.LOG)
 @click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
 @click.option("--x-icr", metavar="METRES", type=float,
-              help="Known forward position of the ICRs; gives the antenna's position. One log.")  # fmt: skip
+              help="Forward position of the ICRs, where known: it gives that of the antenna. One log.")  # fmt: skip
 @click.option("--plot", metavar="FILE", type=options.FILE,
               help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
 @json_option
@@ -34,9 +34,9 @@ def command(
 ) -> None:  # fmt: skip
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
 
-    Several logs are pooled; each is left out in turn to test the models and to choose one. Of one log, the distance of
-    each trial is left out, and antenna place, heading offset, delays and wheel scales are estimated, too. A RUN is used
-    as it was fitted, with its configuration.
+    Several logs are fitted together; to test the models and to choose one, each log is left out in turn. With one log,
+    each trial is predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel
+    scales are estimated as well. A RUN keeps the configuration that it was fitted with.
 
     \b
     Example:

@@ -10,18 +10,18 @@ from icrtool import __version__
 from icrtool.records.text import did_you_mean
 
 _COMMANDS = {
-    "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
-    "calibrate": "Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.",
-    "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
-    "completion": "Print what bash, zsh or fish needs to complete commands, robots, keys and topics.",
-    "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
-    "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",
-    "fit": "Learn the track ICRs of a robot from its logs.",
-    "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
-    "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
+    "fit": "Learn the track ICRs of a robot from its logs.",
+    "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
     "report": "Write a run, a fleet or a comparison as one HTML file.",
+    "calibrate": "Calibrate the motion model of a robot from one log or many.",
+    "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
+    "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",
+    "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
+    "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
     "robots": "List the built-in robots, with their numbers and sources.",
+    "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
+    "completion": "Print what bash, zsh or fish needs to complete commands, robots, keys and topics.",
     "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
@@ -62,5 +62,5 @@ def icrtool() -> None:
 
     A log is an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a bare .db3. Results go to standard output,
     warnings and errors to standard error. Exit status: 0 done, 1 the log, configuration or request cannot be used,
-    2 wrong usage, 3 a gate failed.
+    2 wrong usage, 3 an acceptance limit is not met.
     """

@@ -19,9 +19,17 @@ if TYPE_CHECKING:
 
 @click.command("compare")
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
-@click.option("--csv", "csv_file", metavar="FILE", type=options.FILE, help="Write the transfer matrix.")
-@click.option("-o", "--output", metavar="FILE", type=options.FILE, help="Write it all as JSON.")
-@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw it: png, svg, pdf.")
+@click.option(
+    "--csv",
+    "csv_file",
+    metavar="FILE",
+    type=options.FILE,
+    help="Write the transfer matrix: the errors of each calibration in each group.",
+)
+@click.option(
+    "-o", "--output", metavar="FILE", type=options.FILE, help="Write the comparison as JSON, for icrtool report."
+)
+@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw the comparison: png, svg, pdf.")
 @json_option
 @options.configuration
 @options.verbosity

@@ -11,7 +11,7 @@ from icrtool.cli import options
 
 @click.command("config")
 @options.configuration
-@click.option("-o", "--output", metavar="FILE", type=options.FILE, help="Write it here.")
+@click.option("-o", "--output", metavar="FILE", type=options.FILE, help="File to write; default: standard output.")
 def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], output: Path | None) -> None:
     """Print all configuration keys as a TOML file: meaning, type and bounds, and value.
 

@@ -79,17 +79,17 @@ def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
 
 
 OPTIONS: dict[str, tuple[str, str | None, Any, str]] = {
-    "--icrs": ("icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default by the robot's width, or the study's."),
-    "--path": ("kind", None, click.Choice(PATHS), "What is driven; in study convergence, this alone."),
-    "--duration": ("duration_s", "S", POSITIVE, "Length of a drive [s]; default 100, or the study's."),
-    "--speed": ("speed_mps", "MPS", POSITIVE, "Speed of the body; of the faster track on the spot."),
+    "--icrs": ("icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default: by the robot's width, or the study's."),
+    "--path": ("kind", None, click.Choice(PATHS), "Path to drive; study convergence then has no other."),
+    "--duration": ("duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
+    "--speed": ("speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
     "--radius": ("radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
     "--leg": ("leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
-    "--encoder-counts": ("encoder_counts", "N", POSITIVE, "Counts of a wheel revolution; else the robot's, or 8192."),
-    "--input-noise": ("input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of the track speeds, a sample."),
+    "--encoder-counts": ("encoder_counts", "N", POSITIVE, "Counts per wheel turn; default: the robot's, or 8192."),
+    "--input-noise": ("input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of each sample of the track speeds."),
     "--input-bias": ("input_bias_mps", "MPS", float, "Bias of both track speeds."),
-    "--gnss": ("gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: 0.01, 0.30 or so many metres."),
-    "--gnss-rate": ("gnss_rate_hz", "HZ", POSITIVE, "Fixes a second."),
+    "--gnss": ("gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: rtk 0.01 m, waas 0.30 m."),
+    "--gnss-rate": ("gnss_rate_hz", "HZ", POSITIVE, "Fixes per second."),
 }
 """Options of `simulate` and `study`: the field of the plan, path or sensors that each sets, metavar, type, help."""
 

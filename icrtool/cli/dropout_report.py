@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from icrtool.output.exports.acceptance import Outcome
     from icrtool.records.run import Run
 
-EPILOG_GATE = 'A gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
+EPILOG_GATE = (
+    'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +63,15 @@ class Request:
 @click.option("--calibration", "calibrations", metavar="CAL.json", type=options.FILE, multiple=True,
               help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
 @click.option("--outage", "outages", metavar="SECONDS", type=options.POSITIVE, multiple=True,
-              help="Force outages of this length on the filter; repeatable.")  # fmt: skip
+              help="Force GNSS outages of this length, and report the error at their end; repeatable.")  # fmt: skip
 @click.option("--outage-at", "outages_at", metavar="SECONDS", type=float, multiple=True,
-              help="Begin of a forced outage since the first state, in place of spaced ones; repeatable.")  # fmt: skip
+              help="Begin of a forced outage, since the first state; default: equal spacing; repeatable.")  # fmt: skip
 @click.option("--reference", type=click.Choice(["filter", "smoothed"]), default="filter", show_default=True,
-              help="Compare trials with the filter's states, or the smoother's (fit --smooth).")  # fmt: skip
+              help="Compare trials with the states of the filter, or of the smoother (fit --smooth).")  # fmt: skip
 @click.option("--without-events", is_flag=True,
-              help="Leave out trials that cross a slip event, and report what they cost.")  # fmt: skip
+              help="Leave out trials that cross a slip event, and report how much they change the errors.")  # fmt: skip
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
-              help="Count each standstill once, or start from every recorded state, as the paper does.")  # fmt: skip
+              help="moving: each standstill is one start; all: every recorded state is one.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
 @options.report
@@ -84,7 +86,7 @@ def command(
     as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Report how far a robot can go without GNSS: open loop from recorded states, over 1 to 20 m.
+    """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
 
     RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
     icrtool-runs/. The report is written into the run directory, as dropout/.
@@ -132,7 +134,7 @@ def parse_horizons(text: str) -> tuple[float, ...]:
     try:
         lengths = tuple(float(part) for part in parts)
     except ValueError as err:
-        raise click.BadParameter(f"{text!r} is not a list of metres", param_hint="--horizons") from err
+        raise click.BadParameter(f"{text!r} is not a list of distances", param_hint="--horizons") from err
     if not lengths or not all(math.isfinite(length) and length > 0 for length in lengths):
         raise click.BadParameter(f"{text!r} is not a list of distances", param_hint="--horizons")
     return lengths

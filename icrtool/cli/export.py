@@ -28,8 +28,8 @@ ALL_THE_SAME = "--force exports it all the same"
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.FILE)
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
 @click.option("-o", "--output", metavar="FILE", type=options.FILE,
-              help="Write it here. For evo and kitti, DIR: a file for each path of the run.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Also a calibration that is not fit for use.")
+              help="File to write; for evo and kitti also a directory: a file for each path of the run.")  # fmt: skip
+@click.option("--force", is_flag=True, help="Also export what is not fit for use.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
 

@@ -30,7 +30,7 @@ RUNS = Path("icrtool-runs")
 @click.option("--warm-start", metavar="RUN|CAL.json", type=options.FILE,
               help="Start from another run's final ICRs and covariance, or from those of a calibration.")  # fmt: skip
 @click.option("--terrain-change", "changes", metavar="T", type=float, multiple=True,
-              help="Inflate the ICR covariance T seconds after the start. Repeatable.")  # fmt: skip
+              help="The ground changes after T seconds: inflate the ICR covariance there; repeatable.")  # fmt: skip
 @click.option("--smooth", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
 @json_option
 @options.cut
@@ -114,7 +114,9 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
         return [output]
     parent = output or into
     if parent is not None and (parent / RUN_FILE).is_file():
-        raise OutputError(parent, "is a run itself", "runs in it would go when it is fitted again: name another place")
+        raise OutputError(
+            parent, "is a run itself", "fitting that run again would remove the runs in it: name another place"
+        )
     return [(parent or RUNS) / name for name in distinct_names(logs)]
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
               help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
 @options.budgets
 @click.option("-o", "--output", metavar="FILE.csv", type=options.FILE, help="Write a row for each metre.")
-@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw it: png, svg, pdf.")
+@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw the errors: png, svg, pdf.")
 @json_option
 @options.quiet
 def command(
@@ -32,9 +32,9 @@ def command(
 ) -> None:  # fmt: skip
     """Forecast the error of driving a path without GNSS, with a calibrated motion model.
 
-    Expected and 95 % error after each metre from the start of the path, by the covariance of the calibration and the
-    error growth that it measured on distance it was not fitted to: wheels alone and, where the calibration has it, with
-    a gyro. A negative speed_mps in a plan drives in reverse.
+    The expected and the 95 % error are given after each metre of the path: for wheels alone and, where the calibration
+    has a gyro, with it. They follow from the covariance of the calibration and from its error growth, which was
+    measured on held-out distance. A negative speed_mps in a plan drives in reverse.
 
     \b
     Example:

@@ -36,8 +36,8 @@ def command(
 ) -> None:  # fmt: skip
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 
-    The filter runs as well, and nothing is written: the report includes which ICRs the drive determines, and what to
-    drive next where one of them is not determined.
+    The filter runs too, but nothing is written. The report names the ICRs that the drive shows and, where
+    one is not shown, what to drive next.
 
     Exit status 1 when `icrtool fit` could not run on a log.
     """

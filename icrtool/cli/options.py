@@ -72,8 +72,8 @@ def place(command: Command) -> Command:
     return add_options(
         command,
         click.option("-o", "--output", metavar="DIR", type=FILE,
-                     help="Run directory of a log; of several logs: its parent."),
-        click.option("--into", metavar="DIR", type=FILE, help="Parent of the run directories, also of one log."),
+                     help="Run directory of the log; with several logs: the folder of their run directories."),
+        click.option("--into", metavar="DIR", type=FILE, help="Folder of the run directories, also for one log."),
         click.option("--overwrite", is_flag=True, help="Also replace the run of another recording."),
     )  # fmt: skip
 
@@ -133,17 +133,17 @@ def report(command: Command) -> Command:
     return add_options(
         cast("Command", with_options),
         budgets,
-        click.option("--gate", "gates", metavar="TEXT", multiple=True,
+        click.option("--gate", "gates", metavar="LIMIT", multiple=True,
                      help="Acceptance limit: exit status 3 if it is not met; repeatable."),
         click.option("--baseline", metavar="REPORT.json|DIR", type=FILE,
-                     help="Earlier report, run or batch to compare with; a gate may then read "
+                     help="Earlier report, run or batch to compare with; a limit may then read "
                      "\"icr.p95@10m <= 1.1 * baseline\"."),
         click.option("--strict-gates", "strict", is_flag=True,
-                     help="A gate on the baseline fails by its number alone, also where the interval of the "
-                     "difference reaches the bound."),
+                     help="Compare limits relative to the baseline by their number alone, without the "
+                     "confidence interval of the difference."),
         click.option("--ladder/--no-ladder", default=True, show_default=True,
-                     help="Compare all models on distance they were not fitted to, gyro included."),
-        click.option("--junit", metavar="FILE", type=FILE, help="Write the gates' verdicts as JUnit XML."),
+                     help="Compare all models, with a gyro too, on distance that they were not fitted to."),
+        click.option("--junit", metavar="FILE", type=FILE, help="Write the verdicts on the limits as JUnit XML."),
         click.option("--markdown", metavar="FILE", type=FILE, help="Write a summary for a pull request."),
         plots,
         click.option("--page/--no-page", default=True, show_default=True,
@@ -213,7 +213,7 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
             click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
 
-def error_line(err: IcrToolError, source: Path | str) -> str:
+def error_line(err: IcrToolError | str, source: Path | str) -> str:
     """Return the line about an error, which names the log or run that it occurred in."""
     name = shortened(escaped(str(source)), LONGEST_NAME)
     named = any(part in str(err) for part in (name, escaped(Path(source).name), escaped(Path(source).stem)))
@@ -227,7 +227,9 @@ def report_error(err: IcrToolError, source: Path | str) -> None:
 
 
 def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = False) -> None:
-    """Exit with the status of a command that had several inputs: 3 if a gate failed, else 1 if an input failed.
+    """Exit with the status of a command that had several inputs.
+
+    It is 3 if an acceptance limit was not met, else 1 if an input failed.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from icrtool.cli.fit import RUNS
 @click.option("-o", "--output", metavar="FILE", type=options.FILE,
               help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
 @click.option("--no-coordinates", is_flag=True,
-              help="Leave out where on the globe a run was, for a page that is passed on.")  # fmt: skip
+              help="Leave out the place on the globe, for a page that others will read.")  # fmt: skip
 @options.quiet
 def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.

@@ -12,7 +12,7 @@ from icrtool.output.text_blocks import Line, Table, Text
 @click.command("robots")
 @json_option
 def command(as_json: bool) -> None:
-    """List the built-in robots for --robot, with their numbers and the sources of them.
+    """List the built-in robots for --robot, with their numbers and sources.
 
     For another robot, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…, or a file: icrtool config
     prints one to fill in.

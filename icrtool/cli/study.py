@@ -46,16 +46,19 @@ def values_text(text: str) -> tuple[float, ...]:
 @click.option("-o", "--output", metavar="DIR", type=options.FILE,
               help="Study directory; default icrtool-runs/study-NAME.")  # fmt: skip
 @click.option("--runs", metavar="N", type=click.IntRange(min=1),
-              help="Runs of every setting (from every start, in study initial).")  # fmt: skip
+              help="Runs for each value (in study initial: for each start).")  # fmt: skip
 @options.seed
-@click.option("--values", metavar="V,V,...", type=values_text, help="Settings of what the study varies, in its unit.")
+@click.option("--values", metavar="V,V,...", type=values_text,
+              help="Values of the quantity that the study varies, in its unit.")  # fmt: skip
 @click.option("--preset", type=click.Choice(["paper", "field"]),
-              help="Study this preset alone; default both; initial: paper; convergence: paper, field with a robot.",
+              help="Study this preset alone; default: both; initial: paper; convergence: paper, or field with --robot.",
               )  # fmt: skip
 @drive_options()
 @click.option("--wheels", type=click.Choice(["ideal", "encoder"]),
               help="Wheel speeds without error, or counted travel.")  # fmt: skip
-@click.option("--rate", metavar="HZ", type=click.FloatRange(min=1, max=200), help="Wheel and heading samples a second.")
+@click.option(
+    "--rate", metavar="HZ", type=click.FloatRange(min=1, max=200), help="Wheel and heading samples per second."
+)
 @click.option("--heading-std", "heading_std_rad", metavar="DEG", type=degrees(POSITIVE),
               help="White noise of the heading.")  # fmt: skip
 @options.plots
@@ -80,7 +83,7 @@ def command(
       rate                        whether logs of any rate give the same ICRs
       consistency                 whether the filter's covariance is right
 
-    Everything left out is the paper's (Pentzer 2014, Section 5); --robot and the options put your own in. DIR holds
+    Defaults are those of the paper (Pentzer 2014, Section 5); --robot and the options replace them. DIR holds
     study.json, every run in NAME.csv, and the picture.
 
     \b

@@ -96,7 +96,7 @@ def run_filter(
     table = _states(sensors.wheels, output)
     if table.fault:
         advice = "check warm start and configuration, or cut the log there (--from, --to)"
-        raise DataError(sensors.name, f"the filter broke down: {table.fault}", advice)
+        raise DataError(sensors.name, f"the filter failed: {table.fault}", advice)
     gnss = _outcome(
         sensors.fixes.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code,
         np.hypot(*output.gnss_residual.T),

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
@@ -13,6 +14,7 @@ from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import UNSEEN
+from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import States
 
@@ -35,7 +37,11 @@ UNUSABLE_SHARE = 0.3
 
 
 def unusable_reasons(
-    excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome, noise: ProcessNoise
+    excitation: Excitation,
+    gnss: MeasurementOutcome,
+    heading: MeasurementOutcome,
+    noise: ProcessNoise,
+    wheel_scale: Finding | None = None,
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be."""
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
@@ -45,9 +51,13 @@ def unusable_reasons(
         if share > UNUSABLE_SHARE:
             reasons.append(f"{100 * share:.0f} % of the {word} rejected")
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
-        reasons.append("the wheels explain next to nothing of the motion")
+        reasons.append("the wheels explain almost none of the motion")
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
-        reasons.append("the wheels explain next to nothing of the turns: do they slip, as on ice?")
+        reasons.append("the wheels explain almost none of the turns: do they slip, as on ice?")
+    if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
+        left = wheel_scale.value / wheel_scale.applied
+        if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
+            reasons.append(f"the robot goes {100 * left:.0f} % of the distance that the wheels report")
     return reasons
 
 
@@ -94,12 +104,12 @@ def run_warnings(
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
-    for word, outcome, why in (
-        ("fixes", gnss, "clocks, antenna place or quality of the fixes do not fit the wheels"),
-        ("headings", heading, "clocks, mounting or quality of the heading do not fit the wheels"),
+    for word, outcome, causes in (
+        ("fixes", gnss, "clocks, position of the antenna, quality of the fixes"),
+        ("headings", heading, "clocks, mounting of the sensor, quality of the headings"),
     ):
         if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
-            found.append(f"{100 * share:.0f} % of the {word} were rejected: {why}")
+            found.append(f"{100 * share:.0f} % of the {word} were rejected: check {causes}")
     return [f"{name}: {warning}" for warning in found]
 
 

@@ -30,12 +30,15 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
     counts = Counter(row.status for row in rows)
-    failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
+    shown = [(row, one) for row in rows for one in row.verdicts]
+    failed_gates = [one for _, one in shown if not one.passed]
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
-    if any(row.verdicts for row in rows):
-        lines += [f"**{len(failed_gates)} gates failed.**" if failed_gates else "All gates passed.", ""]
-    shown = [(row, one) for row in rows for one in row.verdicts]
+    if shown:
+        met = (
+            f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
+        )
+        lines += [met, ""]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
         limits = []
@@ -45,7 +48,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
             verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
             numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
             limits.append([escaped_markdown(row.log), escaped_markdown(one.gate.text), *numbers, interval, verdict])
-        head = ("log", "gate", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
+        head = ("log", "acceptance limit", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
         lines += [*markdown_table(head, limits, (0, 1, 7)), ""]
     errors = []
     for row in rows:

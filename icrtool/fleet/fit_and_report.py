@@ -76,7 +76,7 @@ def fit_and_write(
     # The callee alone holds the log, and frees its columns where they are needed no longer.
     run = fit(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=begin)
     if note is not None and (before := replaced_log(directory, run)) is not None:
-        note(f"{directory}: the run of another log, or of other content, was there ({before}): replaced")
+        note(f"{directory}: replaced the run of another recording ({before})")
     begin("writing, pictures" if plots else "writing")
     write_run(run, directory, states=states, plots=plots, note=note)
     return run

@@ -115,7 +115,9 @@ def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
     rows: list[Mapping[str, Any]] = []
     for number, row in enumerate(reader, start=2):
         if None in row or None in row.values():
-            raise ConfigError(f"{path}:{number}", "has not as many values as the first line has names", "add commas")
+            raise ConfigError(
+                f"{path}:{number}", "has more or fewer values than the first line has names", "give one each"
+            )
         rows.append({**row, "tags": [tag.strip() for tag in (row.get("tags") or "").split(";") if tag.strip()]})
     return rows
 

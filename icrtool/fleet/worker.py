@@ -134,7 +134,7 @@ def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
     if status >= 0:
         return f"its process ended with exit status {status}"
     name = signal.Signals(-status).name
-    return f"its process was ended by {name}{', for want of memory perhaps' if name == 'SIGKILL' else ''}"
+    return f"its process was ended by {name}{', perhaps for lack of memory' if name == 'SIGKILL' else ''}"
 
 
 _mine = threading.local()

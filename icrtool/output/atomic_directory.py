@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from icrtool.errors import OutputError
 from icrtool.output import disk
 from icrtool.output.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
+from icrtool.records.text import escaped
 from icrtool.records.unfinished import end, unfinished
 
 IsOurs = Callable[[Path], bool]
@@ -284,5 +285,4 @@ def _listed(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:
         )
     )
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    text = ", ".join(names[:NAMES_SHOWN]) + more
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+    return escaped(", ".join(names[:NAMES_SHOWN]) + more)

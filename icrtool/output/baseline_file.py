@@ -122,7 +122,7 @@ def read_report(path: Path, log: str = "") -> BaselineReport:
     except OSError as err:
         raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as err:
-        raise ConfigError(f"--baseline {path}", "not a whole dropout report", ADVICE) from err
+        raise ConfigError(f"--baseline {path}", "not a complete dropout report", ADVICE) from err
 
 
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:

@@ -36,7 +36,7 @@ KNOWS = {
     "icr": "the distance up to each start",
     "no_slip": "the track width",
     "icr_final": "all of the drive (in sample)",
-    "recommended": "the blocks of the drive that the trial does not touch",
+    "recommended": "the rest of the drive",
 }
 """What the ICRs of a model were learned from."""
 

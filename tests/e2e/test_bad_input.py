@@ -577,3 +577,25 @@ def test_header_stamps_of_another_clock_are_reported(tmp_path: Path, jump_ns: in
         path, lambda _, stamp, data: (stamp, with_header(data, stamp + jump_ns * (stamp > START_NS + 18 * 10**9)))
     )
     assert any("header stamps are of another clock" in warning for warning in read_log(late, CONFIG).warnings)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
+def test_a_recording_of_more_files_than_a_process_may_open_at_first_is_read(tmp_path: Path) -> None:
+    import resource
+
+    folder = tmp_path / "many"
+    folder.mkdir()
+    shutil.move(log(tmp_path), folder / "log_0.mcap")
+    for number in range(1, 60):
+        with (folder / f"log_{number}.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            writer.finish()
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    command = [sys.executable, "-P", "-m", "icrtool", "info", str(folder), "--json", *ROBOT]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (40, most)),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "open files" not in done.stdout + done.stderr

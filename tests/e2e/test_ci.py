@@ -58,7 +58,7 @@ def test_the_jobs_of_the_page_write_what_they_pass_on(place: Path) -> None:
         assert [suite.get("name") for suite in suites] == ["field.mcap", "other.mcap"]
         assert all(case.find("failure") is None for suite in suites for case in suite)
     text = (place / "summary.md").read_text(encoding="utf-8")
-    assert "All gates passed" in text
+    assert "All acceptance limits are met" in text
     assert text.count("field.mcap") >= 2
     row = json.loads((place / "results" / "fleet.json").read_bytes())["logs"][0]
     assert row["verdicts"][0]["baseline_m"] == row["verdicts"][0]["value_m"]

@@ -103,7 +103,7 @@ def test_all_files_say_the_same(fitted: Path) -> None:
     assert gate["value_m"] == summary.loc[("no_slip", 7.5), "max_m"]
     cases = ET.parse(fitted / "gates.xml").getroot().findall("testsuite/testcase")
     assert [case.find("failure") is None for case in cases] == [True, False]
-    assert "**A gate failed.**" in (fitted / "pr.md").read_text(encoding="utf-8")
+    assert "limit is not met" in (fitted / "pr.md").read_text(encoding="utf-8")
 
 
 def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(folder: Path) -> None:

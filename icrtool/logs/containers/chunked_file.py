@@ -50,7 +50,7 @@ class ChunkedFile(ABC):
         self.files = [path]
         self.problems = Problems(path.name)
         self._message = message
-        self._rows: Ints = np.empty((MOST_ROWS, 5), np.int64)
+        self._rows: Ints = np.empty((0, 5), np.int64)
         self._inflation, self._space = Inflation(), Space()
         self._stream = path.open("rb")
         self._size = path.stat().st_size
@@ -90,6 +90,7 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
+        self._rows = np.empty((0, 5), np.int64)
         self._space.free()
         self._inflation.free()
 
@@ -145,6 +146,8 @@ class ChunkedFile(ABC):
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
+        if not len(self._rows):
+            self._rows = np.empty((MOST_ROWS, 5), np.int64)
         count, stop = self._scan(data, begin, self._rows)
         rows = self._rows[:count]
         is_message = rows[:, 0] == self._message

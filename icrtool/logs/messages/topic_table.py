@@ -252,8 +252,9 @@ class TopicCollector:
         fields = new[:, slot.column : slot.column + (repeat - 1) * slot.stride + 3].T
         places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
         _, first = np.unique(codes, return_index=True)
-        for i in np.sort(first).tolist():
-            if (code := int(codes[i])) not in texts:
+        first.sort()
+        for i, code in zip(first.tolist(), codes[first].tolist(), strict=True):
+            if code not in texts:
                 raw = block.data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
                 texts[code] = LogText(raw.decode("utf-8", "replace"))
         if len(texts) > MOST_TEXTS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from functools import lru_cache
 
 _WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
 _OTHER_JOINTS = re.compile(
@@ -36,14 +37,17 @@ def _words(name: str) -> list[str]:
 
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
     """Return the positions of the left and of the right wheel joints among the names of a message."""
-    usable = [i for i, name in enumerate(names) if side_of(name) and not _belongs_elsewhere(name)]
-    named = [i for i in usable if _WHEEL_WORDS.search(names[i])]
-    chosen = named or usable
-    return [i for i in chosen if side_of(names[i]) == "left"], [i for i in chosen if side_of(names[i]) == "right"]
+    sides = [(i, *_side_of_wheel(name)) for i, name in enumerate(names)]
+    any_named = any(named for _, side, named in sides if side)
+    left, right = ([i for i, side, named in sides if side == one and named >= any_named] for one in ("left", "right"))
+    return left, right
 
 
-def _belongs_elsewhere(name: str) -> bool:
-    return any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
+@lru_cache(4096)
+def _side_of_wheel(name: str) -> tuple[str, bool]:
+    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
+    elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
+    return "" if elsewhere else side_of(name), bool(_WHEEL_WORDS.search(name))
 
 
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:

@@ -32,6 +32,9 @@ _FUSED = re.compile(
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
 
+MOST_WHEELS = 32
+"""Of a side. A message that lists more is not of wheels, or was made to take time."""
+
 NEVER_MOVES = 60.0
 """Subtracted from the score of wheels that never move: another topic that moves is preferred."""
 
@@ -139,11 +142,10 @@ def _unwound(positions: Floats) -> Floats:
     This is done before a side is averaged: a front and a rear wheel do not begin a turn at the same time.
     """
     unwound = positions
-    for place, column in enumerate(positions.T):
-        with np.errstate(invalid="ignore"):  # infinite ones are left out later
-            spread = float(np.nanmax(column, initial=-np.inf) - np.nanmin(column, initial=np.inf))
-        if not spread <= ONE_TURN_RAD:
-            continue
+    with np.errstate(invalid="ignore"):  # infinite ones are left out later
+        spread = np.fmax.reduce(positions, axis=0, initial=-np.inf) - np.fmin.reduce(positions, axis=0, initial=np.inf)
+    for place in np.flatnonzero(spread <= ONE_TURN_RAD).tolist():
+        column = positions[:, place]
         finite = np.flatnonzero(np.isfinite(column))
         steps = np.abs(np.diff(column[finite]))
         wraps = steps > np.pi
@@ -162,6 +164,10 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
         named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
         return no_motion(table, named if texts else "lists no joints")
     lefts, rights = len(left), len(right)
+    if max(lefts, rights) > MOST_WHEELS:
+        return no_motion(
+            table, f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
+        )
     # Joints by their place among the wheels, left ones first; -1 for all others.
     wheel = np.full(len(texts) + 1, -1)
     wheel[left + right] = np.arange(lefts + rights)

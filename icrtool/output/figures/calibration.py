@@ -18,7 +18,7 @@ SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
 BEFORE: dict[str, Any] = {
-    "label": "before: as configured, W estimated",
+    "label": "before: as configured, ICR separation estimated",
     "marker": "s",
     "color": "0.62",
     "markersize": 3.2,

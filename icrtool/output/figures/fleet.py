@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, styled
-from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ROW_IN = 0.32
-LONGEST_LABEL = 48
+LEAST_DAYS = 1.0
+"""Shown of the calendar: matplotlib gives a single date four years."""
+LONGEST_ROBOT, LONGEST_GROUP, LONGEST_REASON = 24, 24, 40
+"""Characters of a label that there is space for."""
+
 COLORS = ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
@@ -58,13 +61,18 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     for axes, side, label in zip(panels, (0, 1), ("ICR y right [m]", "ICR y left [m]"), strict=True):
         for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
             mine = [point for point in fleet.points if point.robot == robot]
+            key = f" {drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
             when = date2num([np.datetime64(point.date.rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
             axes.errorbar(
                 when, [point[2 + side] for point in mine], [point[4 + side] for point in mine],
                 linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
-                markersize=4.5, capsize=2.0, linewidth=1.0, label=drawable(robot or "robot not named"),
+                markersize=4.5, capsize=2.0, linewidth=1.0, label=key,
             )  # fmt: skip
         axes.set_ylabel(label)
+    first, last = panels[-1].get_xlim()
+    if last - first < LEAST_DAYS or len({point.date for point in fleet.points}) == 1:
+        middle = (first + last) / 2
+        panels[-1].set_xlim(middle - LEAST_DAYS / 2, middle + LEAST_DAYS / 2)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
@@ -77,7 +85,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
 def fleet_errors(fleet: FleetNumbers) -> Figure:
     """Return the 95 % error of the ICRs after 10 m of every log by group, the median marked."""
     what = "95 % error after 10 m without GNSS, momentary ICRs; bar: median of the logs"
-    labels = [f"{shortened(name, LONGEST_LABEL)} ({len(values)})" for name, values in fleet.errors_m.items()]
+    labels = [f"{drawable(name, LONGEST_GROUP)} ({len(values)})" for name, values in fleet.errors_m.items()]
     figure, axes = _rows(fleet.title, what, labels, left_in=2.4)
     for row, values in enumerate(fleet.errors_m.values()):
         axes.plot(values, [row] * len(values), linestyle="none", marker="o", markersize=4.5, color=COLORS[0], alpha=0.6)
@@ -89,7 +97,7 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
 @styled
 def fleet_failures(fleet: FleetNumbers) -> Figure:
     """Return how many logs could not be used, by reason."""
-    labels = [shortened(reason, LONGEST_LABEL) for reason in fleet.reasons]
+    labels = [drawable(reason, LONGEST_REASON) for reason in fleet.reasons]
     figure, axes = _rows(fleet.title, "logs that could not be used, by reason", labels, left_in=3.3)
     axes.barh(range(len(labels)), list(fleet.reasons.values()), height=0.6, color=COLORS[1])
     axes.set_xlabel("Logs [-]")
@@ -102,6 +110,6 @@ def _rows(title: str, what: str, labels: Sequence[str], *, left_in: float) -> tu
     height_in = 1.7 + ROW_IN * max(len(labels), 2)
     figure = new_figure(title, what, height_in=height_in, margins_in=(left_in, 0.3, 0.85, 0.6))
     axes = figure.subplots()
-    axes.set_yticks(range(len(labels)), [drawable(label) for label in labels], parse_math=False)
+    axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     return figure, axes

@@ -9,7 +9,6 @@ import numpy as np
 
 from icrtool.output.figures.style import HALF_WIDTH, ICR, drawable, new_figure, styled
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,16 +26,17 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
     """
     names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
-    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
+    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by a fit that does not contain it"
     figure = new_figure(
-        " · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows),
-        margins_in=(1.3, 0.2, 1.0, 0.65), wspace=0.75,
+        " · ".join(names), subtitle, width_in=9.6, height_in=2.8 + 0.45 * len(names) + 0.12 * len(rows),
+        margins_in=(1.3, 0.2, 0.8, 1.0), wspace=1.15,
     )  # fmt: skip
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
     _draw_matrix(matrix, document, names)
     labels = []
     for y, one in enumerate(rows):
-        labels.append(f"{_short(one['calibrated_on'])} on {_short(one['tested_on'])}, {one['horizon_m']:g} m")
+        calibrated, tested = (drawable(one[key], LONGEST_NAME) for key in ("calibrated_on", "tested_on"))
+        labels.append(f"{calibrated} on {tested}, {one['horizon_m']:g} m")
         if _known(one["p95_low_m"]):
             costs.plot([one["p95_low_m"], one["p95_high_m"]], [y, y], **ICR.keywords() | {"linestyle": "-"})
         costs.plot([one["p95_m"]], [y], "o", color=ICR.color, markersize=4)
@@ -57,8 +57,8 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
     for row, column in np.ndindex(values.shape):
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [_short(name) for name in names]
-    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False)
+    short = [drawable(name, LONGEST_NAME) for name in names]
+    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
     axes.set_xlabel(f"tested on, after {CHOICE_HORIZON_M:g} m")
     axes.set_ylabel("calibrated on")
@@ -67,7 +67,3 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
 
 def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
-
-
-def _short(name: str) -> str:
-    return shortened(drawable(name), LONGEST_NAME)

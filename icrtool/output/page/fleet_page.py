@@ -90,7 +90,7 @@ def _columns(budgets: Sequence[str]) -> list[str]:
     within = [f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for" for name in budgets]
     errors = [f"error, {label}" for label in MODELS.values()]
     found = ["multiplier", "ICR y right", "ICR y left", "ICR x", "distance", "duration", "start"]
-    return [*within, *errors, *found, "events", "warnings", "gates failed"]
+    return [*within, *errors, *found, "events", "warnings", "limits not met"]
 
 
 def _search_text(log: Mapping[str, Any]) -> str:

@@ -9,8 +9,9 @@ import numpy as np
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
-from icrtool.motion.models import TERMS, FittedModel
+from icrtool.motion.models import TERMS, FittedModel, find_model
 from icrtool.output.text_blocks import Block, Table, Text
+from icrtool.output.text_format import model_text
 
 GEOMETRY = (
     ("y_icr_right_m", "y ICR right", "m"),
@@ -25,9 +26,9 @@ GEOMETRY = (
 
 def format_result(result: CalibrationResult) -> Text:
     """Return the tables of a pooled calibration, no line end."""
-    calibration = result.calibration
+    calibration, fitted = result.calibration, result.calibration.fitted
     blocks: list[Block] = [
-        f"Recommended: {calibration.recommended} ({calibration.fitted.model.label}): {calibration.why}",
+        f"Recommended: {model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))}: {calibration.why}",
         "",
         *_parameter_blocks(calibration),
         "",
@@ -72,12 +73,17 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
         (row.label.removesuffix(" + gyro"), *(_cell(row, h) for h in range(len(table.horizons_m))))
         for row in table.scores
     ]
-    used = ", ".join(dict.fromkeys(table.chosen))
-    tested = f"each {what} left out in turn" if table.folds[0].whole else "each trial predicted without its distance"
+    used = "; ".join(dict.fromkeys(find_model(name).label for name in table.chosen))
+    recommended = find_model(table.recommended).label
+    tested = (
+        f"each {what} left out in turn"
+        if table.folds[0].whole
+        else "each trial predicted by a fit to the rest of the drive"
+    )
     return [
         f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m], median {what} (worst {what})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),
-        f"recommended: chosen without the {what} it is tested on ({used}); of all: {table.recommended}",
+        f"recommended: chosen without the {what} that it is tested on: {used}; for all: {recommended}",
     ]
 
 

@@ -37,9 +37,9 @@ def comparison_blocks(comparison: ModelComparison) -> list[Block]:
 def extended_line(comparison: ModelComparison) -> str:
     """Return which models were chosen for the blocks, and which one for the whole drive."""
     names = {name: fit.model.label for name, fit in comparison.fits.items()}
-    whole = f"for the whole drive: {names[comparison.best]}"
+    whole = f"for all: {names[comparison.best]}"
     used = dict.fromkeys(names[name] for name in comparison.chosen)
-    return f"extended, chosen without the block it is tested on: {'; '.join(used)}; {whole}"
+    return f"extended: chosen without the block that it is tested on: {'; '.join(used)}; {whole}"
 
 
 def comparison_rows(comparison: ModelComparison) -> Iterator[Sequence[str | int | float]]:

@@ -234,10 +234,10 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
 @pytest.mark.parametrize(
     ("told", "stated_m", "real_m", "words"),
     [
-        (FIXED_FIX, np.nan, 0.3, "the fixes state no accuracy and scatter by 0.3 m: that is used"),
-        (FIXED_FIX, 0.0, 0.3, "the fixes state no accuracy and scatter by 0.3 m: that is used"),
-        (OTHER_FIX, 0.2, 0.5, "the other fixes state ±0.2 m and scatter by 0.5 m: that is used"),
-        (FLOAT_FIX, 0.2, 0.5, "the float fixes state ±0.2 m and scatter by 0.5 m: that is used"),
+        (FIXED_FIX, np.nan, 0.3, "the fixes state no accuracy and scatter by 0.3 m"),
+        (FIXED_FIX, 0.0, 0.3, "the fixes state no accuracy and scatter by 0.3 m"),
+        (OTHER_FIX, 0.2, 0.5, "the other fixes state ±0.2 m and scatter by 0.5 m"),
+        (FLOAT_FIX, 0.2, 0.5, "the float fixes state ±0.2 m and scatter by 0.5 m"),
     ],
 )
 def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float, real_m: float, words: str) -> None:
@@ -246,7 +246,8 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
-    assert quality.warnings == (f"made: {words}",)
+    (warning,) = quality.warnings
+    assert warning.startswith(f"made: {words}")
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
 
 
@@ -257,10 +258,8 @@ def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     count = int(np.count_nonzero(float_))
     # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
     (warning,) = quality.warnings
-    assert warning == (
-        f"made: {count:,} fixes ({100 * count / len(float_):.0f} %) are no RTK fixed solution in a log where that is "
-        f"usual: given ±{0.4 * np.sqrt(2 * 10 * 25):.2g} m, as they err alike"
-    )
+    assert f"{count:,} fixes ({100 * count / len(float_):.0f} %)" in warning
+    assert f"±{0.4 * np.sqrt(2 * 10 * 25):.2g} m" in warning
 
 
 def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_number() -> None:
@@ -270,7 +269,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_numbe
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
     assert quality.misreported.any()
-    assert "claim to be fixed but scatter or jump like RTK float" in quality.warnings[0]
+    assert "RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)
 
 

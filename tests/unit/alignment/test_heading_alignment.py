@@ -120,8 +120,8 @@ def constant(log: RobotLog) -> Floats:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (random, "scatters so much"),
-        (wandering, "points nowhere"),
+        (random, "scatters over all directions"),
+        (wandering, "scatters over all directions"),
         (frozen, "stays the same while the wheels turn the robot"),
         (constant, "stays the same"),
     ],

@@ -213,6 +213,6 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
 
 def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:
     text = format_result(result)
-    assert text.splitlines()[0].startswith(f"Recommended: {result.calibration.recommended}")
+    assert text.splitlines()[0].startswith(f"Recommended: {result.calibration.fitted.model.label}")
     assert "each log left out in turn (3 logs)" in text
     assert max(map(len, text.splitlines())) <= 110

@@ -177,3 +177,22 @@ def test_parts_with_parameters_of_their_own_give_what_the_dense_jacobian_gives()
     np.testing.assert_allclose(one.information, of_parts + np.diag(std[:shared] ** -2.0), rtol=1e-9)
     gradient = one.jacobian.T @ (weights[:, 0] * one.residuals) + one.own_pull.sum(axis=0)
     assert np.all(np.abs(gradient + one.x[:shared] / std[:shared] ** 2) < 0.05 * np.sqrt(np.diag(one.information)))
+
+
+def test_groups_that_differ_are_covered_where_they_are_few() -> None:
+    """Three stretches with means of their own: their spread alone is too often small, the expected one holds it up."""
+    rng, size, spread = np.random.default_rng(1), 40, 0.3
+    groups = np.repeat(np.arange(3), size)
+    z: dict[float | None, list[float]] = {None: [], spread: []}
+    for _ in range(400):
+        values = rng.normal(0.0, spread, 3)[groups] + rng.normal(0.0, 0.1, 3 * size)
+        for expected, errors in z.items():
+            residuals = values.mean() - values
+            covariance, _, _ = sandwich_covariance(
+                residuals, np.ones((len(groups), 1)), np.full(len(groups), spread), groups, np.array([[1e-6]]),
+                group_std=None if expected is None else np.array([expected]),
+            )  # fmt: skip
+            errors.append(abs(values.mean()) / np.sqrt(covariance[0, 0]))
+    covered = {expected: np.mean(np.array(errors) < 2.0) for expected, errors in z.items()}
+    assert covered[None] < 0.88
+    assert 0.88 < covered[spread] < 0.99

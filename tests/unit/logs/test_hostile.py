@@ -219,6 +219,15 @@ def test_a_file_that_is_named_twice_is_read_once(tmp_path: Path) -> None:
     container.close()
 
 
+def test_a_recording_of_too_many_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(3):
+        good_db3(tmp_path / f"log_{number}.db3")
+    open_log(tmp_path).close()
+    monkeypatch.setattr("icrtool.logs.containers.bag_directory._MOST_FILES", 2)
+    with pytest.raises(LogError, match="3 storage files; at most 2"):
+        open_log(tmp_path)
+
+
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
 def test_a_cut_holds_the_messages_of_its_times(tmp_path: Path, kind: str) -> None:
     if kind == "db3":
@@ -383,6 +392,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, sqlite_bag
     from icrtool.logs.messages import schema, topic_table
+    from icrtool.logs.streams import wheel_sources
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
@@ -392,7 +402,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
         sqlite_bag._LARGEST_MESSAGE_BYTES, schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, text.LONGEST_TEXT, topic_table.MOST_TEXTS,
-        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES,
+        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_sources.MOST_WHEELS,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
 
@@ -499,6 +509,19 @@ def test_topics_of_many_joints_take_memory_for_their_messages_only() -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20 * 40 * len(wide)
+
+
+@pytest.mark.parametrize(("side", "problem"), [(32, ""), (33, "33 left and 33 right wheels; at most 32")])
+def test_a_message_of_more_wheels_than_a_robot_has_is_not_of_wheels(side: int, problem: str) -> None:
+    from icrtool.config import Config
+    from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
+
+    names = [f"{one}_wheel_{k}" for k in range(side) for one in ("left", "right")]
+    rows = [(START_NS + i, joints(START_NS + i, names, [0.1 * i] * len(names))) for i in range(3)]
+    table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, rows)
+    motion = WHEEL_TYPES["sensor_msgs/JointState"][1](table, Config())
+    assert problem in motion.problem
+    assert bool(motion.problem) == bool(problem)
 
 
 def test_a_topic_of_ever_new_names_is_refused() -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from icrtool.output.figures.style import drawable, new_figure, save, style
+from icrtool.output.figures.fleet import FleetNumbers, IcrPoint, fleet_errors, fleet_failures, fleet_icrs
+from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
 
@@ -22,3 +28,35 @@ def test_a_hostile_name_is_drawn_as_text(tmp_path: Path, name: str) -> None:
 
 def test_an_ordinary_name_is_unchanged() -> None:
     assert drawable("drive 12 – é, ±2σ, 4 m²") == "drive 12 – é, ±2σ, 4 m²"
+
+
+def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
+    names = (*HOSTILE, "_hidden", "W" * 300)
+    points = [IcrPoint(name, "2025-10-09T08:53:21Z", 0.4, -0.4, 0.01, 0.01) for name in names]
+    fleet = FleetNumbers("logs", points, {name: [0.1, 0.2] for name in names}, dict.fromkeys(names, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for draw in (fleet_icrs, fleet_errors, fleet_failures):
+            save(draw(fleet), tmp_path / "fleet", ("png", "svg"))
+    shown = [text.get_text().strip() for text in fleet_icrs(fleet).legends[0].get_texts()]
+    assert shown == [drawable(name, 24) for name in names]
+
+
+def test_settings_of_matplotlib_that_are_no_text_are_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "matplotlibrc").write_bytes(b"axes.grid: \xff")
+    code = "import icrtool.figures"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stderr.splitlines()[-1].startswith("icrtool.errors.OutputError: matplotlibrc: ")
+
+
+def test_a_png_picture_is_what_matplotlib_would_save() -> None:
+    figure = new_figure("title", "subtitle", width_in=3.0, height_in=2.0)
+    figure.subplots().plot([0.0, 1.0], [0.0, 1.0])
+    saved = BytesIO()
+    with style():
+        figure.savefig(saved, format="png")
+    with Image.open(BytesIO(picture_bytes(figure, "png"))) as ours, Image.open(saved) as theirs:
+        assert np.array_equal(ours.convert("RGBA"), theirs.convert("RGBA"))
+        assert ours.info["dpi"] == theirs.info["dpi"]

@@ -139,12 +139,13 @@ const icrtoolMap = (() => {
       const items = marks.selectAll("g").data(ends).join((enter) => {
         const g = enter.append("g");
         g.append("rect").attr("x", -4).attr("y", -4).attr("width", 8).attr("height", 8);
-        g.append("text").attr("x", 8).attr("y", -7);
+        g.append("text").attr("y", -7);
         return g;
       });
       items.attr("transform", ([step]) => `translate(${x(east[step])},${y(north[step])})`);
       items.select("rect").attr("stroke", color("filter")).attr("stroke-width", 2).attr("fill", ([, name]) => color(name === "start" ? "paper" : "filter"));
-      items.select("text").text(([, name]) => name);
+      const outside = ([step]) => x(east[step]) > width - 40;
+      items.select("text").attr("x", (d) => (outside(d) ? -8 : 8)).attr("text-anchor", (d) => (outside(d) ? "end" : "start")).text(([, name]) => name);
     }
 
     function drawLoop(x, y) {
