@@ -77,6 +77,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
+        slipping=run.slipping if run.sensors.events else None,
     )
     return plain if heading is None else with_turn_rate(plain, heading)
 

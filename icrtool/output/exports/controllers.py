@@ -138,7 +138,7 @@ def _controller(calibration: Calibration, errors: ControllerErrors, indent: int)
         ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
         ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
     ):
-        lines.append(f"{key}: {value:.4f}  # ± {std:.4f}")
+        lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {_diagonal(errors.pose_variance)}",

@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.align import sensors_as_sent
+from icrtool.alignment.align import align, sensors_as_sent
+from icrtool.calibration.pooled import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
+from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import FilterInputs
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.kernels.smoother import run_smoother
+from icrtool.motion.recording import cut_windows
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData
-from support.drives import EPOCH_NS, make_log
+from icrtool.records.tables import RobotLog
+from support.drives import EPOCH_NS, ICRS, make_log
 from support.matrix_filter import run_ekf_plain
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -95,3 +99,35 @@ def test_smoothing_ends_at_the_state_of_the_filter_through_slip() -> None:
 
 def test_measurements_without_flags_have_no_slip() -> None:
     assert len(FilterInputs(*(np.empty(0) for _ in range(10))).slipping) == 0
+
+
+def log_with_spin() -> RobotLog:
+    """A drive whose left side turns three times as fast as it rolls, from 40 to 46 s."""
+    log = make_log(seed=3, seconds=120.0)
+    t = (log.wheels.stamp_ns - EPOCH_NS) / 1e9
+    spins = (t >= 40.0) & (t < 46.0)
+    return replace(log, wheels=replace(log.wheels, left=np.where(spins, 3.0, 1.0) * log.wheels.left))
+
+
+def test_an_event_is_left_out_of_the_calibration() -> None:
+    run = fit(log_with_spin(), CONFIG)
+    (event,) = run.sensors.events
+    recording = recording_of(run)
+    windows = cut_windows(recording)
+    begin, end = (recording.begin_ns + 1e9 * windows.knot_t[one] for one in (windows.start, windows.end))
+    assert not ((begin < event.end_ns) & (end > event.begin_ns)).any()
+    assert ((begin < event.end_ns) & (end > event.begin_ns - 2e9)).any()
+    assert len(cut_windows(replace(recording, slipping=None)).start) > len(windows.start)
+
+
+def test_an_event_is_left_out_of_the_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the second alignment the spinning left side is taken for a scale and for an ICR further out."""
+    log = log_with_spin()
+    found = align(log, CONFIG)
+    assert [event.kind for event in found.sensors.events] == ["spin"]
+    monkeypatch.setattr("icrtool.alignment.align.find_slip_events", lambda sensors, width_m: ())
+    once = align(log, CONFIG)
+    true = ICRS[0] - ICRS[1]
+    errors = [abs((one.findings["icr_separation_m"].value or 0.0) - true) for one in (found, once)]
+    assert errors[0] < 0.01 * true
+    assert errors[1] > 3.0 * errors[0]
