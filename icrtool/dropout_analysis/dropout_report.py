@@ -24,6 +24,7 @@ from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run
 
 
@@ -82,6 +83,7 @@ def dropout_report(
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     used, further = _calibration_rows(compared, calibrations)
     found, why = _compare(compared, run) if comparison else (None, "")
+    give_back_freed()
     if found is not None:
         further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 
