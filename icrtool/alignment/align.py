@@ -25,7 +25,7 @@ from icrtool.records.tables import RobotLog
 
 
 def align(log: RobotLog, config: Config) -> Measurements:
-    """Find what the streams of a log get wrong, and correct what is certain.
+    """Find the errors of the streams of a log, and correct what is certain.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ class HeldOut:
 
     Attributes
     ----------
-    folds : recordings or, of a single one, blocks: by what models are chosen, and errors are listed
+    folds : recordings or, of a single one, blocks: models are chosen, and errors are listed, by fold
     trials : by recording, those of the table
     scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
         what a controller makes of that

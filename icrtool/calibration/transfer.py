@@ -174,7 +174,7 @@ class _Tested(NamedTuple):
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Test a calibration in recordings; those of its own are predicted by what was not fitted to them."""
+    """Test a calibration in recordings; those of its own are predicted by fits that do not contain them."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, HORIZONS_M)

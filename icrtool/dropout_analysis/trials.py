@@ -95,7 +95,7 @@ def dropout(
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
-    further : models of constant parameters, beside those
+    further : models of constant parameters, in addition
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -116,11 +116,11 @@ def dropout(
     Notes
     -----
     A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
-    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. No
-    trials, but counted: starts with less path left, paths across a gap of the wheel data, ends in a real GNSS outage.
-    Of a standstill the last state alone starts trials: the others would be copies, and a parked robot would set the
-    result. Overlapping trials are not independent: the intervals come from a moving-block bootstrap (Kuensch 1989) with
-    blocks of the horizon's length.
+    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
+    start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
+    where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
+    and a parked robot would set the result. Overlapping trials are not independent: the
+    intervals come from a moving-block bootstrap (Kuensch 1989) with blocks of the horizon's length.
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")

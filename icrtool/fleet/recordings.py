@@ -115,7 +115,7 @@ class Extent(NamedTuple):
     topics: frozenset[tuple[str, str]]
 
     def goes_on_in(self, other: Extent) -> bool:
-        """Return whether another file goes on where this one ends, with at least half of the topics in common."""
+        """Return whether another file continues where this one ends, with at least half of the topics in common."""
         pause_s = (other.begin_ns - self.end_ns) / 1e9
         fewer = min(len(self.topics), len(other.topics))
         in_common = 2 * len(self.topics & other.topics) >= fewer > 0

@@ -160,16 +160,16 @@ class Run:
 
     @property
     def ended_with(self) -> WarmStart:
-        """The filter's last ICRs and their covariance, to start another run from; wide where they are not shown."""
+        """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
         icrs = np.array([getattr(self.table, column)[-1] for column in ICR_COLUMNS], np.float64)
         covariance = np.array(self.summary["icr"]["final_covariance_m2"], np.float64)
         return WarmStart(icrs, covariance, self.track_width_m)
 
     @property
     def wheel_scales(self) -> tuple[float, float]:
-        """What the recorded speeds of the left and right side were multiplied with, from those at the nominal radius.
+        """Factors, left and right, from the speeds at the nominal wheel radius to the recorded ones.
 
-        It holds configured and estimated scales; dividing by it gives back the speeds that the wheels reported.
+        They hold configured and estimated scales; speeds divided by them are those that the wheels reported.
         """
         wheels = self.summary["wheels"]
         common = wheels.get("applied_scale", 1.0)

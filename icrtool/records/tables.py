@@ -1,4 +1,4 @@
-"""The tables that packages hand to one another: a robot's log, and the states of a run."""
+"""The tables that pass from package to package: a robot's log, and the states of a run."""
 
 from __future__ import annotations
 

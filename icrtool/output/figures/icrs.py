@@ -87,7 +87,7 @@ def icr_estimates(run: Run) -> Figure:
 
 @styled
 def icr_clusters(run: Run) -> Figure:
-    """Return the percent of the time that each ICR estimate had which value [m], after convergence."""
+    """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
     settled = run.settled_s
     after = run.table.t_s >= settled
     subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"

@@ -26,7 +26,7 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
     """
     names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
-    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
+    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by a fit that does not contain it"
     figure = new_figure(
         " · ".join(names), subtitle, width_in=9.6, height_in=2.8 + 0.45 * len(names) + 0.12 * len(rows),
         margins_in=(1.3, 0.2, 0.8, 1.0), wspace=1.15,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.kernels.arrays import Ints
 from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
@@ -22,6 +24,7 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
+from icrtool.records.text import counted
 
 MODEL = 21
 """Characters of a model's name that are printed."""
@@ -110,8 +113,7 @@ def headline(report: DropoutReport) -> list[str]:
 
 def _calibration_lines(report: DropoutReport) -> list[str]:
     return [
-        f"{one.label}: {one.model} from {one.logs} {'log' if one.logs == 1 else 'logs'}, {one.created[:10]}, "
-        f"{one.fitted_text}"
+        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted_text}"
         for one in report.calibrations
     ]
 
@@ -126,16 +128,6 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
         more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
         lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
     return lines
-
-
-def percent_text(percent: float) -> str:
-    """Return an error in percent of the distance."""
-    return f"{percent:.1f} %" if math.isfinite(percent) else "-"
-
-
-def ratio_text(numerator: float, denominator: float) -> str:
-    """Return ``2.1 x``."""
-    return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
 
 
 def reach_text(one: BudgetDistance) -> str:
@@ -172,9 +164,10 @@ def _ratio_rows(report: DropoutReport) -> Rows:
     if icr is None or no_slip is None:
         return []
     rows = []
-    for lead, label, column in (("no slip : ICR", "95 %", "p95"), ("", "expected", "expected")):
+    for lead, label, column in (("no slip / ICR", "95 %", "p95"), ("", "expected", "expected")):
         ours, theirs = getattr(icr.summary, column), getattr(no_slip.summary, column)
-        rows.append([lead, label, *(ratio_text(float(theirs[h]), float(ours[h])) for h in shown_horizons(report))])
+        ratios = (float(theirs[h] / ours[h]) if ours[h] > 0 else math.nan for h in shown_horizons(report))
+        rows.append([lead, label, *(f"{ratio:.1f} x" if math.isfinite(ratio) else "-" for ratio in ratios)])
     return rows
 
 
@@ -186,16 +179,34 @@ def _turning_line(split: TurningSplit) -> str:
 
 def _count_rows(report: DropoutReport) -> Rows:
     """Return the number of trials, and why other starts are none."""
-    shown, counts, cost = shown_horizons(report), report.counts, report.event_cost
-    reasons = (
-        ("not counted: log ends", counts.short),
-        ("  across a slip event", cost.trials if cost is not None else np.zeros_like(counts.short)),
-        ("  across a wheel gap", counts.gap),
-        ("  ends in GNSS outage", counts.outage),
-        ("  from standstill", counts.standing),
-    )
-    named = [("trials", counts.trials), *((label, column) for label, column in reasons if column[shown].any())]
+    shown = shown_horizons(report)
+    named = [("trials", report.counts.trials)]
+    named += [(one.label, one.starts) for one in no_trial(report) if one.starts[shown].any()]
     return [[label, "", *(f"{int(column[h]):,}" for h in shown)] for label, column in named]
+
+
+class NoTrial(NamedTuple):
+    """A reason why starts gave no trial: its key in report.json, words in the table, and number of `starts` (h,)."""
+
+    key: str
+    label: str
+    why: str
+    starts: Ints
+
+
+def no_trial(report: DropoutReport) -> tuple[NoTrial, ...]:
+    """Return the reasons why starts gave no trial."""
+    counts, cost = report.counts, report.event_cost
+    driven = distance_text(report.run_summary["drive"]["distance_m"])
+    slip = cost.trials if cost is not None else np.zeros_like(counts.short)
+    return (
+        NoTrial("too_little_way_left", "not counted: log ends", f"less than that is left of the {driven} driven",
+                counts.short),
+        NoTrial("across_wheel_gap", "  across a wheel gap", "the path crosses a gap in the wheel data", counts.gap),
+        NoTrial("ends_in_gnss_outage", "  ends in GNSS outage", "it ends in a GNSS outage", counts.outage),
+        NoTrial("from_standstill", "  from standstill", "the robot stands", counts.standing),
+        NoTrial("across_slip_event", "  across a slip event", "the path crosses a slip event", slip),
+    )  # fmt: skip
 
 
 def _count_lines(report: DropoutReport) -> list[str]:
@@ -217,7 +228,7 @@ def _event_lines(report: DropoutReport) -> list[str]:
     if not cost.events:
         return ["slip events: none in this log; --without-events changes nothing"]
     both = np.flatnonzero((icr.summary.trials > 0) & (cost.with_events["icr"].trials > 0))
-    number = "1 slip event" if cost.events == 1 else f"{cost.events} slip events"
+    number = counted(cost.events, "slip event")
     if not len(both):
         return [f"{number}: no trial is left without them"]
     h = int(both[-1])
@@ -237,17 +248,10 @@ def why_no_trial(report: DropoutReport, h: int) -> str | None:
     counts = report.counts
     if not len(counts.trials) or counts.trials[h]:
         return None
-    driven = distance_text(report.run_summary["drive"]["distance_m"])
-    reasons = (
-        (counts.short[h], f"less than that is left of the {driven} driven"),
-        (counts.gap[h], "the path crosses a gap in the wheel data"),
-        (0 if report.event_cost is None else report.event_cost.trials[h], "the path crosses a slip event"),
-        (counts.outage[h], "it ends in a GNSS outage"),
-        (counts.standing[h], "the robot stands"),
-    )
+    reasons = no_trial(report)
     if counts.short[h] == report.states:
-        return reasons[0][1]
-    return ", ".join(f"{why} ({int(count):,} starts)" for count, why in reasons if count)
+        return reasons[0].why
+    return ", ".join(f"{one.why} ({int(one.starts[h]):,} starts)" for one in reasons if one.starts[h])
 
 
 def _empty_lines(report: DropoutReport) -> list[str]:
@@ -318,7 +322,8 @@ def _outage_table(outages: Sequence[Outage], report: DropoutReport) -> Table:
 
 
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
-    return f"{error_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
+    percent = 100 * error_m / float(report.horizons_m[h])
+    return f"{error_text(error_m)} {f'{percent:.1f} %' if math.isfinite(percent) else '-':>7}"
 
 
 def _span_text(low_m: float, high_m: float) -> str:

@@ -78,7 +78,7 @@ def format_transfer(transfer: Transfer) -> Text:
     blocks += [
         f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
         Table("lr", matrix, ("", *names)),
-        "on the diagonal each trial is predicted by what was not fitted to it",
+        "on the diagonal each trial is predicted by a fit that does not contain it",
     ]
     return Text(blocks)
 

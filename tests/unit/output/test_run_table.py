@@ -9,7 +9,7 @@ from icrtool.calibration.record import ControllerNumbers
 from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import controller_text, distance_text, duration_text, length_text, signed
+from icrtool.output.text_format import controller_text, distance_text, duration_text, error_text, signed
 from icrtool.records.run import Run
 
 
@@ -117,12 +117,8 @@ def test_durations_read_well(seconds: float, text: str) -> None:
 
 
 def test_lengths_read_well() -> None:
-    assert [length_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456)] == [
-        "3.1 mm",
-        "1.2 cm",
-        "99.9 cm",
-        "3.46 m",
-    ]
+    texts = [error_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456, float("nan"))]
+    assert texts == ["0.0031 m", "0.012 m", "0.999 m", "3.46 m", "-"]
     assert [distance_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
     assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
 
@@ -130,7 +126,7 @@ def test_lengths_read_well() -> None:
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
     steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
     speed = run.summary["drive"]["speed_mean_mps"]
-    said = f"not shown by this drive; a lag of 0.1 s would move x by {length_text(0.1 * speed)}"
+    said = f"not shown by this drive; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
     assert said in format_run(steady)
     known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02, "delay_std_s": 0.01}})
     assert said not in format_run(known)
