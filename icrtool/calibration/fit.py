@@ -71,4 +71,6 @@ def recommendation(run: Run) -> dict[str, Any] | None:
     except DataError:
         return None
     robot = robot_of(run) | {"track_width_m": recording.width_m}
-    return {"label": found.fit.model.label, "why": found.why} | fitted_document(found.fit, robot, found.typical)
+    return {"label": found.fit.model.label, "why": found.why} | fitted_document(
+        found.fit, found.controller, robot, found.typical
+    )
