@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
+from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs
@@ -85,7 +85,7 @@ def compare(hours: float) -> None:
             f"  {name:14s} direct {direct:7.2f} s, fast {fast:6.3f} s: {direct / fast:4.0f} x, equal to {apart:.0e} m"
         )
     errors = open_loop_errors(drive, NO_SLIP, ends)
-    print(f"  percentiles of a model       {seconds(lambda: summarise(errors), 5):8.3f} s")
+    print(f"  percentiles of a model       {seconds(lambda: error_summary(errors), 5):8.3f} s")
 
     def bootstrap() -> None:
         blocks = [cut_blocks(column >= 0, drive.distance, h) for column, h in zip(ends.T, HORIZONS_M, strict=True)]

@@ -179,4 +179,4 @@ def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, 
     for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x", "x_icr_m")):
         assert rows[label] == f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f} m"
     multiplier, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
-    assert rows["multiplier"] == f"{multiplier:.2f} ± {std:.2f}"
+    assert rows["multiplier"] == f"{multiplier:.3f} ± {std:.3f}"

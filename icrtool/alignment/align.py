@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.gnss_quality import grade_fixes
+from icrtool.alignment.gnss_quality import GnssQuality, grade_fixes
 from icrtool.alignment.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
+from icrtool.errors import DataError
 from icrtool.records.measurements import Fixes, Measurements, SensorData
 from icrtool.records.run import half_width_m
 from icrtool.records.samples import PositionFixes
@@ -22,7 +25,7 @@ from icrtool.records.tables import RobotLog
 
 
 def align(log: RobotLog, config: Config) -> Measurements:
-    """Find what the streams of a log get wrong, and correct what is certain.
+    """Find the errors of the streams of a log, and correct what is certain.
 
     Parameters
     ----------
@@ -40,41 +43,19 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
-    found = align_streams(log, config)
-    wheels, heading, delays = found.wheels, found.heading, found.delays
-    quality = grade_fixes(found.log, config, found.fix_steps)
-    aligned = sensors_as_sent(quality.log, config)
-    sensors = replace(
-        aligned,
-        fixes=replace(
-            aligned.fixes,
-            fix_class=quality.fix_class,
-            misreported=quality.misreported,
-            down_weighted=quality.down_weighted,
-        ),
-        headings=replace(
-            aligned.headings,
-            heading_rad=aligned.headings.heading_rad - heading.remaining_offset_rad,
-            var_rad2=quality.log.heading.var_rad2
-            if heading.is_estimated
-            else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
-        ),
-        heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
-        heading_is_estimated=heading.is_estimated,
-        attitude=None if found.derived is None else found.derived.attitude,
-        losses_ns=quality.losses_ns,
-        icr_start=start_icrs(found.geometry, aligned.antenna_m, config),
-    )
+    aligned = _align_once(log, config)
     notes: tuple[str, ...] = ()
     # preset paper takes its wheels as they are
     if config.filter.preset == "field":
-        sensors = replace(sensors, events=find_slip_events(sensors, 2 * half_width_m(config.robot.track_width_m)))
-        filled, note = bridged(sensors.wheels, config.filter.wheel_gap_s)
-        sensors = replace(sensors, wheels=filled)
+        aligned = _with_events(log, config, aligned)
+        filled, note = bridged(aligned.sensors.wheels, config.filter.wheel_gap_s)
+        aligned = aligned._replace(sensors=replace(aligned.sensors, wheels=filled))
         notes = (f"{log.name}: {note}",) if note else ()
+    found, quality, sensors = aligned
+    wheels, heading, delays = found.wheels, found.heading, found.delays
     return Measurements(
         sensors=sensors,
-        findings=alignment_findings(found, aligned.antenna_m),
+        findings=alignment_findings(found, sensors.antenna_m),
         sections={
             "wheels": wheels.summary() | window_summary(found.fit),
             "heading": heading.summary() | delays.heading_summary(),
@@ -90,6 +71,61 @@ def align(log: RobotLog, config: Config) -> Measurements:
             *notes,
         ),
     )
+
+
+class _Aligned(NamedTuple):
+    """Streams that fit together, their fixes graded, and both as the filter takes them."""
+
+    found: AlignedStreams
+    quality: GnssQuality
+    sensors: SensorData
+
+
+def _align_once(log: RobotLog, config: Config) -> _Aligned:
+    found = align_streams(log, config)
+    heading = found.heading
+    quality = grade_fixes(found.log, config, found.fix_steps)
+    sensors = sensors_as_sent(quality.log, config)
+    return _Aligned(
+        found,
+        quality,
+        replace(
+            sensors,
+            fixes=replace(
+                sensors.fixes,
+                fix_class=quality.fix_class,
+                misreported=quality.misreported,
+                down_weighted=quality.down_weighted,
+            ),
+            headings=replace(
+                sensors.headings,
+                heading_rad=sensors.headings.heading_rad - heading.remaining_offset_rad,
+                var_rad2=quality.log.heading.var_rad2
+                if heading.is_estimated
+                else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
+            ),
+            heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
+            heading_is_estimated=heading.is_estimated,
+            attitude=None if found.derived is None else found.derived.attitude,
+            losses_ns=quality.losses_ns,
+            icr_start=start_icrs(found.geometry, sensors.antenna_m, config),
+        ),
+    )
+
+
+def _with_events(log: RobotLog, config: Config, aligned: _Aligned) -> _Aligned:
+    """Return the streams with the slip events found in them, aligned a second time without those, where there are any.
+
+    A log with too little besides them keeps its first alignment.
+    """
+    width = 2 * half_width_m(config.robot.track_width_m)
+    events = find_slip_events(aligned.sensors, width)
+    if events:
+        spans = tuple((event.begin_ns, event.end_ns) for event in events)
+        with suppress(DataError):
+            aligned = _align_once(replace(log, slipping_ns=spans), config)
+            events = find_slip_events(aligned.sensors, width)
+    return aligned._replace(sensors=replace(aligned.sensors, events=events))
 
 
 def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:

@@ -10,6 +10,9 @@ Mahalanobis distance from there.
 Two symmetries are exact: position and heading mirrored together is sides swapped; a heading turned by 180 deg is sides
 swapped and both reversed. There the fewest faults decide; a gyro of the other sense and a robot that hardly ever drives
 forward count as one each.
+
+The fit is not that of `icrtool.alignment.estimator`, which needs named sides and one solve for each hypothesis: this
+one is linear and gives all 32 of them from two solves.
 """
 
 from __future__ import annotations

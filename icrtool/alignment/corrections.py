@@ -112,7 +112,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     Raises
     ------
     DataError
-        Streams that cannot be used together, a heading that nothing explains, wheels that turn while the robot stands.
+        Streams that cannot be used together, an unexplained heading, wheels that turn while the robot stands.
     """
     corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
     as_sent = log

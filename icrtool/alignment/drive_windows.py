@@ -137,18 +137,23 @@ class DriveWindows(NamedTuple):
 def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
     """Return a log as arrays; `heading` in place of its own."""
     stated = log.heading if heading is None else heading
-    return join_streams(log.wheels, log.gnss, stated, same_clock=log.heading_is_of_position)
+    return join_streams(
+        log.wheels, log.gnss, stated, same_clock=log.heading_is_of_position, slipping_ns=log.slipping_ns
+    )
 
 
 def join_streams(
-    wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool
-) -> DriveArrays:
-    """Return streams as arrays; `same_clock` as in `DriveArrays`."""
+    wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool,
+    slipping_ns: tuple[tuple[int, int], ...] = (),
+) -> DriveArrays:  # fmt: skip
+    """Return streams as arrays; `same_clock` as in `DriveArrays`; `slipping_ns`, of `RobotLog`, are gaps."""
     epoch = int(wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
     )
     dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
+    for span in slipping_ns:
+        dt[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
     wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
     heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad))
     step = dt * (np.abs(left) + np.abs(right)) / 2

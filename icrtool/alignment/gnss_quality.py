@@ -1,7 +1,7 @@
 """Classes of the fixes: fixed, float or other by what they state and how they move; noise by class; jumps counted.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
-tens of seconds: taken for independent they would pull the filter along. Some drivers go on claiming a centimetre.
+tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ SHORTEST_LOSS_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class GnssQuality:
-    """What the fixes of a log are.
+    """Classes of the fixes of a log, and their noise.
 
     Attributes
     ----------
     log : with the variances that the fixes deserve; the given one in preset ``paper``
     fix_class : uint8 (m,), keys of `CLASSES`
-    misreported : bool (m,), fixes that claim to be fixed and are not
+    misreported : bool (m,), reported as fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
     statistics : of the classes, and the jumps
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
@@ -106,7 +106,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
-    """Return the class of each fix (m,), and which claim to be fixed and are not (m,)."""
+    """Return the class of each fix (m,), and which are reported as fixed and are not (m,)."""
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none

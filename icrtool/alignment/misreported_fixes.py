@@ -1,4 +1,4 @@
-"""Find fixes that claim to be fixed and are not: by their noise beside a jump, or between a jump and its return."""
+"""Find fixes that are reported as fixed and are not: by their noise beside a jump, or between a jump and its return."""
 
 from __future__ import annotations
 

@@ -29,8 +29,9 @@ SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
 
 LARGEST_SCALE_CORRECTION = 0.15
-FACTOR_TWO_TOLERANCE = 0.04
-"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius)."""
+FACTOR_TWO_TOLERANCE = 2.0 * USUAL_SCALE_STD
+"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius) beside what
+wheels usually roll at."""
 
 STANDS_SHARE, STILL = 0.8, 0.2
 """The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""

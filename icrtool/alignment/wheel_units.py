@@ -135,7 +135,8 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     Notes
     -----
     Straight spans where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
-    before and after. Senses of the wheels do not matter.
+    before and after. Senses of the wheels do not matter. The estimate of `icrtool.alignment.estimator` needs m/s and a
+    heading, which are found after this.
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.kernels.trials import Drive
 
 RESAMPLES, LEVEL = 300, 0.95
@@ -95,5 +95,5 @@ def _by_block(errors: Floats, block: Ints) -> dict[int, Floats]:
 
 
 def _difference(sides: list[Floats]) -> tuple[float, float]:
-    before, after = (summarise(side[:, None]) for side in sides)
+    before, after = (error_summary(side[:, None]) for side in sides)
     return float(after.p95[0] - before.p95[0]), float(after.expected[0] - before.expected[0])

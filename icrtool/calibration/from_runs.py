@@ -51,7 +51,7 @@ def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
 
 
 def robot_of(run: Run) -> dict[str, Any]:
-    """Return what a calibration holds of the robot of a run, but for its track width."""
+    """Return what a calibration holds of the robot of a run, except its track width."""
     robot: dict[str, Any] = {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
     if run.config.wheels.twist_width_m is not None and _from_twists(run):
         robot["twist_width_m"] = run.config.wheels.twist_width_m

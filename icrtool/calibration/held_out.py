@@ -18,7 +18,7 @@ import numpy as np
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.kernels.trials import Summary
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import (
@@ -75,7 +75,7 @@ class HeldOut:
 
     Attributes
     ----------
-    folds : recordings or, of a single one, blocks: by what models are chosen, and errors are listed
+    folds : recordings or, of a single one, blocks: models are chosen, and errors are listed, by fold
     trials : by recording, those of the table
     scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
         what a controller makes of that
@@ -326,8 +326,8 @@ class _Tester:
             rows.append((CONTROLLER.name, CONTROLLER.label, self.errors(found.expressed)))
         scores = []
         for name, label, errors in rows:
-            by_fold = tuple(summarise(errors[fold_of == f]) for f in range(len(self._folds)))
-            scores.append(HeldOutRow(name, label, by_fold, summarise(errors)))
+            by_fold = tuple(error_summary(errors[fold_of == f]) for f in range(len(self._folds)))
+            scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
         return replace(found, scores=tuple(scores))
 
     def _fold_of(self, i: int, starts: Ints) -> Ints:

@@ -6,7 +6,7 @@ the filter's own ICRs, momentary and final, stand beside.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,10 +14,17 @@ import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor, recording_of, scaled_gyro
+from icrtool.calibration.pooled import (
+    ErrorsOf,
+    calibration_from,
+    held_out_predictor,
+    recording_of,
+    scaled_gyro,
+    with_turn_rate,
+)
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.kernels.open_loop import STARTS_A_CALL
 from icrtool.kernels.open_loop_fast import open_loop_errors
 from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
@@ -25,6 +32,7 @@ from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, half_width_m
 
 FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
@@ -92,7 +100,7 @@ class ComparedModels(NamedTuple):
     recommended: ErrorsOf
 
 
-def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> ComparedModels:
+def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> ComparedModels:
     """Test every model on distance it was not fitted to.
 
     Parameters
@@ -112,6 +120,7 @@ def compare_models(run: Run, headings: Sequence[MeasuredHeading] = ()) -> Compar
     """
     recording, heading, notes = _with_heading(run, headings)
     wheels, turned = hold_out([recording])
+    give_back_freed()
     (trials,) = wheels.trials
     scores = list(_wheels_scores(run, recording, trials, wheels))
     if turned is not None:
@@ -140,18 +149,18 @@ def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut 
     return replace(found, warnings=use_warnings(run))
 
 
-def _with_heading(run: Run, headings: Sequence[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
+def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
     notes = []
     plain = recording_of(run, width_m=2.0 * half_width_m(run.track_width_m))
     for one in headings:
-        found = recording_of(run, one, width_m=plain.width_m)
+        found = with_turn_rate(plain, one)
         if found.gyro_radps is not None:
             if found.gyro_reversed:
                 notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
             return found, one.kind, tuple(notes)
         notes.append(f"the {one.kind} does not turn with the robot: rows with it are left out")
-    if not headings:
+    if not notes:
         notes.append("the run holds no heading measured apart from the position: no rows with one")
     return plain, "", tuple(notes)
 
@@ -171,7 +180,7 @@ def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOu
         else:
             # the filter's ICRs are those of the speeds that it saw
             drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-            summary = summarise(_errors_of_filter(drive, _icrs_of(run, name), trials))
+            summary = error_summary(_errors_of_filter(drive, _icrs_of(run, name), trials))
         yield ModelScore(name, LABELS[name], FITTED_TO[name], False, summary)
 
 
@@ -200,7 +209,7 @@ def _turned_scores(
             of = FAMILY[name]
             summary = table.score(of if of == "recommended" else f"{of}_gyro").together
         else:
-            summary = summarise(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
+            summary = error_summary(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
         yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 

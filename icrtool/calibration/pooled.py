@@ -66,18 +66,27 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
     drive, inputs = drive_of(run), run.summary.get("inputs", [])
     left_scale, right_scale = run.wheel_scales
+    if (left_scale, right_scale) != (1.0, 1.0):
+        drive = drive._replace(v_left=drive.v_left / left_scale, v_right=drive.v_right / right_scale)
     plain = Recording(
         name=run.name,
         t_s=run.table.t_s,
-        drive=drive._replace(v_left=drive.v_left / left_scale, v_right=drive.v_right / right_scale),
+        drive=drive,
         gyro_radps=None,
         width_m=width,
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
+        slipping=run.slipping if run.sensors.events else None,
     )
-    if heading is None or not np.isfinite(heading.angle_rad).all():
+    return plain if heading is None else with_turn_rate(plain, heading)
+
+
+def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
+    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
+    if not np.isfinite(heading.angle_rad).all():
         return plain
+    drive = plain.drive
     step = np.append(np.diff(heading.angle_rad), 0.0)
     rate = np.divide(step, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
     slope, _, later_s = _gyro_line(plain, rate)
@@ -255,5 +264,7 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
     -----
     See `icrtool.calibration.held_out.left_out`. Trials for which too little is left to fit to have no error.
     """
-    recording, steps = recordings[i], joined_steps(recordings[i], 1)
+    # Models of the wheels alone: a long log's gyro need not be kept for them.
+    recording = replace(recordings[i], gyro_radps=None)
+    steps = joined_steps(recording, 1)
     return lambda trials: errors_without(recording, trials, table.folds, i, table.without, steps)

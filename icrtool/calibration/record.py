@@ -19,6 +19,7 @@ from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
 from icrtool.records.tables import RobotLog
+from icrtool.records.text import counted
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
 
@@ -128,7 +129,7 @@ class Odometry(NamedTuple):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Calibration:
-    """What goes into the robot, and what error it gives.
+    """Constant parameters of a robot's motion model, their covariance, and the error that they give.
 
     Attributes
     ----------
@@ -138,10 +139,10 @@ class Calibration:
     typical : curvature and speed at which ICRs and multiplier are stated
     why : reason for the recommendation
     logs : what it was fitted to
-    held_out : scores by model, horizon and log; ``recommended`` was chosen without the log, too
+    held_out : scores by model, horizon and log; ``recommended`` is what was chosen without that log
     controller : errors of what a controller can express; None where the drive is too short to measure them
-    sources, gyro_sources : of the errors beside those of the parameters, wheels alone and with a gyro; None where the
-        drive is too short to measure them
+    sources, gyro_sources : variances of what the model leaves out, wheels alone and with a gyro; None where the drive
+        is too short to measure them
     warnings : what to know before use
     created : date and time, UTC, ISO 8601
     name : stem of its file; empty for one just made
@@ -182,12 +183,12 @@ class Calibration:
         return _controller_numbers(*self.geometry(), self.robot)
 
     def log_names(self) -> str:
-        """Return the names of the logs that it was fitted to, and how many they are."""
+        """Return the names of the logs that it was fitted to, and their number."""
         names = ", ".join(log.name for log in self.logs)
         return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
-        """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks; NaN without."""
+        """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks, or NaN."""
         rows = [one for one in self.held_out if one.model == model and one.horizon_m == horizon_m]
         if not rows:
             return float("nan"), float("nan")
@@ -253,12 +254,11 @@ class Calibration:
         return file
 
     def __repr__(self) -> str:
-        numbers = self.controller_numbers()
-        logs = "1 log" if len(self.logs) == 1 else f"{len(self.logs)} logs"
         p95, _ = self.held_out_m("recommended", 10.0)
+        logs = counted(len(self.logs), "log")
         return (
-            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, multiplier "
-            f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, 95 % within {p95:.2f} m after 10 m, held out>"
+            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, "
+            f"95 % within {p95:.2f} m after 10 m, held out>"
         )
 
     def summary(self) -> dict[str, Any]:

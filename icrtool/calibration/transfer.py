@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, hel
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, summarise
+from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
@@ -111,13 +112,14 @@ def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_S
 
     Parameters
     ----------
-    groups : at least two, by name; the runs of one robot
+    groups : at least two, by name, each the runs of one robot; groups of different robots have no errors of one
+        calibration on the other (NaN)
     seed : of the bootstrap
 
     Raises
     ------
     ConfigError
-        Fewer than two groups, a log that is in two of them, or robots that differ.
+        Fewer than two groups, a log that is in two of them, or robots that differ in one group.
     DataError
         Too short a drive.
 
@@ -139,11 +141,14 @@ def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]], *, seed: int = DEFAULT_SEED
 ) -> Transfer:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
-    tested = {
-        (row, column): _test(result, recordings[column], own=row == column)
-        for row, result in results.items() for column in recordings
-    }  # fmt: skip
-    cells = (cell for row, column in tested for cell in _cells(row, column, tested, seed))
+    tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
+    for (row, result), (column, own) in product(results.items(), results.items()):
+        if _of_one_robot(result.calibration, own.calibration):
+            tested.setdefault((row, column), _test(result, recordings[column], own=False))
+        else:
+            known = tested[column, column]
+            tested[row, column] = known._replace(errors=np.full_like(known.errors, np.nan))
+    cells = (cell for row, column in product(results, results) for cell in _cells(row, column, tested, seed))
     first, *others = results
     pairs = []
     for other in others:
@@ -155,6 +160,12 @@ def compare_calibrations(
     return Transfer({name: one.calibration for name, one in results.items()}, tuple(pairs), tuple(cells))
 
 
+def _of_one_robot(one: Calibration, other: Calibration) -> bool:
+    """Return whether the parameters of two calibrations refer to the same track width and wheel radius."""
+    same_width = math.isclose(one.width_m, other.width_m, rel_tol=1e-3)
+    return same_width and one.robot.get("wheel_radius_m") == other.robot.get("wheel_radius_m")
+
+
 class _Tested(NamedTuple):
     """Errors (k, h) [m] of trials, and path lengths (k,) [m] at their starts; recordings one behind the other."""
 
@@ -163,7 +174,7 @@ class _Tested(NamedTuple):
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Test a calibration in recordings; those of its own are predicted by what was not fitted to them."""
+    """Test a calibration in recordings; those of its own are predicted by fits that do not contain them."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, HORIZONS_M)
@@ -187,7 +198,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool, seed: int) ->
 def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], seed: int) -> Iterator[Cell]:
     """Yield the cells of one row and column, a horizon each."""
     errors, path = tested[row, column]
-    summary = summarise(errors)
+    summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
     interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
     own, foreign = tested[column, column], tested[row, column]

@@ -241,6 +241,8 @@ def line_of(row: Row) -> str:
     if right is not None and left is not None:
         std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
         parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
+    elif row.reason:
+        parts.append(escaped(row.reason))
     if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
@@ -254,4 +256,5 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
-    return f"\n{len(rows)} logs: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"
+    logs = f"{len(rows)} log{'s' if len(rows) != 1 else ''}"
+    return f"\n{logs}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"

@@ -24,6 +24,7 @@ from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run
 
 
@@ -56,20 +57,20 @@ def dropout_report(
     outage_s : lengths of outages to force on the filter; default those of the run's configuration
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds what they cost
+    without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds the difference
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
     comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
     reference : what trials are compared with: the filter's states or the smoother's
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
-    strict : such limits are missed by the number alone, not only beyond the confidence interval of the difference
+    strict : compare such limits by the number alone, without the confidence interval of the difference
     seed : of the bootstrap
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
     Raises
     ------
     ConfigError
-        A gate, horizon, budget or outage that cannot be met, or a calibration of another robot.
+        A limit, horizon, budget or outage that cannot be used, or a calibration of another robot.
     DataError
         The run has fewer than two states.
     RunError
@@ -82,6 +83,7 @@ def dropout_report(
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     used, further = _calibration_rows(compared, calibrations)
     found, why = _compare(compared, run) if comparison else (None, "")
+    give_back_freed()
     if found is not None:
         further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 

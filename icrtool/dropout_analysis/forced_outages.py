@@ -11,7 +11,7 @@ from icrtool.dropout_analysis.starts import standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.ekf import run_ekf
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, drive_of
 
@@ -75,7 +75,7 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
         The run cannot be made again.
     """
     setup = set_up_again(run, tuple(spans_ns))
-    output = run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    output = run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
     # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
     rows = min(len(output.x), len(run.table))
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]

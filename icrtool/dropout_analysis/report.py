@@ -49,9 +49,9 @@ class DropoutReport:
     ----------
     horizons_m : (h,) ascending
     results : one per model
-    counts : trials, and starts that were none, by horizon; the same for every model
+    counts : trials, and starts without a trial, by horizon; the same for every model
     states : recorded states
-    standing : of them, those after which the robot stood: their trials are near copies of one another
+    standing : states in which the robot stood: their trials are nearly copies of one another
     seed : of the bootstrap
     run_summary : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
@@ -63,13 +63,13 @@ class DropoutReport:
     budgets : by budget and model
     verdicts : of the acceptance limits
     worst : trials with the largest error first
-    examples : a cornering and a straight trial; empty where no trial is that long
+    examples : a trial of about half a turn and a straight one; empty where no trial is that long
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
     comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     calibrations : those with a row of their own
     baseline : an earlier report that this one is compared with
-    event_cost : what slip events cost, where trials that cross one were left out; None where they count
+    event_cost : how much slip events change the errors, where trials that cross one are left out; None where they count
     """
 
     name: str
@@ -106,7 +106,7 @@ class DropoutReport:
 
     @property
     def passed(self) -> bool:
-        """Whether every acceptance limit was kept."""
+        """Whether every acceptance limit is met."""
         return all(verdict.passed for verdict in self.verdicts)
 
     def result(self, model: str) -> ModelResult | None:

@@ -14,10 +14,7 @@ from icrtool.records.run import Run
 
 def leave_out_events(run: Run) -> Run:
     """Return the run with a gap in place of each slip event: no trial, window or forced outage crosses a gap."""
-    begin, end, in_gap = run.table.stamp_ns[:-1], run.table.stamp_ns[1:], run.in_gap.copy()
-    for event in run.sensors.events:
-        in_gap[:-1] |= (end > event.begin_ns) & (begin < event.end_ns)
-    return replace(run, in_gap=in_gap)
+    return replace(run, in_gap=run.in_gap | run.slipping)
 
 
 def with_event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: int) -> DropoutReport:

@@ -20,11 +20,11 @@ from icrtool.kernels.error_statistics import (
     Blocks,
     bootstrap_intervals,
     cut_blocks,
+    error_summary,
     histogram_sorted,
     round_bin_width,
     sort_trials,
-    summarise,
-    summarise_sorted,
+    summary_of_sorted,
 )
 from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop_fast import open_loop_errors
@@ -95,7 +95,7 @@ def dropout(
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
-    further : models of constant parameters, beside those
+    further : models of constant parameters, in addition
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
 
@@ -116,11 +116,11 @@ def dropout(
     Notes
     -----
     A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
-    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. No
-    trials, but counted: starts with less path left, paths across a gap of the wheel data, ends in a real GNSS outage.
-    Of a standstill the last state alone starts trials: the others would be copies, and a parked robot would set the
-    result. Overlapping trials are not independent: the intervals come from a moving-block bootstrap (Kuensch 1989) with
-    blocks of the horizon's length.
+    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
+    start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
+    where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
+    and a parked robot would set the result. Overlapping trials are not independent: the
+    intervals come from a moving-block bootstrap (Kuensch 1989) with blocks of the horizon's length.
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
@@ -187,10 +187,10 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
             tested = _blocks(drive, horizons, np.where(np.isfinite(errors.T), ends, -1), pool)
         if asked.sink is not None:
             asked.sink(model.name, horizons, errors)
-        results.append(_summarise(model, errors, tested, asked.seed, pool))
+        results.append(_result_of(model, errors, tested, asked.seed, pool))
         if model.name == "icr":
             after = errors[learned:] if learned is not None else errors[:0]
-            by_learning = summarise(errors[:learned]), summarise(after)
+            by_learning = error_summary(errors[:learned]), error_summary(after)
     return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
 
 
@@ -318,21 +318,21 @@ def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32],
     return errors.T
 
 
-def _summarise(
+def _result_of(
     model: Model | ConstantModel, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor
 ) -> ModelResult:
     """Return the errors of one model in numbers, horizon by horizon."""
 
-    def summarise(h: int) -> ModelResult:
+    def at_horizon(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
-        summary = summarise_sorted([ordered])
+        summary = summary_of_sorted([ordered])
         intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
         return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,))
 
-    return _joined(list(pool.map(summarise, range(len(blocks)))))
+    return _joined(list(pool.map(at_horizon, range(len(blocks)))))
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:

@@ -13,7 +13,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.ekf import REFERENCE_STEP_S
-from icrtool.kernels.filter_records import FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterInputs, FilterParameters
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
@@ -89,7 +89,7 @@ class FilterSetup:
     gnss_index : (m,) rows of the fixes that `data` holds; heading_index likewise
     """
 
-    data: Measurements
+    data: FilterInputs
     parameters: FilterParameters
     epoch_ns: int
     t0: float
@@ -147,7 +147,7 @@ def set_up_filter(
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     epoch = int(wheels.stamp_ns[0])
     gnss_index, heading_index = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
-    data = Measurements(
+    data = FilterInputs(
         wheel_t=_seconds(wheels.stamp_ns, epoch),
         v_left=wheels.v_left_mps,
         v_right=wheels.v_right_mps,
@@ -220,7 +220,7 @@ def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[
     return slipping
 
 
-def _start_time(name: str, data: Measurements) -> float:
+def _start_time(name: str, data: FilterInputs) -> float:
     """Return the first stamp by which wheel, GNSS and heading have each been seen."""
     if not (len(data.gnss_t) and len(data.heading_t)):
         raise DataError(name, "the outages leave no fix or no heading", "shorten them")
@@ -231,7 +231,7 @@ def _start_time(name: str, data: Measurements) -> float:
 
 
 def _start_state(
-    data: Measurements,
+    data: FilterInputs,
     t0: float,
     icrs: tuple[Floats, Floats],
     parameters: FilterParameters,
@@ -320,7 +320,7 @@ def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
 
 
-def _response_variance(data: Measurements, width_m: float) -> Floats:
+def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
 
     A body answers its wheels later than they turn, or slips less before it does: each change of the turn rate moves the
@@ -336,7 +336,7 @@ def _response_variance(data: Measurements, width_m: float) -> Floats:
 
 def _parameters(
     config: Config,
-    data: Measurements,
+    data: FilterInputs,
     antenna: tuple[float, float],
     noise: ProcessNoise,
     headings_alike: float,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
@@ -12,24 +14,23 @@ LONGEST_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""
 
 
-def measured_headings(run: Run) -> tuple[MeasuredHeading, ...]:
-    """Return the headings measured apart from the position reference, a gyro's before an attitude sensor's.
+def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
+    """Yield the headings measured apart from the position reference, a gyro's before an attitude sensor's.
 
     A heading that needs positions is left out (estimated, or a field of the position's messages), like one that does
     not cover the run.
     """
-    found, sensors = [], run.sensors
+    sensors = run.sensors
     stamps = run.table.stamp_ns
     if sensors.gyro is not None and _covers(sensors.gyro.stamp_ns, stamps):
-        found.append(MeasuredHeading("gyro", _integrate(sensors.gyro.stamp_ns, sensors.gyro.rate_radps, stamps)))
+        yield MeasuredHeading("gyro", _integrate(sensors.gyro.stamp_ns, sensors.gyro.rate_radps, stamps))
     needs_positions = sensors.heading_from_position or sensors.heading_is_estimated
     attitude = None if needs_positions else sensors.headings
     attitude = sensors.attitude if sensors.attitude is not None else attitude
     if attitude is not None and _covers(attitude.stamp_ns, stamps):
         turned = np.unwrap(attitude.heading_rad)
         angle = np.interp(_since(stamps, stamps), _since(attitude.stamp_ns, stamps), turned)
-        found.append(MeasuredHeading("heading", angle))
-    return tuple(found)
+        yield MeasuredHeading("heading", angle)
 
 
 def _since(stamp_ns: Ints, epoch_ns: Ints) -> Floats:

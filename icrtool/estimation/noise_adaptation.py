@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import FilterOutput
 from icrtool.kernels.measurement_codes import UNSEEN
 from icrtool.records.measurements import SensorData
@@ -55,7 +55,7 @@ def run_adaptively(
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
-        return setup, run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+        return setup, run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
 
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)

@@ -92,12 +92,7 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None, wi
     """
     p = nominal_icrs(table, track_width_m)
     width = float(p[0] - p[1])
-    std = _posterior(
-        windows,
-        position_std=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
-        heading_std=float(np.median(table.std_heading_rad)),
-        width=width,
-    )
+    std = _posterior(windows, width)
     omega = (drive.v_left - drive.v_right) / width
     spins = np.abs(drive.v_left - drive.v_right) > SPIN_RATIO * np.abs(drive.v_left + drive.v_right) / 2
     # noise of standing encoders is no turn
@@ -161,11 +156,10 @@ def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
     return np.array([right, left, x])
 
 
-def _posterior(windows: DriveWindows, *, position_std: float, heading_std: float, width: float) -> Floats:
+def _posterior(windows: DriveWindows, width: float) -> Floats:
     """Return standard deviations (3,) of the ICRs, heading offset and scales marginalised."""
-    place_noise = np.sqrt(2.0 * position_std**2 + (SLIP_SHARE * windows.length_m) ** 2)
-    turn_noise = np.sqrt(2.0 * heading_std**2 + (SLIP_SHARE * windows.turned_rad) ** 2 + 1e-12)
-    rows = windows.jacobian / np.concatenate([place_noise, place_noise, turn_noise])[:, None]
+    slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
+    rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
     information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
     deviations: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     return deviations

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
@@ -13,6 +14,7 @@ from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import UNSEEN
+from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import States
 
@@ -35,7 +37,11 @@ UNUSABLE_SHARE = 0.3
 
 
 def unusable_reasons(
-    excitation: Excitation, gnss: MeasurementOutcome, heading: MeasurementOutcome, noise: ProcessNoise
+    excitation: Excitation,
+    gnss: MeasurementOutcome,
+    heading: MeasurementOutcome,
+    noise: ProcessNoise,
+    wheel_scale: Finding | None = None,
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be."""
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
@@ -48,6 +54,10 @@ def unusable_reasons(
         reasons.append("the wheels explain almost none of the motion")
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
         reasons.append("the wheels explain almost none of the turns: do they slip, as on ice?")
+    if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
+        left = wheel_scale.value / wheel_scale.applied
+        if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
+            reasons.append(f"the robot goes {100 * left:.0f} % of the distance that the wheels report")
     return reasons
 
 

@@ -38,6 +38,9 @@ SMALLEST_CHANGE_M = 0.03
 SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
 """Chords of the driven path are at least this long, and so many standard deviations of the position."""
 
+LEAST_MODELLED = 0.5
+"""Part of a chord that the model shows where the speed within it is the model's."""
+
 MOST_LISTED = 50
 """Jumps of the position that run.json lists."""
 
@@ -65,7 +68,8 @@ def summarise(
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
-    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise)
+    scale = measurements.findings["wheel_scale"] if config.filter.preset == "field" else None
+    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise, scale)
     document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,
@@ -274,16 +278,19 @@ def drive_summary(table: States) -> dict[str, float]:
     -----
     The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
     parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
-    follows the model's.
+    follows the model's, or is constant where the model shows less than half of it.
     """
     weight = np.diff(table.t_s)
     duration = float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
     rows, chords = _chords(table, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
     distance = float(chords.sum())
-    modelled = np.diff(table.distance_m[rows])
-    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=modelled > 0)
-    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows))
+    modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
+    # in a gap of the wheel data the model stands still
+    known = LEAST_MODELLED * chords < modelled
+    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
+    even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
+    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
     mean = distance / duration if duration > 0 else 0.0
     spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=weight))) if duration > 0 else 0.0
     return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}

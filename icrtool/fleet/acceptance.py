@@ -30,17 +30,15 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
     counts = Counter(row.status for row in rows)
-    failed_gates = [one for row in rows for one in row.verdicts if not one.passed]
+    shown = [(row, one) for row in rows for one in row.verdicts]
+    failed_gates = [one for _, one in shown if not one.passed]
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
-    if any(row.verdicts for row in rows):
-        lines += [
-            f"**Acceptance limits not met: {len(failed_gates)}.**"
-            if failed_gates
-            else "All acceptance limits are met.",
-            "",
-        ]
-    shown = [(row, one) for row in rows for one in row.verdicts]
+    if shown:
+        met = (
+            f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
+        )
+        lines += [met, ""]
     if shown:
         shown.sort(key=lambda pair: pair[1].passed)
         limits = []

@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import Request, files_of, path_of
-from icrtool.fleet.recordings import FoundRecording, find_recordings
+from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
@@ -78,6 +78,9 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
         raise OutputError(output, "is a run itself", "name another place for the batch")
     if output.exists() and not output.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
+    # A table of simulated truth beside its log, from a pattern of the shell, is no manifest.
+    beside = logs_among([place for place in places if place.is_file()])[1]
+    places = [place for place in places if place not in beside]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
     searched = [place for place in places if not is_manifest(place)]
     searched += [place for entry in entries for place in entry.places]
@@ -112,7 +115,7 @@ def finished(request: Request) -> Row | None:
         or (request.report.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
     ):
         return None
-    why = "done before: same input, configuration and version"
+    why = "; ".join(filter(None, ["done before: same input, configuration and version", row.reason]))
     return replace(row, status="skipped", reason=why, log=request.row.log, group=request.row.group,
                    tags=request.row.tags)  # fmt: skip
 
@@ -138,6 +141,8 @@ def run_batch(
     for request, row in _all_of(todo, executor, options, watch):
         if row.status == "failed" and not row.repeatable:
             again.append(request)
+            if watch is not None:
+                watch(row.log, "waits for a second attempt")
         else:
             yield row
     for request in again:

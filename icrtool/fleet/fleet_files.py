@@ -17,7 +17,7 @@ from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes
 from icrtool.records.dropout import Verdict
-from icrtool.records.text import LogText, escaped
+from icrtool.records.text import LogText, counted, escaped
 
 FLEET_SCHEMA = "icrtool/fleet/1"
 
@@ -83,7 +83,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
     parts = []
     for one in calibrations:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
-        head = f"{name}: {len(one.logs)} {'log' if len(one.logs) == 1 else 'logs'}"
+        head = f"{name}: {counted(len(one.logs), 'log')}"
         if one.left_out:
             head += f", {len(one.left_out)} not used (not usable, copies, or more than {MOST_POOLED})"
         if one.reason:
@@ -124,9 +124,8 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
 
 
 def reason_of(row: Row) -> str:
-    """Return why a log failed without what is particular to it: the second part of ``what: why; advice``."""
-    parts = row.reason.split(": ", 1)
-    return parts[-1].split(";")[0].split(" (tried")[0]
+    """Return why a log failed without what is particular to it: the first part of ``why; advice``."""
+    return row.reason.split(";")[0].split(" (tried")[0]
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:

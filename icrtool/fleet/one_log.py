@@ -81,7 +81,11 @@ def process(request: Request, stage: Stage) -> Row:
         row = _results(request, stage)
     except IcrToolError as err:
         # A full disk may not be full the next time; the log's own errors come again.
-        row = failed(request, str(err), repeatable=not isinstance(err, OutputError))
+        # Row and message name the log already.
+        reason = str(err)
+        for name in (request.path, request.directory):
+            reason = reason.removeprefix(f"{path_of(name)}: ")
+        row = failed(request, reason, repeatable=not isinstance(err, OutputError))
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     row_file = path_of(request.row_file)
     row_file.parent.mkdir(parents=True, exist_ok=True)
@@ -130,6 +134,7 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
     return replace(
         request.row,
         status="done",
+        reason=f"not usable: {summary['unusable_because']}" if not summary["usable"] else "",
         robot=request.row.robot or request.config.robot.name or "",
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary["drive"]["duration_s"],

@@ -58,13 +58,11 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
     LogError
         A place does not exist, or there is no recording in any of them.
     """
-    found: dict[str, Path] = {}
     for place in places:
         if not place.exists() and not split_files(place):
             raise LogError(place, "no such file or directory")
-        for path in _search(place) if place.is_dir() else [place]:
-            found.setdefault(os.path.realpath(path), path)
-    found = joined(found)
+    logs, _ = logs_among(places)
+    found = joined({os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)})
     if not found:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
@@ -117,7 +115,7 @@ class Extent(NamedTuple):
     topics: frozenset[tuple[str, str]]
 
     def goes_on_in(self, other: Extent) -> bool:
-        """Return whether another file goes on where this one ends, with at least half of the topics in common."""
+        """Return whether another file continues where this one ends, with at least half of the topics in common."""
         pause_s = (other.begin_ns - self.end_ns) / 1e9
         fewer = min(len(self.topics), len(other.topics))
         in_common = 2 * len(self.topics & other.topics) >= fewer > 0

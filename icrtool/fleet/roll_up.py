@@ -86,7 +86,7 @@ def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
-    """Return the run directories of a batch by the name of their group: of the manifest, else of the robot.
+    """Return the usable runs of a batch by the name of their group: of the manifest, else of the robot.
 
     Robots that are in the same group of the manifest are distinguished.
 
@@ -95,7 +95,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     RunError
         The folder does not hold the result of a batch.
     """
-    logs = logs_of_fleet(directory)
+    logs = [one for one in logs_of_fleet(directory) if one.multiplier is not None]
     robots = {one.robot for one in logs}
     found: dict[str, list[Path]] = {}
     for one in logs:

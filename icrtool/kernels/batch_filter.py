@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf import REFERENCE_STEP_S, filter_rows
-from icrtool.kernels.filter_records import FilterOutput, FilterParameters, FilterState, Measurements
+from icrtool.kernels.filter_records import FilterInputs, FilterOutput, FilterParameters, FilterState
 from icrtool.kernels.kinematics import euler_step
 
 
@@ -19,7 +19,7 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    wheel_t : (n,) [s], n >= 2; gnss_t : (m,); heading_t : (h,); change_t : (c,), as in `Measurements`
+    wheel_t : (n,) [s], n >= 2; gnss_t : (m,); heading_t : (h,); change_t : (c,), as in `FilterInputs`
     gnss_r : (m, 2) [m^2]; heading_r : (h,) [rad^2]
     v_left, v_right : (runs, n) [m/s]; gnss_z : (runs, m, 2) [m]; heading_z : (runs, h) [rad]
     t0 : time of the start [s]; x0 : (runs, 6) states there; P0 : (21,) upper triangle of the covariance there
@@ -81,7 +81,7 @@ def _filter_runs(batch: Batch, parameters: FilterParameters, first: int, out: Ba
     residual, innovation, distance = np.zeros((n_gnss, 2)), np.zeros(n_heading), np.zeros(len(batch.wheel_t))
     det = np.zeros(n_gnss)
     for run in range(len(batch.x0)):
-        data = Measurements(
+        data = FilterInputs(
             batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
             batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t, np.zeros(0, np.bool_),
             np.zeros(0),

@@ -15,7 +15,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf_step import DIAGONAL, EAST, HEADING, NORTH, correct, keep_sides, measured_column, predict, wrap
-from icrtool.kernels.filter_records import FilterOutput, FilterParameters, FilterState, Measurements, Nodes
+from icrtool.kernels.filter_records import FilterInputs, FilterOutput, FilterParameters, FilterState, Nodes
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
@@ -23,7 +23,7 @@ REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
 
 BLOCK_EVENTS = 500_000
-"""Events in one compiled call of `run_filter`: some 0.2 s, between which Ctrl-C and SIGTERM are acted on."""
+"""Events in one compiled call of `run_ekf`: some 0.2 s, between which Ctrl-C and SIGTERM are acted on."""
 
 
 @njit
@@ -148,7 +148,7 @@ def advance(
 
 @njit
 def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
-    data: Measurements, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
+    data: FilterInputs, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
     nodes: Nodes | None,
 ) -> int:  # fmt: skip
     """Run the filter over wheel samples [begin, end); return the number of events.
@@ -226,7 +226,7 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
     return count
 
 
-def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
+def run_ekf(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
     """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
 
     Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
@@ -246,7 +246,7 @@ def run_filter(data: Measurements, t0: float, x0: Floats, P0: Floats, parameters
     return block._replace(x=x, variance=variance, distance=distance, P=state.P)
 
 
-def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> FilterState:
+def start_state(data: FilterInputs, t0: float, x0: Floats, P0: Floats) -> FilterState:
     """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
     times = (data.gnss_t, data.heading_t, data.change_t)
     return FilterState(
@@ -259,7 +259,7 @@ def start_state(data: Measurements, t0: float, x0: Floats, P0: Floats) -> Filter
     )
 
 
-def empty_output(data: Measurements, rows: int) -> FilterOutput:
+def empty_output(data: FilterInputs, rows: int) -> FilterOutput:
     """Return the output of a run of so many recorded states, before it has run."""
     n_gnss, n_heading = len(data.gnss_t), len(data.heading_t)
     return FilterOutput(

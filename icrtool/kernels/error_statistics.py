@@ -29,7 +29,7 @@ MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
 
 
-def summarise(errors_m: Floats) -> Summary:
+def error_summary(errors_m: Floats) -> Summary:
     """Summarise the trials of every horizon; `errors_m` is (n_starts, n_horizons).
 
     Notes
@@ -37,7 +37,7 @@ def summarise(errors_m: Floats) -> Summary:
     Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
     interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
-    return summarise_sorted([sort_trials(column) for column in errors_m.T])
+    return summary_of_sorted([sort_trials(column) for column in errors_m.T])
 
 
 def sort_trials(errors_m: Floats) -> Floats:
@@ -46,8 +46,8 @@ def sort_trials(errors_m: Floats) -> Floats:
     return ordered[: np.searchsorted(ordered, np.inf, side="right")]
 
 
-def summarise_sorted(ordered: Sequence[Floats]) -> Summary:
-    """Summarise trials as `summarise` does; `ordered` has the result of `sort_trials` for each horizon."""
+def summary_of_sorted(ordered: Sequence[Floats]) -> Summary:
+    """Summarise trials as `error_summary` does; `ordered` has the result of `sort_trials` for each horizon."""
     table = np.full((4, len(ordered)), np.nan)
     for h, errors in enumerate(ordered):
         if len(errors):

@@ -52,7 +52,7 @@ class FilterParameters(NamedTuple):
     guard: int = GUARDED
 
 
-class Measurements(NamedTuple):
+class FilterInputs(NamedTuple):
     """Inputs of one run: times [s] since any one epoch, non-decreasing.
 
     Attributes

@@ -191,19 +191,28 @@ def normal_equations(residuals: Floats, jacobian: Floats, scale: Floats, overlap
 
 
 def sandwich_covariance(
-    residuals: Floats, jacobian: Floats, scale: Floats, group: Ints, pull: Floats, overlap: float = 1.0
+    residuals: Floats,
+    jacobian: Floats,
+    scale: Floats,
+    group: Ints,
+    pull: Floats,
+    overlap: float = 1.0,
+    group_std: Floats | None = None,
 ) -> tuple[Floats, Floats, int]:
     """Return the covariance (k, k) of a robust fit, its information matrix (k, k), and the number of groups.
 
     Parameters
     ----------
     pull : (k,) information of the prior
+    group_std : (k,) how far the parameters of a group are expected to lie from the common ones, an expectation that
+        counts as one group; None: the groups alone show it
 
     Notes
     -----
     H^-1 (sum g g^T + P) H^-1 with g the gradient of a group, H the Gauss-Newton matrix and P the prior (White 1982;
     Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread: no variance is less
-    than that of H^-1.
+    than that of H^-1. A group with parameters of its own, T their covariance about the common ones, and information A
+    has a gradient of covariance A T A: so is the spread expected with `group_std`, and the two are averaged.
     """
     z, scaled = residuals / scale, jacobian / scale[:, None]
     influence = soft_l1_weights(z) / overlap
@@ -212,7 +221,12 @@ def sandwich_covariance(
     first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
     gradients = np.add.reduceat((scaled * (influence * z)[:, None])[order], first)
     count = len(first)
-    meat = gradients.T @ gradients * (count / max(count - 1, 1)) + np.diag(pull)
+    meat = gradients.T @ gradients * (count / max(count - 1, 1))
+    if group_std is not None:
+        rows = np.split(order, first[1:])
+        of_groups = [(scaled[one] * influence[one, None]).T @ scaled[one] * group_std for one in rows]
+        meat = (count * meat + sum(one @ one.T for one in of_groups)) / (count + 1)
+    meat = meat + np.diag(pull)
     inverse = np.linalg.solve(information, np.eye(len(pull)))
     sandwich = inverse @ meat @ inverse
     if not (np.diag(sandwich) > 0.0).all():

@@ -20,7 +20,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.ekf import empty_nodes, empty_output, filter_rows, start_state
-from icrtool.kernels.filter_records import FilterParameters, Measurements, Nodes
+from icrtool.kernels.filter_records import FilterInputs, FilterParameters, Nodes
 from icrtool.kernels.kinematics import step_jacobian
 
 CHUNK_ROWS = 8192
@@ -142,9 +142,9 @@ def smooth_chunk(
 
 
 def run_smoother(
-    data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_ROWS
+    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_ROWS
 ) -> Smoothed:
-    """Smooth the run that `icrtool.kernels.ekf.run_filter` makes of the same arguments.
+    """Smooth the run that `icrtool.kernels.ekf.run_ekf` makes of the same arguments.
 
     Returns
     -------
@@ -169,7 +169,7 @@ def run_smoother(
     return out
 
 
-def most_events(data: Measurements, place: Ints, begin: int, end: int) -> int:
+def most_events(data: FilterInputs, place: Ints, begin: int, end: int) -> int:
     """Return the largest number of events from `place` (3,) on in the wheel samples [begin, end)."""
     stamps = (data.gnss_t, data.heading_t, data.change_t)
     stop = [int(np.searchsorted(times, data.wheel_t[end - 1], side="right")) for times in stamps]

@@ -13,6 +13,7 @@ from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.records.samples import ROLE_WORDS, Role, rate_and_jitter
 from icrtool.records.tables import RobotLog
+from icrtool.records.text import counted
 
 Sources = Sequence[WheelMotion | PositionSource | HeadingSource]
 
@@ -28,7 +29,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
     everything : also list the topics whose types no role can use
     """
     size = sum(file.bytes for file in survey.inputs)
-    topics, files = _count(len(survey.channels), "topic"), _count(len(survey.inputs), "file")
+    topics, files = counted(len(survey.channels), "topic"), counted(len(survey.inputs), "file")
     lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
     lines += _topics(survey, everything=everything)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
@@ -79,14 +80,14 @@ def _topics(survey: Survey, *, everything: bool) -> list[str]:
         if table is not None:
             rate, _ = rate_and_jitter(table.log_time_ns)
             text += (
-                f"  {_count(len(table), 'message')}{f', {rate:.4g} Hz' if rate > 0 else ''}{_gaps(table.log_time_ns)}"
+                f"  {counted(len(table), 'message')}{f', {rate:.4g} Hz' if rate > 0 else ''}{_gaps(table.log_time_ns)}"
             )
             if table.unreadable:
                 text += f", {table.unreadable} unreadable"
         elif topic in survey.candidates.unread:
             text += f"  not read: {survey.candidates.unread[topic]}"
         elif channel.count is not None:
-            text += f"  {_count(channel.count, 'message')}, no role"
+            text += f"  {counted(channel.count, 'message')}, no role"
         else:
             text += "  no role"
         lines.append(text)
@@ -103,11 +104,7 @@ def _gaps(stamps: Ints) -> str:
     long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
     if not long.any():
         return ""
-    return f", {_count(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}" if number == 1 else f"{number} {word}s"
+    return f", {counted(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
 
 
 def _candidates(sources: Sources, chosen: str | None) -> list[str]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Complexes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop import ends_from
 from icrtool.kernels.trials import Drive
@@ -55,6 +55,7 @@ class Recording:
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
+    slipping : (n,) whether the interval after a state lies in a slip event, which no window crosses; None without one
     """
 
     name: str
@@ -66,6 +67,7 @@ class Recording:
     sha256: str = ""
     gyro_reversed: bool = False
     begin_ns: int = 0
+    slipping: Bools | None = None
 
     @property
     def held_s(self) -> Floats:
@@ -78,7 +80,9 @@ class Recording:
         """Return the states [first, stop) as a recording."""
         rows = slice(first, stop)
         gyro = None if self.gyro_radps is None else self.gyro_radps[rows]
-        return replace(self, t_s=self.t_s[rows], drive=Drive._make(c[rows] for c in self.drive), gyro_radps=gyro)
+        slipping = None if self.slipping is None else self.slipping[rows]
+        drive = Drive._make(c[rows] for c in self.drive)
+        return replace(self, t_s=self.t_s[rows], drive=drive, gyro_radps=gyro, slipping=slipping)
 
 
 class LogConstants(NamedTuple):
@@ -170,7 +174,7 @@ class Windows(NamedTuple):
 def cut_windows(
     recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Sequence[Recording] = ()
 ) -> Windows:
-    """Cut a recording into windows of driven distance; those across a gap or with an end in an outage are left out.
+    """Cut a recording into windows of driven distance; none crosses a gap or a slip event, or ends in an outage.
 
     Parameters
     ----------
@@ -190,6 +194,10 @@ def cut_windows(
     begins = begins[~drive.in_outage[begins]]
     ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
     row, column = np.nonzero(ends.T >= 0)[::-1]
+    if recording.slipping is not None:
+        before: Ints = np.cumsum(recording.slipping) - recording.slipping
+        quiet: Bools = before[begins[row]] == before[ends[row, column]]
+        row, column = row[quiet], column[quiet]
     if len(row) < FEWEST_WINDOWS:
         why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"
         raise DataError(recording.name, why, "a calibration needs a longer drive")

@@ -65,7 +65,7 @@ class Entry(NamedTuple):
 FIGURES = {
     "trajectory": Entry(
         "run", "The drive from above",
-        "Filter and position reference should coincide. Odometry leaves them by what wheel speeds alone lose.",
+        "Filter and position reference should coincide; the odometry shows what error wheel speeds alone make.",
         "trajectory.trajectory", with_place=True,
     ),
     "icr_estimates": Entry(

@@ -24,7 +24,13 @@ class InputFile(msgspec.Struct, frozen=True):
 
 
 class FleetLog(msgspec.Struct, frozen=True):
-    """What fleet.json holds of a log, as others need it; `run`: its directory below that of the batch."""
+    """What fleet.json holds of a log, as others need it.
+
+    Attributes
+    ----------
+    run : its directory below that of the batch
+    multiplier : None where its ICRs are not usable
+    """
 
     log: str
     run: str
@@ -32,6 +38,7 @@ class FleetLog(msgspec.Struct, frozen=True):
     robot: str
     group: str
     inputs: list[InputFile]
+    multiplier: float | None = None
 
 
 class _Fleet(msgspec.Struct, frozen=True):

@@ -113,23 +113,29 @@ def read_states(path: Path, states: StatesFormat) -> States:
         if states == "parquet":
             import pyarrow.parquet as pq
 
-            numbers = pq.read_metadata(path).num_rows * len(COLUMNS)
-            if 8 * numbers > FREE_BYTES + LARGEST_RATIO * path.stat().st_size:
-                raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
-            stored = pq.read_table(path, columns=list(COLUMNS))
-        else:
-            import pyarrow.csv as pc
+            with pq.ParquetFile(path) as file:
+                numbers = file.metadata.num_rows * len(COLUMNS)
+                if 8 * numbers > FREE_BYTES + LARGEST_RATIO * path.stat().st_size:
+                    raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
+                _check_columns(file.schema_arrow, types)
+                # One at a time: each one's memory is used again for the next.
+                return States(**{name: _array(file.read([name]).column(0)) for name in COLUMNS})
+        import pyarrow.csv as pc
 
-            options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
-            stored = pc.read_csv(path, convert_options=options)
-        if dict(zip(stored.schema.names, stored.schema.types, strict=True)) != types:
-            raise StatesFileError("its columns are not those of the states")
+        options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
+        stored = pc.read_csv(path, convert_options=options)
+        _check_columns(stored.schema, types)
         columns = dict(zip(stored.schema.names, stored.columns, strict=True))
         del stored
         # Each column's memory goes back before the next is copied.
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
     except pa.ArrowException as err:
         raise StatesFileError(" ".join(str(err).split())) from err
+
+
+def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
+    if {name: schema.field(name).type for name in schema.names if name in types} != types:
+        raise StatesFileError("its columns are not those of the states")
 
 
 def _array(column: pa.ChunkedArray) -> NDArray[Any]:

@@ -8,8 +8,11 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from icrtool.output.text_blocks import Line
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.text import counted
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import ControllerErrors
     from icrtool.records.run_document import RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -46,19 +49,6 @@ def signed(metres: float) -> str:
     return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
 
 
-def length_text(metres: float) -> str:
-    """Return a distance as ``3.4 mm``, ``1.2 cm`` or ``3.45 m``."""
-    if metres < 0.01:
-        return f"{1000 * metres:.1f} mm"
-    return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.2f} m"
-
-
-def metres_text(metres: float) -> str:
-    """Return an error as ``0.0034 m``, ``0.012 m`` or ``3.45 m``: one unit wherever errors stand side by side."""
-    digits = 4 if metres < 0.01 else 3 if metres < 0.1 else 2
-    return f"{metres:.{digits}f} m"
-
-
 def distance_text(metres: float) -> str:
     """Return a distance as ``398.5 m`` or ``36.00 km``."""
     return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
@@ -76,20 +66,31 @@ def duration_text(seconds: float) -> str:
 
 def model_text(label: str, name: str, parameters: int) -> str:
     """Return a recommended model as ``three ICRs (3 parameters, model icr)``."""
-    count = "one parameter" if parameters == 1 else f"{parameters} parameters"
-    return f"{label} ({count}, model {name})"
+    return f"{label} ({counted(parameters, 'parameter')}, model {name})"
 
 
 def controller_text(numbers: Mapping[str, Any]) -> str:
     """Return what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
+    if not any(value for name, value in numbers.items() if name.endswith("_std")):
+        return "keeps its constants: the recommended model estimates none of them"
     return (
-        f"wheel_separation_multiplier {numbers['multiplier']:.2f} ± {numbers['multiplier_std']:.2f}, left/right wheel "
+        f"wheel_separation_multiplier {numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}, left/right wheel "
         f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"
     )
 
 
+def controller_error_text(errors: ControllerErrors | None) -> str:
+    """Return the held-out error of a controller beside that of the whole model; empty where it was not measured."""
+    if errors is None or not math.isfinite(errors.p95_m):
+        return ""
+    return (
+        f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "
+        f"out), with the whole model {error_text(errors.full_p95_m)}"
+    )
+
+
 def error_text(metres: float) -> str:
-    """Return an error [m] with three digits or to the millimetre."""
+    """Return an error as ``0.0034 m``, ``0.123 m`` or ``3.45 m``: one unit, and the same digits, in all places."""
     if not math.isfinite(metres):
         return "-"
-    return f"{metres:.3f} m" if metres < 1 else f"{metres:.2f} m"
+    return f"{metres:.{4 if metres < 0.01 else 3 if metres < 1 else 2}f} m"

@@ -129,6 +129,14 @@ class Run:
         return tuple(change["t_s"] for change in self.summary["terrain"]["changes"])
 
     @property
+    def slipping(self) -> Bools:
+        """Whether the interval after a state lies in a slip event (n,)."""
+        begin, end, inside = self.table.stamp_ns[:-1], self.table.stamp_ns[1:], np.zeros(len(self.table), np.bool_)
+        for event in self.sensors.events:
+            inside[:-1] |= (end > event.begin_ns) & (begin < event.end_ns)
+        return inside
+
+    @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
         spans = self.summary["icr"]["convergence_span_s"]
@@ -152,16 +160,16 @@ class Run:
 
     @property
     def ended_with(self) -> WarmStart:
-        """The filter's last ICRs and their covariance, to start another run from; wide where they are not shown."""
+        """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
         icrs = np.array([getattr(self.table, column)[-1] for column in ICR_COLUMNS], np.float64)
         covariance = np.array(self.summary["icr"]["final_covariance_m2"], np.float64)
         return WarmStart(icrs, covariance, self.track_width_m)
 
     @property
     def wheel_scales(self) -> tuple[float, float]:
-        """What the recorded speeds of the left and right side were multiplied with, from those at the nominal radius.
+        """Factors, left and right, from the speeds at the nominal wheel radius to the recorded ones.
 
-        It holds configured and estimated scales; dividing by it gives back the speeds that the wheels reported.
+        They hold configured and estimated scales; speeds divided by them are those that the wheels reported.
         """
         wheels = self.summary["wheels"]
         common = wheels.get("applied_scale", 1.0)

@@ -1,4 +1,4 @@
-"""The tables that packages hand to one another: a robot's log, and the states of a run."""
+"""The tables that pass from package to package: a robot's log, and the states of a run."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ class RobotLog:
     gyros : all inertial units with turn rates, all axes
     other_receivers : further GNSS receivers
     other_references : the same log with another position reference and its heading, where it holds one
+    slipping_ns : (k, 2) begins and ends of the slip events found in it: its wheels show nothing there
     """
 
     name: str
@@ -60,6 +61,7 @@ class RobotLog:
     gyros: tuple[GyroAxes, ...] = ()
     other_receivers: tuple[OtherReceiver, ...] = ()
     other_references: tuple[RobotLog, ...] = ()
+    slipping_ns: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def from_frames(

@@ -81,6 +81,11 @@ def table_cell(text: str) -> str:
     return f"'{shown}" if shown.startswith(("=", "+", "-", "@")) else shown
 
 
+def counted(number: int, what: str) -> str:
+    """Return ``1 log`` or ``3 logs``."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
 def shortened(text: str, longest: int) -> str:
     """Return a text of at most `longest` characters: where it is longer, an ellipsis replaces its middle."""
     if len(text) <= longest:

@@ -13,7 +13,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import FilterOutput, FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterInputs, FilterOutput, FilterParameters
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
@@ -55,10 +55,8 @@ def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float, step_hea
     return F
 
 
-def run_filter_plain(
-    data: Measurements, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters
-) -> FilterOutput:
-    """Do what `icrtool.kernels.ekf.run_filter` does, with matrices; the same arguments and result."""
+def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
+    """Do what `icrtool.kernels.ekf.run_ekf` does, with matrices; the same arguments and result."""
     first = int(np.searchsorted(data.wheel_t, t0))
     out = empty_output(data, len(data.wheel_t) - first)
     x, P, t, travelled = x0.astype(float), P0.astype(float), t0, 0.0
@@ -120,7 +118,7 @@ def _keep_sides(x: Floats, P: Floats, least: float) -> Floats:
 
 
 def _measure(
-    kind: int, i: int, t: float, x: Floats, P: Floats, data: Measurements, parameters: FilterParameters,
+    kind: int, i: int, t: float, x: Floats, P: Floats, data: FilterInputs, parameters: FilterParameters,
     run: list, out: FilterOutput,  # type: ignore[type-arg]  # count, time, innovation
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Gate and apply fix i (kind 1) or heading i (kind 2)."""

@@ -13,7 +13,8 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.atomic_file import write_file
-from icrtool.output.tables.dropout import budget_lines, percent_text, ratio_text, shown_horizons
+from icrtool.output.tables.dropout import format_dropout, shown_horizons
+from icrtool.output.text_blocks import Line, Table
 from icrtool.output.text_format import error_text, run_title, xml_text
 from icrtool.records.dropout import Verdict
 
@@ -81,37 +82,21 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 
 
 def format_markdown(report: DropoutReport) -> str:
-    """Return one report as Markdown."""
-    shown = shown_horizons(report)
-    head = ("distance without GNSS", *(f"{report.horizons_m[h]:g} m" for h in shown))
-    rows = []
-    for result in report.results:
-        for label, column in (("95 %", result.summary.p95), ("expected", result.summary.expected)):
-            cells = [
-                f"{error_text(float(column[h]))} ({percent_text(100 * float(column[h] / report.horizons_m[h]))})"
-                for h in shown
-            ]
-            rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
-    icr, no_slip = report.result("icr"), report.result("no_slip")
-    if icr is not None and no_slip is not None:
-        ratios = [ratio_text(float(no_slip.summary.p95[h]), float(icr.summary.p95[h])) for h in shown]
-        rows.append(["no slip : ICR, 95 %", *ratios])
-    lines = [f"## {escaped_markdown(run_title(report.run_summary))}", ""]
-    if report.verdicts:
+    """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
+    title, verdicts = run_title(report.run_summary), [one.line() for one in report.verdicts]
+    lines = [f"## {escaped_markdown(title)}", ""]
+    if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
-        lines += [word, "", *(f"- {escaped_markdown(verdict.line())}" for verdict in report.verdicts), ""]
-    lines += [f"Open loop from each of {report.states:,} states. In words:", ""]
-    lines += [f"- {escaped_markdown(line)}" for line in budget_lines(report.budgets)]
-    lines += ["", *markdown_table(head, rows)]
+        lines += [word, "", *(f"- {escaped_markdown(line)}" for line in verdicts), ""]
+    for block in format_dropout(report).blocks:
+        if isinstance(block, Table):
+            rows = [[escaped_markdown(cell.strip()) for cell in row] for row in block.rows]
+            texts = [column for column, side in enumerate(block.sides()) if side == "l"]
+            lines += ["", *markdown_table(block.head, rows, texts), ""]
+        elif (text := block.text if isinstance(block, Line) else block) and text not in (title, *verdicts):
+            lines.append(f"- {escaped_markdown(text)}")
     if report.baseline is not None:
         lines += _baseline_lines(report, report.baseline)
-    if report.outages:
-        rows = [
-            [one.kind, f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s", f"{one.distance_m:.1f} m",
-             error_text(one.end_error_m), error_text(one.max_error_m)]
-            for one in report.outages
-        ]  # fmt: skip
-        lines += ["", *markdown_table(("outage", "from", "length", "distance", "end error", "max error"), rows)]
     return "\n".join(lines) + "\n"
 
 

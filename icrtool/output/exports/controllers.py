@@ -16,6 +16,7 @@ from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
+from icrtool.output.text_format import controller_error_text
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
 TARGETS: tuple[Target, ...] = get_args(Target)
@@ -137,7 +138,7 @@ def _controller(calibration: Calibration, errors: ControllerErrors, indent: int)
         ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
         ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
     ):
-        lines.append(f"{key}: {value:.4f}  # ± {std:.4f}")
+        lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {_diagonal(errors.pose_variance)}",
@@ -161,10 +162,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+.3f} ± {std_x:.3f} m (body: x forward, y right)"
     )
-    held_out = (
-        f"held out of the fit, wheels alone, after {POSE_AFTER_M:g} m: 95 % within {errors.p95_m:.2f} m with these "
-        f"numbers, {errors.full_p95_m:.2f} m with the whole model ({calibration.recommended}; icrtool export --for icr)"
-    )
+    held_out = f"{controller_error_text(errors)} ({calibration.recommended}; icrtool export --for icr)"
     lost = (
         f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"

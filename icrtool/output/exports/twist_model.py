@@ -69,7 +69,7 @@ def format_twist(calibration: Calibration) -> str:
 
 
 def sign_in_rep103(term: Term) -> float:
-    """Return by what a parameter is multiplied when y points left, turns count counter-clockwise and w = -w."""
+    """Return the factor of a parameter when y points left, turns count counter-clockwise and w = -w."""
     left, right = np.array([0.3]), np.array([0.1])
     here, swapped = (term.column(wheel_motion(*sides, 1.0))[0] for sides in ((left, right), (right, left)))
     axis = 1.0 if term.axis == VX else -1.0

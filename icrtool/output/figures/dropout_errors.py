@@ -19,7 +19,7 @@ from icrtool.output.figures.style import (
     new_figure,
     styled,
 )
-from icrtool.output.text_format import MODEL_WORDS, metres_text, run_title
+from icrtool.output.text_format import MODEL_WORDS, error_text, run_title
 from icrtool.records.dropout import ModelResult
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     axes.axvline(expected, label="expected value", **MEAN.keywords())
     label = MODEL_WORDS.get(result.name, result.label)
     axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
-    facts = f"expected {metres_text(expected)},  95 % within {metres_text(p95)},  max {metres_text(largest)}"
+    facts = f"expected {error_text(expected)},  95 % within {error_text(p95)},  max {error_text(largest)}"
     axes.set_title(facts, loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
     beyond = float(bins.percent[bins.left >= end_m].sum())

@@ -29,7 +29,7 @@ from icrtool.output.figures.style import (
     spot,
     styled,
 )
-from icrtool.output.text_format import MODEL_WORDS, duration_text, metres_text, run_title
+from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title
 from icrtool.records.dropout import ExampleTrial, Outage
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     examples = _needed(report, report.examples, "example trials")
     horizon = examples[0].horizon_m
@@ -78,7 +78,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
     for axes, drive in zip(panels, examples, strict=True):
         _draw_drive(axes, drive, shape=3.0 / 2.75)
         facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{MODEL_WORDS[name]} {metres_text(error)}" for name, error in drive.errors_m.items())
+        errors = ",  ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -93,7 +93,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     worst = _needed(report, report.worst, "worst trials")
     rows = -(-(len(worst) + 1) // WORST_COLUMNS)
@@ -110,7 +110,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
         _draw_drive(axes, drive, shape=1.0)
         text = (
-            f"{rank}.  ICR error {metres_text(drive.errors_m['icr'])}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
+            f"{rank}.  ICR error {error_text(drive.errors_m['icr'])}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
         )
         axes.set_title(f"{text}\nat {drive.speed_mean_mps:.2f} m/s", **CELL_TITLE)
         axes.tick_params(labelsize=7.5)
@@ -140,12 +140,12 @@ def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, e
 
 @styled
 def dropout_outages(report: DropoutReport) -> Figure:
-    """Return the path [m] with those of forced and real outages, and their end errors [m].
+    """Return the path [m] with its forced and real outages, and their end errors [m].
 
     Raises
     ------
     DataError
-        The report holds none, as one of `icrtool.dropout`.
+        The report holds none; `icrtool.dropout_report` makes one that does.
     """
     outages = _needed(report, report.outages, "outages")
     norths = np.concatenate([report.reference_north_m, *(one.north_m for one in outages)])
@@ -207,7 +207,7 @@ def _outages_text(outages: Sequence[Outage]) -> str:
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
             span = duration_text(lengths[0])
             span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
-            parts.append(f"{len(ours)} {kind} of {span}, end error up to {metres_text(worst)}")
+            parts.append(f"{len(ours)} {kind} of {span}, end error up to {error_text(worst)}")
     return "Outages: " + "; ".join(parts)
 
 
@@ -221,7 +221,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
         _spot_box(path[row], point_px) for path in paths for row in places(path[:, 1], path[:, 0], LINE_PT * point_px)
     ]
     for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
-        text = f"{number}: {metres_text(one.end_error_m)}"
+        text = f"{number}: {error_text(one.end_error_m)}"
         boxes = _label_boxes(path[-1], CHARACTER_PT * len(text), point_px)
         found = _free_box(boxes, [*taken, *crossed], axes.bbox) or _free_box(boxes, taken, axes.bbox)
         if found is None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROW_IN = 0.32
+LEAST_DAYS = 1.0
+"""Shown of the calendar: matplotlib gives a single date four years."""
 LONGEST_ROBOT, LONGEST_GROUP, LONGEST_REASON = 24, 24, 40
 """Characters of a label that there is space for."""
 
@@ -67,6 +69,10 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
                 markersize=4.5, capsize=2.0, linewidth=1.0, label=key,
             )  # fmt: skip
         axes.set_ylabel(label)
+    first, last = panels[-1].get_xlim()
+    if last - first < LEAST_DAYS or len({point.date for point in fleet.points}) == 1:
+        middle = (first + last) / 2
+        panels[-1].set_xlim(middle - LEAST_DAYS / 2, middle + LEAST_DAYS / 2)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]

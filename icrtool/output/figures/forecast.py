@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from icrtool.calibration.forecast import Forecast
-from icrtool.output.figures.style import FILTER, HALF_WIDTH, ICR, LABEL_BOX, MEAN, new_figure, styled
+from icrtool.output.figures.style import CHANGE, FILTER, HALF_WIDTH, ICR, MEAN, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,11 +32,7 @@ def forecast_figure(
             grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **ICR.keywords() | dash)
             grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **FILTER.keywords() | dash)
     for budget in budgets_m:
-        grown.axhline(budget, **HALF_WIDTH.keywords())
-        grown.annotate(
-            f"budget {budget:g} m", (0.99, budget), xycoords=("axes fraction", "data"), xytext=(0, 2),
-            textcoords="offset points", ha="right", fontsize=8, color="0.3", zorder=4, bbox=LABEL_BOX,
-        )  # fmt: skip
+        grown.axhline(budget, label=f"budget {budget:g} m", **CHANGE.keywords())
     if forecast.distance_m[-1] > measured_m:
         grown.axvline(measured_m, label="measured up to here", **MEAN.keywords())
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))

@@ -22,7 +22,7 @@ from icrtool.output.figures.style import (
     styled,
     time_unit,
 )
-from icrtool.output.text_format import metres_text, position_word, run_title
+from icrtool.output.text_format import error_text, position_word, run_title
 from icrtool.records.run import Run
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def gnss_difference(run: Run) -> Figure:
     top = _top(difference[used])
     if (mean := facts["mean_difference_m"]) is not None and (most := facts["max_difference_m"]) is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
-        _draw_used(axes, t[trusted], difference[trusted], f"used, max {metres_text(most)}")
-        axes.axhline(mean, label=f"mean {metres_text(mean)}", **MEAN.keywords())
+        _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
+        axes.axhline(mean, label=f"mean {error_text(mean)}", **MEAN.keywords())
     _mark(axes, t, difference, gated, top, "rejected", "x", color=BAD_FIX_COLOR, markersize=4.5)
     weak = run.sensors.fixes.down_weighted & used
     _mark(axes, t, difference, weak, top, "down-weighted", ".", color=FLOAT_COLOR, markersize=4.0)

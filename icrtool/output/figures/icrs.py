@@ -87,7 +87,7 @@ def icr_estimates(run: Run) -> Figure:
 
 @styled
 def icr_clusters(run: Run) -> Figure:
-    """Return the percent of the time that each ICR estimate had which value [m], after convergence."""
+    """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
     settled = run.settled_s
     after = run.table.t_s >= settled
     subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
@@ -108,8 +108,10 @@ def icr_clusters(run: Run) -> Figure:
 def _spans_s(run: Run) -> list[tuple[float, float]]:
     """Return begin and end [s] of the panels: all three estimates converging and what follows, or all in one."""
     duration = float(run.table.t_s[-1])
-    found = [span for span in run.convergence_s.values() if span is not None]
-    first, last = min((span[0] for span in found), default=0.0), run.settled_s
+    begins = [span[0] for span in run.convergence_s.values() if span is not None]
+    if not begins:
+        return [(0.0, duration)]
+    first, last = min(begins), run.settled_s
     margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
     begin, end = max(first - margin, 0.0), last + margin
     return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]

@@ -25,7 +25,7 @@ from icrtool.output.figures.style import (
     spot,
     styled,
 )
-from icrtool.output.text_format import distance_text, duration_text, metres_text, position_word, run_title
+from icrtool.output.text_format import distance_text, duration_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
@@ -155,7 +155,7 @@ def _draw_jumps(axes: Axes, run: Run) -> None:
     if len(stamps):
         rows = np.clip(np.searchsorted(table.stamp_ns, stamps), 0, len(table) - 1)
         largest = max(jump["size_m"] for jump in run.summary["gnss"]["jump_list"])
-        axes.plot(table.east_m[rows], table.north_m[rows], label=f"jump, up to {metres_text(largest)}", **JUMP_LOOK)
+        axes.plot(table.east_m[rows], table.north_m[rows], label=f"jump, up to {error_text(largest)}", **JUMP_LOOK)
 
 
 def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:

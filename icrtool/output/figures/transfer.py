@@ -26,10 +26,10 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
     """
     names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
-    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by what was not fitted to it"
+    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by a fit that does not contain it"
     figure = new_figure(
-        " · ".join(names), subtitle, width_in=9.0, height_in=2.6 + 0.45 * len(names) + 0.12 * len(rows),
-        margins_in=(1.3, 0.2, 1.0, 0.65), wspace=0.75,
+        " · ".join(names), subtitle, width_in=9.6, height_in=2.8 + 0.45 * len(names) + 0.12 * len(rows),
+        margins_in=(1.3, 0.2, 0.8, 1.0), wspace=1.15,
     )  # fmt: skip
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
     _draw_matrix(matrix, document, names)
@@ -58,7 +58,7 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
     short = [drawable(name, LONGEST_NAME) for name in names]
-    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False)
+    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
     axes.set_xlabel(f"tested on, after {CHOICE_HORIZON_M:g} m")
     axes.set_ylabel("calibrated on")

@@ -11,9 +11,10 @@ from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import reach_text
-from icrtool.output.text_format import error_text
+from icrtool.output.text_format import controller_error_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run import ICR_WORDS
+from icrtool.records.text import counted
 
 Grade = Literal["good", "care", "bad", "fact"]
 
@@ -55,6 +56,7 @@ class Answer(NamedTuple):
     ----------
     grade, verdict : may the numbers be used, in one word and in one sentence
     no_numbers : reason why there is no number, or no multiplier; empty where there is one
+    with_numbers : the error with these numbers alone; empty where it was not measured
     export : configuration of a diff_drive_controller; empty without a calibration
     """
 
@@ -63,6 +65,7 @@ class Answer(NamedTuple):
     reaches: tuple[Reach, ...]
     numbers: tuple[Number, ...]
     no_numbers: str
+    with_numbers: str
     export: str
     model: str
     checks: tuple[Check, ...]
@@ -95,6 +98,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
         reaches=_reaches(report),
         numbers=numbers,
         no_numbers=no_numbers,
+        with_numbers=controller_error_text(calibration.controller) if calibration is not None else "",
         export=_export(calibration),
         model=calibration.fitted.model.label if calibration is not None else "",
         checks=tuple(_checks(summary, report)),
@@ -143,6 +147,8 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
 
 
 def _with_std(value: float, std: float) -> str:
+    if std == 0.0:
+        return f"{value:.3f}, not estimated"
     return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f} ± less than 0.001"
 
 
@@ -184,23 +190,23 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
     gnss, events = summary["gnss"], summary["events"]
     found = []
     if warnings := len(summary["warnings"]):
-        found.append(Check("care", f"{_count(warnings, 'warning')} about the log."))
+        found.append(Check("care", f"{counted(warnings, 'warning')} about the log."))
     if events:
         kinds = [one["kind"] for one in events]
         each = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
         what = "the ICRs are not learned there" + ("" if report["without_events"] else ", but trials across them count")
-        found.append(Check("care", f"{_count(len(events), 'slip event')} ({each}): {what}."))
+        found.append(Check("care", f"{counted(len(events), 'slip event')} ({each}): {what}."))
     real = [one for one in report["outages"] if one["kind"] == "real"]
     if real:
         worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
         error = f"{error_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
-        found.append(Check("fact", f"{_count(len(real), 'real outage')}: in the worst the filter was {error}."))
+        found.append(Check("fact", f"{counted(len(real), 'real outage')}: in the worst the filter was {error}."))
     of = gnss["used"] + gnss["rejected"]
     if of:
         rejected = f"{gnss['rejected']:,} ({100 * gnss['rejected'] / of:.0f} %)" if gnss["rejected"] else "None"
         found.append(Check("fact", f"{rejected} of {of:,} positions were rejected."))
     if gnss["jumps"]:
-        text = f"{_count(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
+        text = f"{counted(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
         found.append(Check("care", text))
     return found
 
@@ -227,7 +233,3 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
         what = f"the {error_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
         found.append(Check("fact", f"{share} of {what} can be the error of the position reference."))
     return found
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -80,7 +80,6 @@ def _environment() -> Environment:
     )  # fmt: skip
     environment.filters |= {
         "metres": lambda value: "–" if value is None else _with_units(error_text(value)),
-        "metric": lambda value: _with_units(text_format.length_text(value)),
         "distance": lambda value: _with_units(text_format.distance_text(value)),
         "duration": lambda value: _with_units(text_format.duration_text(value)),
         "signed": text_format.signed,

@@ -22,7 +22,7 @@ from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
 from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
-from icrtool.output.text_format import duration_text, length_text, position_word
+from icrtool.output.text_format import duration_text, error_text, position_word
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_WORDS, Run
 from icrtool.records.samples import ROLE_WORDS
@@ -165,7 +165,7 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         real = [out for out in report["outages"] if out["kind"] == "real"]
         lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
         slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
-        notes = [f"the position jumps by {length_text(max(sizes))}"] if sizes else []
+        notes = [f"the position jumps by {error_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
         notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
         found.append({**one, "note": ", ".join(notes)})

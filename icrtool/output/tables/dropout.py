@@ -12,6 +12,7 @@ from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
     MODEL_WORDS,
+    controller_error_text,
     controller_text,
     distance_text,
     duration_text,
@@ -21,6 +22,7 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
+from icrtool.records.text import counted
 
 MODEL = 21
 """Characters of a model's name that are printed."""
@@ -29,7 +31,7 @@ LISTED_HORIZONS = 4
 """More horizons than this without a trial are printed as a range."""
 
 
-STARTS_TEXT = {"moving": "each moving one", "all": "each"}
+STARTS_TEXT = {"moving": "moving ", "all": ""}
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
@@ -46,13 +48,13 @@ def format_dropout(report: DropoutReport) -> Text:
     drive = report.run_summary["drive"]
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-    starts = f"{STARTS_TEXT[report.starts]} of {report.states:,} states"
+    starts = f"a trial from each {STARTS_TEXT[report.starts]}state of {report.states:,}"
     rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
     head = ("distance without GNSS", "", *_horizon_texts(report))
     blocks: list[Block] = [
         *unusable_lines(report.run_summary),
         Line(run_title(report.run_summary), "title"),
-        f"without GNSS, wheel speeds only, from {starts}; {driven}{reference}",
+        f"{driven}; without GNSS, wheel speeds only, {starts}{reference}",
         "",
     ]
     if sentences := headline(report):
@@ -99,17 +101,17 @@ def headline(report: DropoutReport) -> list[str]:
     interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
+    alone = controller_error_text(calibration.controller)
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
         f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
-        f"Controller: {controller_text(numbers._asdict())}.",
+        f"Controller: {controller_text(numbers._asdict())}{f'; {alone}' if alone else ''}.",
     ]
 
 
 def _calibration_lines(report: DropoutReport) -> list[str]:
     return [
-        f"{one.label}: {one.model} from {one.logs} {'log' if one.logs == 1 else 'logs'}, {one.created[:10]}, "
-        f"{one.fitted_text}"
+        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted_text}"
         for one in report.calibrations
     ]
 
@@ -124,16 +126,6 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
         more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
         lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
     return lines
-
-
-def percent_text(percent: float) -> str:
-    """Return an error in percent of the distance."""
-    return f"{percent:.1f} %" if math.isfinite(percent) else "-"
-
-
-def ratio_text(numerator: float, denominator: float) -> str:
-    """Return ``2.1 x``."""
-    return f"{numerator / denominator:.1f} x" if denominator > 0 and math.isfinite(numerator) else "-"
 
 
 def reach_text(one: BudgetDistance) -> str:
@@ -170,9 +162,10 @@ def _ratio_rows(report: DropoutReport) -> Rows:
     if icr is None or no_slip is None:
         return []
     rows = []
-    for lead, label, column in (("no slip : ICR", "95 %", "p95"), ("", "expected", "expected")):
+    for lead, label, column in (("no slip / ICR", "95 %", "p95"), ("", "expected", "expected")):
         ours, theirs = getattr(icr.summary, column), getattr(no_slip.summary, column)
-        rows.append([lead, label, *(ratio_text(float(theirs[h]), float(ours[h])) for h in shown_horizons(report))])
+        ratios = (float(theirs[h] / ours[h]) if ours[h] > 0 else math.nan for h in shown_horizons(report))
+        rows.append([lead, label, *(f"{ratio:.1f} x" if math.isfinite(ratio) else "-" for ratio in ratios)])
     return rows
 
 
@@ -215,7 +208,7 @@ def _event_lines(report: DropoutReport) -> list[str]:
     if not cost.events:
         return ["slip events: none in this log; --without-events changes nothing"]
     both = np.flatnonzero((icr.summary.trials > 0) & (cost.with_events["icr"].trials > 0))
-    number = "1 slip event" if cost.events == 1 else f"{cost.events} slip events"
+    number = counted(cost.events, "slip event")
     if not len(both):
         return [f"{number}: no trial is left without them"]
     h = int(both[-1])
@@ -316,7 +309,8 @@ def _outage_table(outages: Sequence[Outage], report: DropoutReport) -> Table:
 
 
 def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
-    return f"{error_text(error_m)} {percent_text(100 * error_m / float(report.horizons_m[h])):>7}"
+    percent = 100 * error_m / float(report.horizons_m[h])
+    return f"{error_text(error_m)} {f'{percent:.1f} %' if math.isfinite(percent) else '-':>7}"
 
 
 def _span_text(low_m: float, high_m: float) -> str:

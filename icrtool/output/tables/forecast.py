@@ -15,6 +15,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.logs.table_file import csv_frame
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, model_text
+from icrtool.records.text import counted
 
 PLAN_COLUMNS = ("east_m", "north_m")
 
@@ -109,8 +110,7 @@ def format_forecast(
 ) -> Text:
     """Return the table of a forecast, no line end."""
     total = float(forecast.distance_m[-1])
-    logs = "1 log" if len(calibration.logs) == 1 else f"{len(calibration.logs)} logs"
-    fitted = calibration.fitted
+    fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
     model = f"{model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))} from {logs}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []

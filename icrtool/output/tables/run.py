@@ -9,7 +9,7 @@ from icrtool.output.text_format import (
     controller_text,
     distance_text,
     duration_text,
-    length_text,
+    error_text,
     model_text,
     position_word,
     run_title,
@@ -18,6 +18,7 @@ from icrtool.output.text_format import (
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ClassDocument
 from icrtool.records.samples import ROLE_WORDS
+from icrtool.records.text import counted
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
 """A delay that receivers have, to show what it does; at lower speeds than this it does little."""
@@ -115,7 +116,7 @@ def _multiplier_rows(run: Run) -> list[Row]:
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     note = "" if shown else ": not shown well enough to be used"
-    value = f"{multiplier:.2f} ± {std:.2f}" if std is not None else f"{multiplier:.2f}"
+    value = f"{multiplier:.3f} ± {std:.3f}" if std is not None else f"{multiplier:.3f}"
     return [("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
 
 
@@ -125,10 +126,10 @@ def _recommended_rows(run: Run) -> list[Row]:
     if found is None or not run.usable:
         return []
     rows = found["parameters"].items()
-    values = ", ".join(f"{name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
+    values = "".join(f", {name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
     model = model_text(found["label"], found["model"], len(rows))
     return [
-        ("model", f"recommended: {model}: {values}; what error it makes: icrtool dropout-report"),
+        ("model", f"recommended: {model}{values}; what error it makes: icrtool dropout-report"),
         ("controller", controller_text(found["controller"])),
     ]
 
@@ -149,7 +150,7 @@ def _position_rows(run: Run) -> list[Row]:
     word = position_word(run.summary)
     lines = []
     if (difference := gnss["mean_difference_m"]) is not None and (largest := gnss["max_difference_m"]) is not None:
-        mean, most = length_text(difference), length_text(largest)
+        mean, most = error_text(difference), error_text(largest)
         raised = run.process_position_mps != configured_noise(run.config).position_mps
         why = "; follows them closely, for its position noise was raised" if raised else ""
         lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
@@ -169,7 +170,7 @@ def _position_rows(run: Run) -> list[Row]:
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
         lost = len(run.summary["rtk_losses_ns"])
         cause = f" ({lost} of RTK, fixes went on)" if lost else ""
-        lines.append(("", f"{outages} {'outage' if outages == 1 else 'outages'}{cause}, {away} in all"))
+        lines.append(("", f"{counted(outages, 'outage')}{cause}, {away} in all"))
     return lines
 
 
@@ -182,7 +183,7 @@ def _class_rows(classes: dict[str, ClassDocument], jumps: int) -> list[Row]:
         done += [f"{one['sold_as_fixed']:,} wrongly reported as fixed"] if one["sold_as_fixed"] else []
         lines.append(("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
     if jumps:
-        lines.append(("", f"{jumps} {'jump' if jumps == 1 else 'jumps'} of the position"))
+        lines.append(("", f"{counted(jumps, 'jump')} of the position"))
     return lines
 
 
@@ -217,7 +218,7 @@ def _delay_rows(run: Run) -> list[Row]:
     lines = [*found, "not corrected: slip of the wheels has the same effect"] if found else []
     speed = run.summary["drive"]["speed_mean_mps"]
     if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
-        shift = length_text(TYPICAL_DELAY_S * speed)
+        shift = error_text(TYPICAL_DELAY_S * speed)
         lines.append(f"of the fixes: not shown by this drive; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}")
     return [("" if number else "delays", line) for number, line in enumerate(lines)]
 

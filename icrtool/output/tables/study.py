@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from icrtool.output.text_blocks import Block, Table, Text
+from icrtool.records.text import counted
 from icrtool.simulation.studies import KINDS, StudyNumber, StudyRequest, StudyResult
 
 ERRORS = tuple(
@@ -89,7 +90,7 @@ def _number(value: float) -> str:
 
 def runs_text(request: StudyRequest) -> str:
     """Return number and length of the runs, as ``1 run of 60 s``."""
-    return f"{request.runs} run{'s' if request.runs != 1 else ''} of {request.plan.duration_s:g} s"
+    return f"{counted(request.runs, 'run')} of {request.plan.duration_s:g} s"
 
 
 def study_title(result: StudyResult) -> str:

@@ -74,16 +74,17 @@ def format_transfer(transfer: Transfer) -> Text:
         blocks.append("")
     names = list(transfer.calibrations)
     cells = [[transfer.cell(row, column, CHOICE_HORIZON_M) for column in names] for row in names]
-    matrix = [
-        (row[0].calibrated_on, *(f"{one.errors.p95_m:.2f} / {one.errors.expected_m:.2f}" for one in row))
-        for row in cells
-    ]
+    matrix = [(row[0].calibrated_on, *(_errors(cell) for cell in row)) for row in cells]
     blocks += [
         f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
         Table("lr", matrix, ("", *names)),
-        "on the diagonal each trial is predicted by what was not fitted to it",
+        "on the diagonal each trial is predicted by a fit that does not contain it",
     ]
     return Text(blocks)
+
+
+def _errors(cell: Cell) -> str:
+    return f"{cell.errors.p95_m:.2f} / {cell.errors.expected_m:.2f}" if math.isfinite(cell.errors.p95_m) else "-"
 
 
 def verdict(transfer: Transfer, pair: Pair) -> str:

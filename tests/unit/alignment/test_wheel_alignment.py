@@ -209,3 +209,17 @@ def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: 
     fused = replace(with_wheels(log, speed + 0.4 * turn, speed - 0.4 * turn), streams=streams, gyro=gyro)
     warnings = align_streams(fused, CONFIG).warnings
     assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned
+
+
+def test_the_diameter_for_the_radius_is_corrected_on_wheels_that_roll_at_less_than_their_radius_too() -> None:
+    log = make_log(seconds=120.0)
+    left, right = (2.0 / 0.955 * speed for speed in (log.wheels.left, log.wheels.right))
+    found = align_streams(with_wheels(log, left, right), CONFIG)
+    assert found.wheels.applied_scale == pytest.approx(0.955 / 2.0, rel=0.01)
+
+
+def test_a_scale_that_nothing_explains_makes_the_run_unusable() -> None:
+    log = make_log(seconds=120.0)
+    run = fit(with_wheels(log, 1.4 * log.wheels.left, 1.4 * log.wheels.right), CONFIG)
+    assert not run.usable
+    assert "71 % of the distance" in run.summary["unusable_because"]

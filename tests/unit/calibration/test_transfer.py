@@ -72,6 +72,17 @@ def test_one_group_is_refused() -> None:
         compare_groups({"one": []})
 
 
+def test_a_calibration_is_not_tested_on_another_robot() -> None:
+    groups = {"small": group(OLD, range(1)), "again": group(OLD, range(1, 2)), "large": group(OLD, range(2, 3))}
+    groups["large"] = [replace(groups["large"][0], width_m=2.0 * groups["small"][0].width_m)]
+    found = compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
+    assert np.isnan(found.cell("small", "large", 10.0).errors.p95_m)
+    assert np.isnan(found.cell("large", "again", 10.0).errors.p95_m)
+    assert all(found.cell(name, name, 10.0).errors.p95_m > 0.0 for name in groups)
+    assert found.cell("small", "again", 10.0).errors.p95_m > 0.0
+    assert [pair.second for pair in found.pairs] == ["again", "large"]
+
+
 def test_costs_are_differences_in_the_same_trials(transfer: Transfer) -> None:
     cell, own = transfer.cell("old", "new", 10.0), transfer.cell("new", "new", 10.0)
     assert own.cost is None

@@ -19,7 +19,7 @@ from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
 from icrtool.fleet.row import File, Row
 from icrtool.kernels.block_sums import BlockSums, block_sums
-from icrtool.kernels.error_statistics import cut_blocks, sort_trials, summarise
+from icrtool.kernels.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.output.baseline_file import open_baseline, read_report
 from icrtool.records.run import Run
 from support.edits import edited
@@ -37,7 +37,7 @@ def moving_sums(rng: np.random.Generator, starts: int) -> np.ndarray:
 
 def sums_of(errors: np.ndarray) -> tuple[BlockSums, dict[str, float]]:
     blocks = cut_blocks(np.isfinite(errors), np.arange(len(errors), dtype=float), float(HORIZON))
-    summary = summarise(errors[:, np.newaxis])
+    summary = error_summary(errors[:, np.newaxis])
     found = block_sums(errors, blocks, sort_trials(errors), float(summary.p50[0]), float(summary.p95[0]))
     assert found is not None
     return found, {"expected": float(summary.expected[0]), "p50": float(summary.p50[0]), "p95": float(summary.p95[0])}

@@ -18,7 +18,7 @@ from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
-from icrtool.kernels.error_statistics import summarise
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.motion.trials import cut_trials
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import format_dropout
@@ -53,7 +53,7 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
     drive: Run, own: Calibration, report: DropoutReport
 ) -> None:
     recording = recording_of(drive)
-    expected = summarise(predictor(own, recording)(cut_trials(recording, HORIZONS, all_starts=True)))
+    expected = error_summary(predictor(own, recording)(cut_trials(recording, HORIZONS, all_starts=True)))
     for name in ("calibration:own", "calibration:last.season"):
         result = report.result(name)
         assert result is not None
@@ -98,7 +98,7 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
     assert numbers == own.controller_numbers()
     assert exported["separation_multiplier"] == numbers.multiplier
     assert exported["separation_multiplier_std"] == numbers.multiplier_std
-    assert f"wheel_separation_multiplier {numbers.multiplier:.2f} ± {numbers.multiplier_std:.2f}" in " ".join(
+    assert f"wheel_separation_multiplier {numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}" in " ".join(
         format_dropout(report).split()
     )
     assert exported["left_radius_multiplier"] == numbers.left_radius

@@ -113,6 +113,17 @@ def test_the_distance_is_that_of_the_positions_where_wheels_spin_in_place() -> N
     assert slipped.summary["drive"]["distance_m"] == pytest.approx(distance, rel=0.05)
 
 
+def test_a_gap_in_the_wheel_data_is_no_burst_of_speed() -> None:
+    log = make_log(seconds=60.0)
+    kept = np.abs((log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9 - 30.0) > 1.5
+    columns = (column[kept] for column in (log.wheels.stamp_ns, log.wheels.left, log.wheels.right))
+    whole, gappy = (
+        fit(one, load_config()).summary["drive"] for one in (log, replace(log, wheels=WheelSamples(*columns)))
+    )
+    assert gappy["distance_m"] == pytest.approx(whole["distance_m"], rel=0.02)
+    assert gappy["speed_std_mps"] == pytest.approx(whole["speed_std_mps"], abs=0.02)
+
+
 def test_a_clean_log_gives_no_warning() -> None:
     assert fit(make_log(), load_config(sets=[WIDTH])).warnings == ()
 

@@ -13,7 +13,7 @@ from icrtool.estimation.filter_setup import FIELD_NOISE, PAPER_NOISE, ProcessNoi
 from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import find_noise, innovation_cost
 from icrtool.estimation.run_filter import noise_of, set_up_again
-from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.records.run import Run
 from icrtool.records.tables import RobotLog
@@ -55,7 +55,7 @@ def test_what_is_configured_is_not_searched_for() -> None:
 def cost_of(run: Run, noise: ProcessNoise) -> float:
     summary = {**run.summary, "filter": {**run.summary["filter"], "process_position_mps": noise.position_mps}}
     setup = set_up_again(replace(run, summary=summary))
-    return innovation_cost(run_filter(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters))
+    return innovation_cost(run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters))
 
 
 def test_the_cost_is_least_near_the_noise_a_drive_was_made_with() -> None:
@@ -111,9 +111,9 @@ def test_a_clean_drive_takes_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def counted(*given: object) -> object:
         passes.append(given)
-        return run_filter(*given)  # type: ignore[arg-type]
+        return run_ekf(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("icrtool.estimation.noise_adaptation.run_filter", counted)
+    monkeypatch.setattr("icrtool.estimation.noise_adaptation.run_ekf", counted)
     fit(make_log(), load_config(sets=[WIDTH]))
     assert len(passes) == 1
 

@@ -7,17 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.align import sensors_as_sent
+from icrtool.alignment.align import align, sensors_as_sent
+from icrtool.calibration.pooled import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
-from icrtool.kernels.ekf import run_filter
-from icrtool.kernels.filter_records import Measurements
+from icrtool.estimation.fit import fit
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import FilterInputs
 from icrtool.kernels.measurement_codes import GATED
 from icrtool.kernels.smoother import run_smoother
+from icrtool.motion.recording import cut_windows
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData
-from support.drives import EPOCH_NS, make_log
-from support.matrix_filter import run_filter_plain
+from icrtool.records.tables import RobotLog
+from support.drives import EPOCH_NS, ICRS, make_log
+from support.matrix_filter import run_ekf_plain
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 BEGIN_S, END_S = 30.0, 36.0
@@ -62,7 +66,7 @@ def with_event(sensors: SensorData) -> SensorData:
 def test_fixes_in_an_event_are_followed_and_the_icrs_stay() -> None:
     sensors = held_sensors()
     plain, told = (set_up_filter(one, CONFIG) for one in (sensors, with_event(sensors)))
-    unaware, aware = (run_filter(s.data, s.t0, s.x0, s.P0, s.parameters) for s in (plain, told))
+    unaware, aware = (run_ekf(s.data, s.t0, s.x0, s.P0, s.parameters) for s in (plain, told))
     assert np.count_nonzero(aware.gnss_code == GATED) == 0
     t = told.data.wheel_t[-len(aware.x) :]
     before, after = np.searchsorted(t, [BEGIN_S - EVENT_MARGIN_S, END_S + EVENT_MARGIN_S])
@@ -82,7 +86,7 @@ def test_an_outage_that_is_made_knows_no_event() -> None:
 def test_the_filter_through_slip_equals_the_matrix_form() -> None:
     setup = set_up_filter(with_event(held_sensors()), CONFIG)
     arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
-    out, plain = run_filter(*arguments), run_filter_plain(*arguments)
+    out, plain = run_ekf(*arguments), run_ekf_plain(*arguments)
     for name in ("x", "variance", "distance", "P"):
         assert getattr(out, name) == pytest.approx(getattr(plain, name), abs=1e-9)
 
@@ -90,8 +94,40 @@ def test_the_filter_through_slip_equals_the_matrix_form() -> None:
 def test_smoothing_ends_at_the_state_of_the_filter_through_slip() -> None:
     setup = set_up_filter(with_event(held_sensors()), CONFIG)
     arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
-    assert run_smoother(*arguments).x[-1] == pytest.approx(run_filter(*arguments).x[-1], abs=1e-12)
+    assert run_smoother(*arguments).x[-1] == pytest.approx(run_ekf(*arguments).x[-1], abs=1e-12)
 
 
 def test_measurements_without_flags_have_no_slip() -> None:
-    assert len(Measurements(*(np.empty(0) for _ in range(10))).slipping) == 0
+    assert len(FilterInputs(*(np.empty(0) for _ in range(10))).slipping) == 0
+
+
+def log_with_spin() -> RobotLog:
+    """A drive whose left side turns three times as fast as it rolls, from 40 to 46 s."""
+    log = make_log(seed=3, seconds=120.0)
+    t = (log.wheels.stamp_ns - EPOCH_NS) / 1e9
+    spins = (t >= 40.0) & (t < 46.0)
+    return replace(log, wheels=replace(log.wheels, left=np.where(spins, 3.0, 1.0) * log.wheels.left))
+
+
+def test_an_event_is_left_out_of_the_calibration() -> None:
+    run = fit(log_with_spin(), CONFIG)
+    (event,) = run.sensors.events
+    recording = recording_of(run)
+    windows = cut_windows(recording)
+    begin, end = (recording.begin_ns + 1e9 * windows.knot_t[one] for one in (windows.start, windows.end))
+    assert not ((begin < event.end_ns) & (end > event.begin_ns)).any()
+    assert ((begin < event.end_ns) & (end > event.begin_ns - 2e9)).any()
+    assert len(cut_windows(replace(recording, slipping=None)).start) > len(windows.start)
+
+
+def test_an_event_is_left_out_of_the_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the second alignment the spinning left side is taken for a scale and for an ICR further out."""
+    log = log_with_spin()
+    found = align(log, CONFIG)
+    assert [event.kind for event in found.sensors.events] == ["spin"]
+    monkeypatch.setattr("icrtool.alignment.align.find_slip_events", lambda sensors, width_m: ())
+    once = align(log, CONFIG)
+    true = ICRS[0] - ICRS[1]
+    errors = [abs((one.findings["icr_separation_m"].value or 0.0) - true) for one in (found, once)]
+    assert errors[0] < 0.01 * true
+    assert errors[1] > 3.0 * errors[0]

@@ -34,6 +34,8 @@ def test_recordings_are_known_by_content_and_sidecars_are_left_out(tmp_path: Pat
         bag.execute("create table topics (name text)")
         bag.execute("create table messages (data blob)")
     assert names(tmp_path) == ["mon/a", "mon/renamed", "rosbag", "tue/b"]
+    given_by_the_shell = [tmp_path / "mon" / name for name in ("a.json", "a.mcap", "a.truth.npz")]
+    assert names(*given_by_the_shell) == ["a"]
 
 
 def test_a_recorder_s_file_that_holds_nothing_is_not_passed_over(tmp_path: Path) -> None:

@@ -70,11 +70,12 @@ def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pyt
 
 
 def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
-    logs = [*rows("a"), *rows("b", "copy", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
+    logs = [*rows("a", multiplier=1.5), *rows("b", "copy", group="ice", multiplier=1.5)]
+    logs += [*rows("unusable"), Row("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
     groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
-    write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice")], place)
+    write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice", multiplier=1.5)], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
     with pytest.raises(RunError):
         runs_of_fleet(place / "runs")
@@ -85,7 +86,7 @@ def test_figures_show_what_there_is(tmp_path: Path) -> None:
     dates = ("2024-05-01T10:00:00Z", "2024-05-02T10:00:00Z")
     good = [replace(row, start_utc=date) for row, date in
             zip(rows("a", "$b_x", icr=icr, errors={"icr_p95_10m_m": 0.3}), dates, strict=True)]  # fmt: skip
-    failed = Row("f", "runs/f", "failed", reason="f.mcap: no wheels found; needs a JointState (tried twice)")
+    failed = Row("f", "runs/f", "failed", reason="no wheels found; needs a JointState (tried twice)")
     write_fleet([*good, failed], tmp_path, (), ("png",))
     assert {file.name for file in (tmp_path / "plots").iterdir()} == {"icrs.png", "errors.png", "failures.png"}
     write_fleet(good, tmp_path, (), ("svg",))

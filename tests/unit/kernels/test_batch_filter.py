@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icrtool.kernels import batch_filter as study
-from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.ekf_step import predict
-from icrtool.kernels.filter_records import FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterInputs, FilterParameters
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
 from support.matrix_filter import step_state
 
@@ -65,8 +65,8 @@ def make_batch(runs: int, icrs: tuple[float, float, float], stops: tuple[int, ..
     )
 
 
-def single(batch: study.Batch, run: int) -> Measurements:
-    return Measurements(
+def single(batch: study.Batch, run: int) -> FilterInputs:
+    return FilterInputs(
         batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
         batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t,
     )  # fmt: skip
@@ -82,7 +82,7 @@ def test_a_batch_gives_every_run_what_the_filter_gives_it_alone() -> None:
     batch = make_batch(3, (0.6, -0.6, 0.0), stops=(100, 333))
     out = study.run_batch(batch, PARAMETERS)
     for run in range(3):
-        alone = run_filter(single(batch, run), 0.0, batch.x0[run], full(batch.P0), PARAMETERS)
+        alone = run_ekf(single(batch, run), 0.0, batch.x0[run], full(batch.P0), PARAMETERS)
         np.testing.assert_array_equal(out.x[run], alone.x)
         np.testing.assert_array_equal(out.variance[run], alone.variance)
         np.testing.assert_array_equal(out.gnss_nis[run], alone.gnss_nis)
@@ -95,7 +95,7 @@ def test_the_covariance_at_a_stop_is_that_of_a_run_that_ends_there() -> None:
     out = study.run_batch(batch, PARAMETERS)
     data = single(batch, 1)
     data = data._replace(wheel_t=data.wheel_t[:251], v_left=data.v_left[:251], v_right=data.v_right[:251])
-    np.testing.assert_array_equal(out.P[1, 0], run_filter(data, 0.0, batch.x0[1], full(batch.P0), PARAMETERS).P)
+    np.testing.assert_array_equal(out.P[1, 0], run_ekf(data, 0.0, batch.x0[1], full(batch.P0), PARAMETERS).P)
 
 
 @pytest.mark.parametrize("guard", [UNGUARDED, PRINTED])

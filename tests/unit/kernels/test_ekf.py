@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.ekf import run_filter
+from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import FilterParameters, Measurements
+from icrtool.kernels.filter_records import FilterInputs, FilterParameters
 from icrtool.kernels.measurement_codes import GATED, RECOVERED, UNSEEN, USED
-from support.matrix_filter import run_filter_plain, state_jacobian, step_state
+from support.matrix_filter import run_ekf_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)
 TWIN_TOLERANCE = 1e-9
@@ -46,7 +46,7 @@ def parameters(**changes: object) -> FilterParameters:
 def drive(
     seed: int, seconds: float = 30.0, rate: float = 50.0, icrs: tuple[float, float, float] = (0.5, -0.75, -0.25),
     *, coincident: bool = False,
-) -> tuple[Measurements, np.ndarray]:  # fmt: skip
+) -> tuple[FilterInputs, np.ndarray]:  # fmt: skip
     """Simulate a drive of known ICRs with the paper's sensors; return measurements and true states at wheel stamps."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 1.0 / rate)
@@ -66,22 +66,22 @@ def drive(
     heading_t = t if coincident else np.sort(rng.uniform(0, t[-1], int(seconds * rate)))
     gnss_z = at(gnss_t)[:, :2] + rng.normal(0, 0.01, (len(gnss_t), 2))
     heading_z = np.array([wrap(h) for h in at(heading_t)[:, 2] + rng.normal(0, math.radians(1), len(heading_t))])
-    return Measurements(
+    return FilterInputs(
         t, v_left, v_right, gnss_t, gnss_z, np.full((len(gnss_t), 2), 1e-4), heading_t, heading_z,
         np.full(len(heading_t), math.radians(1) ** 2), np.empty(0),
     ), x  # fmt: skip
 
 
-def start(data: Measurements, icrs: tuple[float, float, float] = (0.6, -0.6, 0.0), icr_std: float = 0.5):  # type: ignore[no-untyped-def]
+def start(data: FilterInputs, icrs: tuple[float, float, float] = (0.6, -0.6, 0.0), icr_std: float = 0.5):  # type: ignore[no-untyped-def]
     t0 = max(data.wheel_t[0], data.gnss_t[0], data.heading_t[0])
     z = data.gnss_z[np.searchsorted(data.gnss_t, t0, side="right") - 1]
     psi = data.heading_z[np.searchsorted(data.heading_t, t0, side="right") - 1]
     return t0, np.array([*z, psi, *icrs]), np.diag([1e-4, 1e-4, math.radians(1) ** 2, *([icr_std**2] * 3)])
 
 
-def assert_twins(data: Measurements, settings: FilterParameters, **kwargs: object) -> None:
+def assert_twins(data: FilterInputs, settings: FilterParameters, **kwargs: object) -> None:
     t0, x0, P0 = start(data, **kwargs)  # type: ignore[arg-type]
-    fast, plain = run_filter(data, t0, x0, P0, settings), run_filter_plain(data, t0, x0, P0, settings)
+    fast, plain = run_ekf(data, t0, x0, P0, settings), run_ekf_plain(data, t0, x0, P0, settings)
     for name in fast._fields:
         np.testing.assert_allclose(
             getattr(fast, name), getattr(plain, name), rtol=TWIN_TOLERANCE, atol=TWIN_TOLERANCE, err_msg=name
@@ -125,7 +125,7 @@ def test_the_kernel_equals_its_python_function() -> None:
 
     data, _ = drive(5, seconds=3.0)
     t0, x0, P0 = start(data)
-    out = run_filter(data, t0, x0, P0, parameters())
+    out = run_ekf(data, t0, x0, P0, parameters())
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
     state, again = ekf.start_state(data, t0, x0, P0), ekf.empty_output(data, last - first)
     ekf.filter_rows.py_func(data, first, last, state, parameters(), again, None)  # type: ignore[attr-defined]
@@ -138,9 +138,9 @@ def test_the_size_of_compiled_blocks_changes_nothing(monkeypatch: pytest.MonkeyP
     data, _ = drive(6, seconds=5.0)
     t0, x0, P0 = start(data)
     settings = parameters(gnss_gate=9.0, heading_gate=6.0)
-    whole = run_filter(data, t0, x0, P0, settings)
+    whole = run_ekf(data, t0, x0, P0, settings)
     monkeypatch.setattr("icrtool.kernels.ekf.BLOCK_EVENTS", 50)
-    for name, one, other in zip(whole._fields, whole, run_filter(data, t0, x0, P0, settings), strict=True):
+    for name, one, other in zip(whole._fields, whole, run_ekf(data, t0, x0, P0, settings), strict=True):
         np.testing.assert_array_equal(one, other, err_msg=name)
 
 
@@ -156,7 +156,7 @@ def test_the_jacobian_equals_complex_step_differences(icrs: tuple[float, float, 
         np.testing.assert_allclose(F[:, column], derivative, atol=DERIVATIVE_TOLERANCE)
 
 
-def transcription(data: Measurements, x: np.ndarray, P: np.ndarray) -> np.ndarray:
+def transcription(data: FilterInputs, x: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Eqs. 14-25 as they stand in the paper, for a log with all three streams at the same stamps."""
     Q = np.diag(PAPER_Q)
     R = np.diag([0.01**2, 0.01**2, math.radians(1) ** 2])
@@ -182,7 +182,7 @@ def test_the_papers_filter_equals_a_transcription_of_its_equations() -> None:
     data, _ = drive(6, seconds=60.0, rate=100.0, coincident=True)
     t0, x0, _ = start(data, icrs=(1.0, -1.0, 1.0))
     P0 = np.diag([1e-4, 1e-4, math.radians(1) ** 2, 1.0, 1.0, 1.0])
-    out = run_filter(data, t0, x0, P0, parameters(rate_invariant=False, step_heading=0.0, wheel_gap_s=math.inf))
+    out = run_ekf(data, t0, x0, P0, parameters(rate_invariant=False, step_heading=0.0, wheel_gap_s=math.inf))
     np.testing.assert_allclose(out.x, transcription(data, x0, P0), atol=TRANSCRIPTION_TOLERANCE)
 
 
@@ -191,7 +191,7 @@ def test_one_state_is_recorded_per_wheel_sample_from_the_first_stamp_all_streams
     late = data.heading_t > 5.0
     data = data._replace(heading_t=data.heading_t[late], heading_z=data.heading_z[late], heading_r=data.heading_r[late])
     t0, x0, P0 = start(data)
-    out = run_filter(data, t0, x0, P0, parameters())
+    out = run_ekf(data, t0, x0, P0, parameters())
     assert len(out.x) == np.count_nonzero(data.wheel_t >= t0)
     assert (out.gnss_code[data.gnss_t <= t0] == UNSEEN).all()
     assert (out.gnss_code[(data.gnss_t > t0) & (data.gnss_t <= data.wheel_t[-1])] == USED).all()
@@ -203,7 +203,7 @@ def test_outliers_are_gated_and_a_jump_that_stays_is_believed_within_two_seconds
     data.gnss_z[data.gnss_t > 25.0] += [2.0, 1.0]
     settings = parameters(gnss_gate=18.4, heading_gate=15.1)
     t0, x0, P0 = start(data)
-    out = run_filter(data, t0, x0, P0, settings)
+    out = run_ekf(data, t0, x0, P0, settings)
     before = data.gnss_t < 25.0
     outlier = np.zeros(len(data.gnss_t), bool)
     outlier[100::50] = True
@@ -223,7 +223,7 @@ def test_a_gap_in_the_wheel_data_makes_the_pose_uncertain_and_drives_nowhere() -
         gnss_t=data.gnss_t[blind], gnss_z=data.gnss_z[blind], gnss_r=data.gnss_r[blind],
     )  # fmt: skip
     t0, x0, P0 = start(data)
-    out = run_filter(data, t0, x0, P0, parameters())
+    out = run_ekf(data, t0, x0, P0, parameters())
     stamps = data.wheel_t[-len(out.x) :]
     after = int(np.searchsorted(stamps, 13.0))
     assert out.distance[after] == out.distance[after - 1]
@@ -246,7 +246,7 @@ def test_nees_and_nis_stay_in_their_bands_where_the_model_holds() -> None:
         icrs = (0.6 + 0.1 * rng.normal(), -0.6 + 0.1 * rng.normal(), 0.1 * rng.normal())
         data, truth = drive(1000 + seed, seconds=20.0, icrs=icrs, coincident=True)
         t0, x0, P0 = start(data, icrs=(0.6, -0.6, 0.0), icr_std=0.1)
-        out = run_filter(data, t0, x0, P0, settings)
+        out = run_ekf(data, t0, x0, P0, settings)
         P = np.zeros((6, 6))
         P[np.triu_indices(6)] = out.P
         P = P + np.triu(P, 1).T

@@ -11,10 +11,10 @@ from icrtool.kernels.error_statistics import (
     bootstrap_interval,
     bootstrap_intervals,
     cut_blocks,
+    error_summary,
     histogram_sorted,
     round_bin_width,
     sort_trials,
-    summarise,
 )
 
 STATES_PER_M = 40  # of the drives made here
@@ -51,7 +51,7 @@ class TestSummary:
         rng = np.random.default_rng(0)
         errors = rng.exponential(size=(1003, 4))
         errors[rng.random(errors.shape) < 0.1] = np.nan
-        summary = summarise(errors)
+        summary = error_summary(errors)
         np.testing.assert_array_equal(summary.trials, np.isfinite(errors).sum(axis=0))
         for column, expected in [
             (summary.expected, np.nanmean(errors, axis=0)),
@@ -62,12 +62,12 @@ class TestSummary:
             np.testing.assert_allclose(column, expected, rtol=1e-14)  # another order of adding
 
     def test_of_no_trial_is_nan_and_of_one_is_that_trial(self):
-        summary = summarise(np.array([[np.nan, 2.0], [np.nan, np.nan]]))
+        summary = error_summary(np.array([[np.nan, 2.0], [np.nan, np.nan]]))
         assert summary.trials.tolist() == [0, 1]
         np.testing.assert_array_equal(np.stack(summary[1:]), [[np.nan, 2.0]] * 4)
 
     def test_of_no_state_is_nan(self):
-        assert np.isnan(summarise(np.empty((0, 3))).p95).all()
+        assert np.isnan(error_summary(np.empty((0, 3))).p95).all()
 
 
 class TestBootstrap:

@@ -136,3 +136,22 @@ def test_weights_that_differ_by_hundreds_of_decades_leave_variances() -> None:
     for pull in (np.full(3, 1.0), np.full(3, 1e-200)):
         covariance = sandwich_covariance(rng.standard_normal(30), jacobian, scale, np.arange(30) // 5, pull)[0]
         assert (np.diag(covariance) > 0.0).all()
+
+
+def test_groups_that_differ_are_covered_where_they_are_few() -> None:
+    """Three stretches with means of their own: their spread alone is too often small, the expected one holds it up."""
+    rng, size, spread = np.random.default_rng(1), 40, 0.3
+    groups = np.repeat(np.arange(3), size)
+    z: dict[float | None, list[float]] = {None: [], spread: []}
+    for _ in range(400):
+        values = rng.normal(0.0, spread, 3)[groups] + rng.normal(0.0, 0.1, 3 * size)
+        for expected, errors in z.items():
+            residuals = values.mean() - values
+            covariance, _, _ = sandwich_covariance(
+                residuals, np.ones((len(groups), 1)), np.full(len(groups), spread), groups, np.array([1e-6]),
+                group_std=None if expected is None else np.array([expected]),
+            )  # fmt: skip
+            errors.append(abs(values.mean()) / np.sqrt(covariance[0, 0]))
+    covered = {expected: np.mean(np.array(errors) < 2.0) for expected, errors in z.items()}
+    assert covered[None] < 0.88
+    assert 0.88 < covered[spread] < 0.99

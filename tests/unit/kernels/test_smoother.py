@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_nodes, empty_output, filter_rows, run_filter, start_state
+from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_nodes, empty_output, filter_rows, run_ekf, start_state
 from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import FilterParameters, Measurements, Nodes
+from icrtool.kernels.filter_records import FilterInputs, FilterParameters, Nodes
 from icrtool.kernels.smoother import (
     Smoothed,
     most_events,
@@ -39,13 +39,13 @@ def parameters(**other: object) -> FilterParameters:
     return FilterParameters(**(values | other))
 
 
-def measurements(n: int = 30, seed: int = 0) -> Measurements:
+def measurements(n: int = 30, seed: int = 0) -> FilterInputs:
     """A robot that turns, fixes between the wheel stamps, headings upon them, and a gap in the wheel data."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(n)
     t[n // 2 :] += 1.0
     fix_t = np.arange(0.25, t[-1], 0.2) + 0.013
-    return Measurements(
+    return FilterInputs(
         wheel_t=t, v_left=0.6 + 0.4 * np.sin(3 * t), v_right=0.5 + 0.3 * np.cos(2 * t),
         gnss_t=fix_t, gnss_z=np.cumsum(rng.normal(0.1, 0.05, (len(fix_t), 2)), axis=0),
         gnss_r=np.full((len(fix_t), 2), 4e-4),
@@ -58,7 +58,7 @@ X0 = np.array([0.0, 0.0, 0.1, 0.5, -0.5, 0.05])
 P0 = np.diag([1e-2, 1e-2, 1e-2, 0.09, 0.09, 0.04])
 
 
-def nodes_of(data: Measurements, settings: FilterParameters, rows: Callable[..., int] = filter_rows) -> Nodes:
+def nodes_of(data: FilterInputs, settings: FilterParameters, rows: Callable[..., int] = filter_rows) -> Nodes:
     end = len(data.wheel_t)
     state = start_state(data, 0.0, X0, P0)
     nodes = empty_nodes(most_events(data, state.place, 0, end))
@@ -126,7 +126,7 @@ def test_smoothed_states_are_the_batch_solution() -> None:
 def test_the_forward_pass_is_the_filters() -> None:
     data, settings = measurements(200), parameters(gnss_gate=9.0, heading_gate=9.0)
     nodes = nodes_of(data, settings)
-    assert np.array_equal(nodes.x[nodes.row >= 0], run_filter(data, 0.0, X0, P0, settings).x)
+    assert np.array_equal(nodes.x[nodes.row >= 0], run_ekf(data, 0.0, X0, P0, settings).x)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 64, 200])
@@ -139,7 +139,7 @@ def test_chunks_do_not_matter(rows: int) -> None:
 
 def test_smoothing_never_adds_variance_and_ends_where_the_filter_does() -> None:
     data, settings = measurements(300), parameters()
-    filtered, smoothed = run_filter(data, 0.0, X0, P0, settings), run_smoother(data, 0.0, X0, P0, settings)
+    filtered, smoothed = run_ekf(data, 0.0, X0, P0, settings), run_smoother(data, 0.0, X0, P0, settings)
     assert np.all(smoothed.variance <= filtered.variance * (1 + 1e-9) + 1e-15)
     assert np.array_equal(smoothed.x[-1], filtered.x[-1])
     assert smoothed.variance[0, 3] < 0.5 * filtered.variance[0, 3]

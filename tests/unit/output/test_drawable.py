@@ -5,12 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import warnings
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from icrtool.output.figures.fleet import FleetNumbers, IcrPoint, fleet_errors, fleet_failures, fleet_icrs
-from icrtool.output.figures.style import drawable, new_figure, save, style
+from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
 
@@ -46,3 +49,14 @@ def test_settings_of_matplotlib_that_are_no_text_are_refused_in_one_line(tmp_pat
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
     assert done.stderr.splitlines()[-1].startswith("icrtool.errors.OutputError: matplotlibrc: ")
+
+
+def test_a_png_picture_is_what_matplotlib_would_save() -> None:
+    figure = new_figure("title", "subtitle", width_in=3.0, height_in=2.0)
+    figure.subplots().plot([0.0, 1.0], [0.0, 1.0])
+    saved = BytesIO()
+    with style():
+        figure.savefig(saved, format="png")
+    with Image.open(BytesIO(picture_bytes(figure, "png"))) as ours, Image.open(saved) as theirs:
+        assert np.array_equal(ours.convert("RGBA"), theirs.convert("RGBA"))
+        assert ours.info["dpi"] == theirs.info["dpi"]

@@ -66,7 +66,7 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
     p95 = float(icr.summary.p95[1])
     assert row_of(text, "ICR, momentary  95 %")[:4] == [f"{p95:.3f}", "m", f"{100 * p95:.1f}", "%"]
     ratio = float(no_slip.summary.p95[1]) / p95
-    assert row_of(text, "no slip : ICR   95 %")[:2] == [f"{ratio:.1f}", "x"]
+    assert row_of(text, "no slip / ICR   95 %")[:2] == [f"{ratio:.1f}", "x"]
     assert "ICR, final" in text
     assert max(len(line) for line in text.splitlines()) <= 100
     assert not any(line != line.rstrip() for line in text.splitlines())

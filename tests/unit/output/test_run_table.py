@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from icrtool.calibration.record import ControllerNumbers
 from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import distance_text, duration_text, length_text, signed
+from icrtool.output.text_format import controller_text, distance_text, duration_text, error_text, signed
 from icrtool.records.run import Run
 
 
@@ -40,7 +41,7 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
         assert (f"{rise:.1f} s" if rise is not None else "hardly moved") in line
     multiplier = line_of(text, "multiplier")
     assert (
-        f"{separation_multiplier(run.table, 0.6):.2f} ± {icr['separation_multiplier_std']:.2f} = (y right" in multiplier
+        f"{separation_multiplier(run.table, 0.6):.3f} ± {icr['separation_multiplier_std']:.3f} = (y right" in multiplier
     )
     assert multiplier.endswith("with b = 0.6 m")
     assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
@@ -81,6 +82,12 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
     assert " 0 rejected" in text
 
 
+def test_constants_that_no_model_estimated_are_no_numbers() -> None:
+    numbers = ControllerNumbers(1.0, 0.0, 1.0, 0.0, 1.0, 0.0)
+    assert not any(one.isdigit() for one in controller_text(numbers._asdict()))
+    assert "1.482 ± 0.004" in controller_text(numbers._replace(multiplier=1.482, multiplier_std=0.004)._asdict())
+
+
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(speed_mps=0.01, duration_s=20.0))
     assert line_of(text, "y right").split() == ["y", "right", "not", "shown"]
@@ -110,12 +117,8 @@ def test_durations_read_well(seconds: float, text: str) -> None:
 
 
 def test_lengths_read_well() -> None:
-    assert [length_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456)] == [
-        "3.1 mm",
-        "1.2 cm",
-        "99.9 cm",
-        "3.46 m",
-    ]
+    texts = [error_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456, float("nan"))]
+    assert texts == ["0.0031 m", "0.012 m", "0.999 m", "3.46 m", "-"]
     assert [distance_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
     assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
 
@@ -123,7 +126,7 @@ def test_lengths_read_well() -> None:
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
     steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
     speed = run.summary["drive"]["speed_mean_mps"]
-    said = f"not shown by this drive; a lag of 0.1 s would move x by {length_text(0.1 * speed)}"
+    said = f"not shown by this drive; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
     assert said in format_run(steady)
     known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02, "delay_std_s": 0.01}})
     assert said not in format_run(known)

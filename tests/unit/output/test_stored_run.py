@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from icrtool.estimation.fit import fit
 from icrtool.output import run_directory
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.figure_catalogue import FIGURES
-from icrtool.output.figures.style import SAVE, style
+from icrtool.output.figures.style import picture_bytes
 from icrtool.output.json_file import json_bytes
 from icrtool.output.run_directory import write_run
 from icrtool.output.stored_run import log_of, newest_run, open_run
@@ -101,13 +100,8 @@ def test_a_run_read_back_prints_the_same(whole: Run, stored: Run) -> None:
 
 @pytest.mark.parametrize("name", [name for name, entry in FIGURES.items() if entry.of == "run"])
 def test_a_run_read_back_draws_the_same(name: str, whole: Run, stored: Run) -> None:
-    pictures = []
-    for one in (whole, stored):
-        memory = BytesIO()
-        with style():
-            FIGURES[name].draw(one).savefig(memory, format="png", **SAVE["png"])
-        pictures.append(memory.getvalue())
-    assert pictures[0] == pictures[1]
+    first, second = (picture_bytes(FIGURES[name].draw(one), "png") for one in (whole, stored))
+    assert first == second
 
 
 @pytest.mark.parametrize("reference", ["filter", "smoothed"])

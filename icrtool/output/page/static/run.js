@@ -30,7 +30,7 @@ const icrtoolPage = (() => {
     const parts = [`${clock(t)} (${t.toFixed(1)} s), ${data.steps.distance[series.step[row]].toFixed(1)} m driven`,
       `wheels left ${series.v_left[row].toFixed(2)}, right ${series.v_right[row].toFixed(2)} m/s`,
       `ICR y right ${signed(series.y_right[row])} ± ${series.std_y_right[row].toFixed(3)}, y left ${signed(series.y_left[row])} ± ${series.std_y_left[row].toFixed(3)}, x ${signed(series.x[row])} ± ${series.std_x[row].toFixed(3)} m`];
-    if (off !== null) parts.push(`filter to fix ${off < 1 ? `${(100 * off).toFixed(1)} cm` : `${off.toFixed(2)} m`}`);
+    if (off !== null) parts.push(`filter to fix ${off.toFixed(off < 1 ? 3 : 2)} m`);
     readout.textContent = parts.join(" · ").replace(/(\d) (?=m|cm|s\)|±)|± /g, (found) => found.replace(" ", "\u00a0"));
     charts.mark(t);
     map.mark(row);
