@@ -109,6 +109,8 @@ def write_exports(
     rows: Sequence[Row], missing: Sequence[str], page: Path | None, *, junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
+    from icrtool.output.atomic_file import write_file
+
     if junit is not None:
         from icrtool.fleet.acceptance import suites_of
         from icrtool.output.exports.acceptance import write_junit
@@ -116,14 +118,14 @@ def write_exports(
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
         from icrtool.fleet.acceptance import format_fleet_markdown
-        from icrtool.output.atomic_file import write_file
 
         write_file(markdown, format_fleet_markdown(rows, missing))
     if page is not None:
         from icrtool.fleet.fleet_files import fleet_document
-        from icrtool.output.page.fleet_page import write_fleet_page
+        from icrtool.output.page.fleet_page import fleet_page
+        from icrtool.output.run_directory import PAGE_FILE
 
-        write_fleet_page(fleet_document(rows), page)
+        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows), page))
 
 
 def print_results(

@@ -20,7 +20,7 @@ from icrtool.kernels.trials import Summary
 from icrtool.output.atomic_directory import atomic_directory
 from icrtool.output.csv_file import csv_bytes
 from icrtool.output.json_file import json_bytes, schema_of
-from icrtool.output.tables.dropout import why_no_trial
+from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.trials_file import trials_file
 from icrtool.records.dropout import ExampleTrial, ModelResult
@@ -133,29 +133,21 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         if report.comparison is not None
         else {"left_out": report.no_comparison},
         "gates": [
-            {
-                **asdict(verdict.gate),
-                "value_m": verdict.value_m,
-                "value_bound_m": verdict.bound_m,
-                "baseline_m": verdict.baseline_m,
-                "margin_m": verdict.margin_m,
-                "margin_low_m": verdict.margin_low_m,
-                "margin_high_m": verdict.margin_high_m,
-                "not_checked": verdict.not_checked or None,
-                "passed": verdict.passed,
-                "verdict": verdict.line(),
-            }
-            for verdict in report.verdicts
+            {**asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, "value_bound_m": one.bound_m,
+             "not_checked": one.not_checked or None, "verdict": one.line()}
+            for one in report.verdicts
         ],
         "passed": report.passed,
         "baseline": _baseline_document(report),
         "outages": [{name: getattr(one, name) for name in OUTAGE_KEYS} for one in report.outages],
         "worst": [_trial_document(one) for one in report.worst],
         "examples": [_trial_document(one) for one in report.examples],
-    }
+    }  # fmt: skip
 
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
+
+VERDICT_KEYS = ("value_m", "baseline_m", "margin_m", "margin_low_m", "margin_high_m", "passed")
 
 OUTAGE_KEYS = ("kind", "begin_s", "end_s", "distance_m", "end_error_m", "max_error_m")
 
@@ -205,18 +197,12 @@ def _baseline_document(report: DropoutReport) -> dict[str, Any] | None:
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
     """Return how many starts were a trial at each horizon, and why the others were none."""
-    counts = report.counts
+    reasons = no_trial(report)
     return [
         {
             "horizon_m": float(horizon),
-            "trials": int(counts.trials[h]),
-            "no_trial": {
-                "too_little_way_left": int(counts.short[h]),
-                "across_wheel_gap": int(counts.gap[h]),
-                "ends_in_gnss_outage": int(counts.outage[h]),
-                "from_standstill": int(counts.standing[h]),
-                "across_slip_event": 0 if report.event_cost is None else int(report.event_cost.trials[h]),
-            },
+            "trials": int(report.counts.trials[h]),
+            "no_trial": {one.key: int(one.starts[h]) for one in reasons},
             "why_none": why_no_trial(report, h),
         }
         for h, horizon in enumerate(report.horizons_m)

@@ -7,7 +7,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from icrtool.output.atomic_file import write_file
 from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
@@ -64,17 +63,6 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
         horizon_m=HORIZON_M,
         pictures=list(pictures_in(folder / PLOTS).values()),
     )  # fmt: skip
-
-
-def write_fleet_page(document: Mapping[str, Any], folder: Path) -> None:
-    """Write the page of a fleet into its folder.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written.
-    """
-    write_file(folder / PAGE_FILE, fleet_page(document, folder))
 
 
 def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:

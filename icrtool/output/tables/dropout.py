@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.kernels.arrays import Ints
 from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
@@ -177,16 +179,34 @@ def _turning_line(split: TurningSplit) -> str:
 
 def _count_rows(report: DropoutReport) -> Rows:
     """Return the number of trials, and why other starts are none."""
-    shown, counts, cost = shown_horizons(report), report.counts, report.event_cost
-    reasons = (
-        ("not counted: log ends", counts.short),
-        ("  across a slip event", cost.trials if cost is not None else np.zeros_like(counts.short)),
-        ("  across a wheel gap", counts.gap),
-        ("  ends in GNSS outage", counts.outage),
-        ("  from standstill", counts.standing),
-    )
-    named = [("trials", counts.trials), *((label, column) for label, column in reasons if column[shown].any())]
+    shown = shown_horizons(report)
+    named = [("trials", report.counts.trials)]
+    named += [(one.label, one.starts) for one in no_trial(report) if one.starts[shown].any()]
     return [[label, "", *(f"{int(column[h]):,}" for h in shown)] for label, column in named]
+
+
+class NoTrial(NamedTuple):
+    """A reason why starts gave no trial: its key in report.json, words in the table, and number of `starts` (h,)."""
+
+    key: str
+    label: str
+    why: str
+    starts: Ints
+
+
+def no_trial(report: DropoutReport) -> tuple[NoTrial, ...]:
+    """Return the reasons why starts gave no trial."""
+    counts, cost = report.counts, report.event_cost
+    driven = distance_text(report.run_summary["drive"]["distance_m"])
+    slip = cost.trials if cost is not None else np.zeros_like(counts.short)
+    return (
+        NoTrial("too_little_way_left", "not counted: log ends", f"less than that is left of the {driven} driven",
+                counts.short),
+        NoTrial("across_wheel_gap", "  across a wheel gap", "the path crosses a gap in the wheel data", counts.gap),
+        NoTrial("ends_in_gnss_outage", "  ends in GNSS outage", "it ends in a GNSS outage", counts.outage),
+        NoTrial("from_standstill", "  from standstill", "the robot stands", counts.standing),
+        NoTrial("across_slip_event", "  across a slip event", "the path crosses a slip event", slip),
+    )  # fmt: skip
 
 
 def _count_lines(report: DropoutReport) -> list[str]:
@@ -228,17 +248,10 @@ def why_no_trial(report: DropoutReport, h: int) -> str | None:
     counts = report.counts
     if not len(counts.trials) or counts.trials[h]:
         return None
-    driven = distance_text(report.run_summary["drive"]["distance_m"])
-    reasons = (
-        (counts.short[h], f"less than that is left of the {driven} driven"),
-        (counts.gap[h], "the path crosses a gap in the wheel data"),
-        (0 if report.event_cost is None else report.event_cost.trials[h], "the path crosses a slip event"),
-        (counts.outage[h], "it ends in a GNSS outage"),
-        (counts.standing[h], "the robot stands"),
-    )
+    reasons = no_trial(report)
     if counts.short[h] == report.states:
-        return reasons[0][1]
-    return ", ".join(f"{why} ({int(count):,} starts)" for count, why in reasons if count)
+        return reasons[0].why
+    return ", ".join(f"{one.why} ({int(one.starts[h]):,} starts)" for one in reasons if one.starts[h])
 
 
 def _empty_lines(report: DropoutReport) -> list[str]:

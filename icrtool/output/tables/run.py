@@ -152,7 +152,7 @@ def _position_rows(run: Run) -> list[Row]:
     if (difference := gnss["mean_difference_m"]) is not None and (largest := gnss["max_difference_m"]) is not None:
         mean, most = error_text(difference), error_text(largest)
         raised = run.process_position_mps != configured_noise(run.config).position_mps
-        why = "; follows them closely, for its position noise was raised" if raised else ""
+        why = "; follows them closely, because the position noise was raised" if raised else ""
         lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
     reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
     why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
@@ -169,7 +169,7 @@ def _position_rows(run: Run) -> list[Row]:
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
         lost = len(run.summary["rtk_losses_ns"])
-        cause = f" ({lost} of RTK, fixes went on)" if lost else ""
+        cause = f" ({lost} by loss of RTK)" if lost else ""
         lines.append(("", f"{counted(outages, 'outage')}{cause}, {away} in all"))
     return lines
 
