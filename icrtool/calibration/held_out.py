@@ -31,7 +31,7 @@ from icrtool.motion.models import (
     typical_drive,
     wheel_motion,
 )
-from icrtool.motion.recording import Recording, Steps, cut_windows
+from icrtool.motion.recording import Recording, Steps, cut_windows, extent_of
 from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -268,13 +268,16 @@ class _Tester:
     def __init__(self, recordings: Sequence[Recording], horizons_m: Sequence[float] = ()) -> None:
         self._folds = plan_folds(recordings)
         self._recordings, self._horizons_m = recordings, tuple(horizons_m)
-        windows = [cut_windows(one, pooled=recordings) for one in recordings]
+        pooled = extent_of(*recordings)
+        windows = [cut_windows(one, pooled=pooled) for one in recordings]
         self.pool = Pool(windows, [one.width_m for one in recordings])
-        self._clear = [self.pool.clear_of(fold) for fold in self._folds]
         choosing = self.pool.length_m == CHOICE_HORIZON_M
-        self._tested = [np.flatnonzero(self.pool.within(fold) & choosing) for fold in self._folds]
-        for fold, clear in zip(self._folds, self._clear, strict=True):
-            if np.count_nonzero(clear) < FEWEST_RESIDUALS:
+        # rows of the fold's recording
+        self._tested = [
+            np.flatnonzero((self.pool.within(fold) & choosing)[self.pool.rows(fold.recording)]) for fold in self._folds
+        ]
+        for fold in self._folds:
+            if np.count_nonzero(self.pool.clear_of(fold)) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
         self._trials = [cut_trials(one, horizons_m) for one in recordings] if len(horizons_m) else []
@@ -298,14 +301,14 @@ class _Tester:
 
     def _inner_errors(self, fit: PooledFit) -> Floats:
         """Return the expected error [m] (folds, folds) of the windows of fold g, fitted without f and g."""
-        count, clear, tested = len(self._folds), self._clear, self._tested
+        folds, count = self._folds, len(self._folds)
         inner = np.full((count, count), np.nan)
-        for f in range(count):
-            for g in range(f, count):
-                if f == g or count >= FEWEST_TO_CHOOSE:
-                    x = fit.nearly_without(~(clear[f] & clear[g]))
-                    inner[f, g] = _window_error(fit, tested[g], x)
-                    inner[g, f] = _window_error(fit, tested[f], x)
+        for g, rows in enumerate(self._tested):
+            # with few folds, only what is fitted without g
+            others = list(range(count)) if count >= FEWEST_TO_CHOOSE else [g]
+            residuals = fit.residuals_without(folds[g], [folds[f] for f in others])[:, rows]
+            moving = self.pool.windows[folds[g].recording].moving
+            inner[others, g] = _window_errors(residuals, moving[rows[: len(rows) // 2]])
         return inner
 
     def table(self, tested: Sequence[_Tested], choice: Choice) -> HeldOut:
@@ -343,14 +346,18 @@ class _Tester:
             yield Trials(trials.starts, np.where(np.isfinite(some), trials.ends, -1))
 
 
-def _window_error(fit: PooledFit, rows: Ints, x: Floats) -> float:
-    """Return the expected error [m] of windows of `CHOICE_HORIZON_M`, by rows, for all parameters x near a fit."""
-    at = fit.solution
-    residuals = at.residuals[rows] + at.jacobian[rows] @ (x - at.x)
-    half = len(residuals) // 2
-    if not half:
-        return float("nan")
-    return float(np.hypot(residuals[:half], residuals[half:]).mean() * np.sqrt(CHOICE_HORIZON_M))
+def _window_errors(residuals: Floats, moving: Ints) -> Floats:
+    """Return the expected error (f,) [m] of windows of `CHOICE_HORIZON_M` by their residuals (f, 2 w); NaN for none.
+
+    Parameters
+    ----------
+    moving : (w,) states in which the robot moved from a window's start to the next: trials start from these
+    """
+    half = len(moving)
+    if not moving.any():
+        return np.full(len(residuals), np.nan)
+    errors = np.hypot(residuals[:, :half], residuals[:, half:]) @ moving / moving.sum()
+    return np.asarray(errors * np.sqrt(CHOICE_HORIZON_M), np.float64)
 
 
 def _over(function: Callable[[Floats], Any], folds: Sequence[Summary], column: str, h: int) -> float:

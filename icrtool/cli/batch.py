@@ -16,6 +16,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.stages import signal_word
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -201,7 +202,7 @@ class View:
         self._clear()
         if row.status == "failed":
             if self._reports:
-                click.echo(options.error_line(escaped(row.reason), row.log), err=True)
+                click.echo(f"{signal_word('Error:', 'red')} {escaped(row.log)}: {escaped(row.reason)}", err=True)
                 if self._verbose and row.details:
                     click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
         elif self._prints:

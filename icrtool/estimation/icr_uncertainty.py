@@ -156,7 +156,7 @@ def final_covariance(
         windows.jacobian,
         scale,
         np.tile(windows.stretch, 3),
-        prior_std(width_m) ** -2.0,
+        np.diag(prior_std(width_m) ** -2.0),
         group_std=width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0]),
     )
     found: Floats = covariance[:3, :3]

@@ -118,7 +118,7 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
 
     Parameters
     ----------
-    covariance : (6, 6) of the last state
+    covariance : (3, 3) of the final ICRs [m^2]
 
     Notes
     -----
@@ -129,7 +129,7 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
         return []
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
-    sigma = math.sqrt(max(float(covariance[3, 3] + covariance[4, 4] + 2 * covariance[3, 4]), 0.0)) / 2
+    sigma = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     if abs(middle) <= max(LOPSIDED_M, LOPSIDED_SIGMAS * sigma):
         return []
     side, other = ("right", "left") if middle > 0 else ("left", "right")

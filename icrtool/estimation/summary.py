@@ -78,7 +78,7 @@ def summarise(
             "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": _warnings(measurements, filtered, config, multiplier, excitation, changes_s),
+            "warnings": _warnings(measurements, filtered, config, multiplier, excitation, changes_s, covariance),
             "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
@@ -110,15 +110,15 @@ def summarise(
 
 def _warnings(
     measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation,
-    changes_s: Sequence[float],
+    changes_s: Sequence[float], covariance: Floats,
 ) -> list[str]:  # fmt: skip
-    """Return the warnings of alignment and filter, in the order they were found."""
+    """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
     name, table = filtered.sensors.name, filtered.table
     end_s = float(table.t_s[-1])
     return [
         *measurements.warnings,
         *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
-        *([] if measurements.antenna_is_known else antenna_warning(name, table, filtered.covariance)),
+        *([] if measurements.antenna_is_known else antenna_warning(name, table, covariance)),
         *(
             f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
             for t in filtered.changes_s

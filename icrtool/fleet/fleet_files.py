@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
-from icrtool.fleet.roll_up import MOST_POOLED, PooledCalibration
+from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
 from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
 from icrtool.output.atomic_file import atomic_file, write_file
 from icrtool.output.csv_file import csv_bytes
@@ -85,7 +85,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
         head = f"{name}: {counted(len(one.logs), 'log')}"
         if one.left_out:
-            head += f", {len(one.left_out)} not used (not usable, copies, or more than {MOST_POOLED})"
+            head += f", {len(one.left_out)} not used (not usable, copies, or beyond {MOST_POOLED_S / 3600:.0f} h)"
         if one.reason:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -23,9 +24,8 @@ from icrtool.records.run import Run
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
 
-MOST_POOLED = 12
-"""Logs of a robot and group that are calibrated together: evenly spaced over all by time. Time and memory grow faster
-than their number, and what is not known of the parameters shrinks with its root only."""
+MOST_POOLED_S = 86_400.0
+"""Of the logs of a robot and group, so much time is calibrated together, evenly spaced over all: about 1 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class PooledCalibration:
     Attributes
     ----------
     logs : that it is fitted to
-    left_out : logs that are not usable, copies, or more than `MOST_POOLED`
+    left_out : logs that are not usable, copies, or beyond `MOST_POOLED_S`
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
     recommended, multiplier, multiplier_std : of the calibration
     table : leave-one-log-out table as text
@@ -118,9 +118,9 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     # A copy of a log would be tested on itself.
     distinct = {tuple(sorted(file.sha256 for file in row.inputs)): row for row in reversed(members)}
     ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
-    spaced = {
-        ordered[i].log for i in np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_POOLED)).round().astype(int)
-    }
+    total_s = sum(row.duration_s or 0.0 for row in ordered)
+    count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
+    spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
     used: list[str] = []
 
     def usable() -> Iterator[Run]:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.elimination import Parts, eliminate, normal_equations
 
 MAD_TO_STD = 1.4826
 """Standard deviation over median absolute deviation, for normal values."""
@@ -71,12 +72,13 @@ class RobustFit(NamedTuple):
 
     Attributes
     ----------
-    x : (k,) parameters
-    covariance : (k, k), from the spread between groups, nowhere less than `information` allows
+    x : (k + p c,) parameters, those of the parts behind the k shared ones
+    covariance : (k, k) of the shared ones, from the spread between groups, nowhere less than `information` allows
     information : (k, k) Gauss-Newton matrix: data, one residual in `overlap`, and prior
-    residuals : (m,), jacobian : (m, k), at `x`, to first order of the last step
+    own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
+        follow the shared ones
+    residuals : (m,), jacobian : (m, k), at `x`, to first order of the last step; own parameters follow the shared ones
     scale : (m,) robust standard deviation of each residual, that of its kind
-    weights : (m,) of the loss, 0 to 1
     groups : independent groups of residuals
     converged : whether the last step was short enough
     """
@@ -84,22 +86,23 @@ class RobustFit(NamedTuple):
     x: Floats
     covariance: Floats
     information: Floats
+    own_prior: Floats
+    own_pull: Floats
     residuals: Floats
     jacobian: Floats
     scale: Floats
-    weights: Floats
     groups: int
     converged: bool
 
     @property
     def std(self) -> Floats:
-        """One standard deviation of each parameter (k,)."""
+        """One standard deviation of each shared parameter (k,)."""
         deviations: Floats = np.sqrt(np.diag(self.covariance))
         return deviations
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
-"""Maps parameters (k,) to residuals (m,) and their Jacobian (m, k)."""
+"""Maps parameters (k + p c,) to residuals (m,) and their Jacobian (m, k + c)."""
 
 
 def robust_least_squares(
@@ -110,6 +113,7 @@ def robust_least_squares(
     *,
     kind: Ints | None = None,
     group: Ints | None = None,
+    parts: Parts | None = None,
     overlap: float = 1.0,
     most_steps: int = 15,
     settled: float = SETTLED,
@@ -119,10 +123,11 @@ def robust_least_squares(
     Parameters
     ----------
     evaluate : residuals and Jacobian at some parameters
-    start : (k,) where to begin
-    prior_mean, prior_std : (k,); an infinite deviation is no prior
+    start : (k + p c,) where to begin
+    prior_mean, prior_std : (k + p c,); an infinite deviation is no prior
     kind : (m,) residuals of one kind share one robust scale, which is their own; default one kind
     group : (m,) residuals of one group depend on one another, others do not; default each its own
+    parts : of the data, which have parameters of their own; default one part without
     overlap : so many residuals count as one independent one
     most_steps : at most this many steps
     settled : length of the last step in standard deviations, all parameters together
@@ -134,16 +139,15 @@ def robust_least_squares(
     """
     x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
     residuals, jacobian = evaluate(x)
+    parts = Parts(np.array([0, len(residuals)])) if parts is None else parts
     converged = False
     for _ in range(most_steps):
         scale = scale_by_kind(residuals, kind)
-        information, gradient = normal_equations(residuals, jacobian, scale, overlap)
-        information = information + np.diag(pull)
-        gradient = gradient + pull * (x - prior_mean)
-        step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
-        if -float(gradient @ step) < settled**2:
+        weights = robust_weights(residuals, scale, overlap)
+        step, decrease, _ = eliminate(residuals, jacobian, weights, parts, pull, x - prior_mean)
+        if decrease < settled**2:
             # too short to evaluate for: residuals follow it to first order
-            x, residuals, converged = x + step, residuals + jacobian @ step, True
+            x, residuals, converged = x + step, residuals + parts.change(jacobian, step), True
             break
         before = _cost(residuals / scale, overlap, pull, x - prior_mean)
         tried = evaluate(x + step)
@@ -161,10 +165,16 @@ def robust_least_squares(
             converged = True
             break
     scale = scale_by_kind(residuals, kind)
+    found = eliminate(residuals, jacobian, robust_weights(residuals, scale, overlap), parts, pull, x - prior_mean)
+    jacobian = found.reduced(jacobian, parts)
+    k = jacobian.shape[1]
+    own, away = (of_all[k:].reshape(found.gain.shape[:2]) for of_all in (pull, x - prior_mean))
+    own_prior = np.einsum("pck,pc,pcl->pkl", found.gain, own, found.gain)
+    own_pull = -np.einsum("pck,pc->pk", found.gain, own * away)
     groups = np.arange(len(residuals)) if group is None else group
-    covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, pull, overlap)
-    weights = soft_l1_weights(residuals / scale)
-    return RobustFit(x, covariance, information, residuals, jacobian, scale, weights, count, converged)
+    prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
+    covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, prior, overlap)
+    return RobustFit(x, covariance, information, own_prior, own_pull, residuals, jacobian, scale, count, converged)
 
 
 def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
@@ -179,15 +189,10 @@ def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
     return scale
 
 
-def normal_equations(residuals: Floats, jacobian: Floats, scale: Floats, overlap: float) -> tuple[Floats, Floats]:
-    """Return the data's part of the information matrix (k, k) and of the gradient (k,), soft-L1 weighted."""
-    from icrtool.kernels.sparse_normal import weighted_products
-
-    weights = soft_l1_weights(residuals / scale) / overlap / scale**2
-    k = jacobian.shape[1]
-    matrix, vector = np.empty((k, k)), np.empty(k)
-    weighted_products(np.ascontiguousarray(jacobian), weights, residuals, matrix, vector)
-    return matrix, vector
+def robust_weights(residuals: Floats, scale: Floats, overlap: float) -> Floats:
+    """Return the weights (m,) of squared residuals: of the loss, one in `overlap`, over the variance."""
+    weights: Floats = soft_l1_weights(residuals / scale) / overlap / scale**2
+    return weights
 
 
 def sandwich_covariance(
@@ -195,7 +200,7 @@ def sandwich_covariance(
     jacobian: Floats,
     scale: Floats,
     group: Ints,
-    pull: Floats,
+    prior: Floats,
     overlap: float = 1.0,
     group_std: Floats | None = None,
 ) -> tuple[Floats, Floats, int]:
@@ -203,7 +208,7 @@ def sandwich_covariance(
 
     Parameters
     ----------
-    pull : (k,) information of the prior
+    prior : (k, k) information of the prior
     group_std : (k,) how far the parameters of a group are expected to lie from the common ones, an expectation that
         counts as one group; None: the groups alone show it
 
@@ -214,20 +219,17 @@ def sandwich_covariance(
     than that of H^-1. A group with parameters of its own, T their covariance about the common ones, and information A
     has a gradient of covariance A T A: so is the spread expected with `group_std`, and the two are averaged.
     """
-    z, scaled = residuals / scale, jacobian / scale[:, None]
-    influence = soft_l1_weights(z) / overlap
-    information = normal_equations(residuals, jacobian, scale, overlap)[0] + np.diag(pull)
-    order = np.argsort(group, kind="stable")
-    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
-    gradients = np.add.reduceat((scaled * (influence * z)[:, None])[order], first)
-    count = len(first)
+    weights = robust_weights(residuals, scale, overlap)
+    information = normal_equations(residuals, jacobian, weights)[0] + prior
+    gradients = _gradients(residuals, jacobian, weights, group)
+    count = len(gradients)
     meat = gradients.T @ gradients * (count / max(count - 1, 1))
     if group_std is not None:
-        rows = np.split(order, first[1:])
-        of_groups = [(scaled[one] * influence[one, None]).T @ scaled[one] * group_std for one in rows]
+        rows = [np.flatnonzero(group == one) for one in np.unique(group)]
+        of_groups = [normal_equations(residuals[one], jacobian[one], weights[one])[0] * group_std for one in rows]
         meat = (count * meat + sum(one @ one.T for one in of_groups)) / (count + 1)
-    meat = meat + np.diag(pull)
-    inverse = np.linalg.solve(information, np.eye(len(pull)))
+    meat = meat + prior
+    inverse = np.linalg.solve(information, np.eye(len(prior)))
     sandwich = inverse @ meat @ inverse
     if not (np.diag(sandwich) > 0.0).all():
         # rounding: weights that differ by hundreds of decades
@@ -237,6 +239,14 @@ def sandwich_covariance(
         grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
         covariance: Floats = sandwich * np.outer(grown, grown)
     return (covariance + covariance.T) / 2.0, information, count
+
+
+def _gradients(residuals: Floats, jacobian: Floats, weights: Floats, group: Ints) -> Floats:
+    """Return the gradient (g, k) of each group, in their order."""
+    order = np.argsort(group, kind="stable")
+    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
+    gradients: Floats = np.add.reduceat((jacobian * (weights * residuals)[:, None])[order], first)
+    return gradients
 
 
 def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: float = 1.0) -> Floats:
@@ -250,10 +260,8 @@ def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: fl
     -----
     The influence of the groups on each parameter is a series in order of distance; `long_run_factor` applies to it.
     """
-    order = np.argsort(group, kind="stable")
-    z, jacobian = fit.residuals / fit.scale, fit.jacobian / fit.scale[:, None]
-    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
-    gradients = np.add.reduceat((jacobian * (soft_l1_weights(z) / overlap * z)[:, None])[order], first)
+    weights = robust_weights(fit.residuals, fit.scale, overlap)
+    gradients = _gradients(fit.residuals, fit.jacobian, weights, group)
     inverse = np.linalg.solve(fit.information, np.eye(len(pull)))
     series = gradients @ inverse
     of_prior = np.einsum("ij,j,ij->i", inverse, pull, inverse)

@@ -1,22 +1,25 @@
 """Robust fit of motion models to windows of driven distance, pooled over recordings.
 
 Heading and place are sums over the wheel samples, and so are their derivatives: all windows of a recording cost one
-pass over its samples (`icrtool.kernels.window_residuals`). What is left out of a fit is taken from its normal
+pass over its samples (`icrtool.kernels.window_residuals`). What is left out of a fit is subtracted from its normal
 equations, so one fit serves all folds.
 
 Each recording has constants of its own, which are not part of a calibration (`icrtool.motion.recording.LogConstants`).
+Of several recordings they are eliminated from the normal equations of each (`icrtool.kernels.elimination`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.robust import RobustFit, normal_equations, robust_least_squares, scale_by_kind
+from icrtool.kernels.elimination import Parts, normal_equations
+from icrtool.kernels.robust import RobustFit, robust_least_squares, robust_weights, scale_by_kind, soft_l1_weights
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
@@ -31,6 +34,9 @@ OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
 
 REWEIGHTS = 3
+
+FEWEST_TO_SUBTRACT = 4
+"""Of fewer recordings each is too large a part of all: the others are fitted anew."""
 
 FEWEST_RESIDUALS = 20
 """Fewer that are left beside a fold give no parameters."""
@@ -61,7 +67,7 @@ Prediction = tuple[FittedModel, LogConstants]
 """A model that was not fitted to a fold, and the constants of the fold's recording."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class PooledFit(FittedModel):
     """A model fitted to windows of several recordings.
 
@@ -69,7 +75,8 @@ class PooledFit(FittedModel):
     ----------
     wheels : as in `FittedModel`, fitted to the same windows
     pool : the windows
-    solution : of all parameters, those of the model first, then those of each recording
+    solution : of all parameters, those of the model first, then the constants of each recording. Those of several
+        recordings follow the model's; those of a single one are parameters like them.
     """
 
     wheels: PooledFit | None = None
@@ -108,46 +115,100 @@ class PooledFit(FittedModel):
         clear = pool.clear_of(fold)
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:
             return None
-        x, covariance = self.without_residuals(~clear)
-        of_wheels = None if self.wheels is None else self.wheels.without(fold)
-        fitted = FittedModel(self.model, x[:k], covariance[:k, :k], of_wheels and of_wheels[0])
-        if fold.whole:
+        if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
+            others = Pool([w for w in pool.windows if w is not pool.windows[i]], pool.widths_m[1:])
+            fitted = others.fit(self.model, self.wheels and others.fit(self.wheels.model)).fitted
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
-        return fitted, self._constants(x, i)
+        of_wheels = None if self.wheels is None else self.wheels.without(fold)
+        wheels = None if of_wheels is None else of_wheels[0]
+        if fold.whole:
+            gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
+            covariance = self._covariance(self._curvature, self._curvature - curvature)
+            fitted = FittedModel(self.model, self.parameters + self._steps(gradient, curvature), covariance, wheels)
+            return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
+        x, covariance = self._reweighted(clear)
+        return FittedModel(self.model, x[:k], covariance[:k, :k], wheels), self._constants(x, i)
 
-    def without_residuals(self, dropped: Bools) -> tuple[Floats, Floats]:
-        """Return all parameters as fitted without the residuals marked in `dropped` (m,), and their covariance.
+    def _reweighted(self, clear: Bools) -> tuple[Floats, Floats]:
+        """Return all parameters of a single recording as fitted to some residuals (m,), and their covariance.
 
         Notes
         -----
         Reweighted steps, as of a new fit, with residuals that follow the parameters to first order: over some metres
         they do so nearly exactly.
         """
-        at, kept = self.solution, np.flatnonzero(~dropped)
+        at, kept = self.solution, np.flatnonzero(clear)
         residuals, jacobian, x, information = at.residuals[kept], at.jacobian[kept], at.x, at.information
         mean, std = self.pool.prior(self.model)
         pull = std**-2.0
         for _ in range(REWEIGHTS):
             left = residuals + jacobian @ (x - at.x)
-            information, gradient = normal_equations(left, jacobian, scale_by_kind(left), self.pool.overlap)
+            weights = robust_weights(left, scale_by_kind(left), self.pool.overlap)
+            information, gradient = normal_equations(left, jacobian, weights)
             information += np.diag(pull)
             x = x - np.linalg.solve(information, gradient + pull * (x - mean))
-        # a parameter's variance exceeds that of independent residuals by as much as with all of them
-        grown = np.sqrt(np.diag(at.covariance) / np.diag(np.linalg.inv(at.information)))
-        return x, np.linalg.inv(information) * np.outer(grown, grown)
+        return x, self._covariance(at.information, information)
 
-    def nearly_without(self, dropped: Bools) -> Floats:
-        """Return all parameters without the residuals marked in `dropped` (m,), to first order: a downdate.
+    def _covariance(self, whole: Floats, left: Floats) -> Floats:
+        """Return the covariance without a fold, from information matrices with it and without it.
 
         Notes
         -----
-        At the minimum the gradients of all residuals and of the prior sum to zero, so what is left without some is
-        minus theirs. Enough to choose a model; errors come out some per cent too small.
+        A parameter's variance exceeds that of independent residuals by as much as with the fold.
         """
+        grown = np.sqrt(np.diag(self.solution.covariance) / np.diag(np.linalg.inv(whole)))
+        return np.asarray(np.linalg.inv(left) * np.outer(grown, grown), np.float64)
+
+    def residuals_without(self, fold: Fold, others: Sequence[Fold]) -> Floats:
+        """Return the residuals (f, m) of a fold's recording, as fitted without the fold and without each of others.
+
+        Notes
+        -----
+        To first order of a step of the parameters; the constants of a recording that is left out whole are found in it.
+        """
+        at, rows = self.solution, self.pool.rows(fold.recording)
+        if fold.whole:
+            out = [list({fold.recording, other.recording}) for other in others]
+            removed = [tuple(of_each[some].sum(axis=0) for of_each in self._by_recording) for some in out]
+        else:
+            clear = self.pool.clear_of(fold)
+            removed = [self._derivatives(~(clear & self.pool.clear_of(other))) for other in others]
+        gradients, curvatures = (np.array(one) for one in zip(*removed, strict=True))
+        residuals: Floats = at.residuals[rows] + self._steps(gradients, curvatures) @ at.jacobian[rows].T
+        return residuals
+
+    def _steps(self, gradient: Floats, curvature: Floats) -> Floats:
+        """Return the steps (..., k) of the parameters without residuals of some gradient and curvature.
+
+        Notes
+        -----
+        A Newton step of the loss. At the minimum the gradients of all residuals and of the prior sum to zero, so what
+        is left without some is minus theirs.
+        """
+        return np.asarray(np.linalg.solve(self._curvature - curvature, gradient[..., None])[..., 0], np.float64)
+
+    @cached_property
+    def _by_recording(self) -> tuple[Floats, Floats]:
+        """Gradient and curvature of each recording, its constants eliminated; (r, k), (r, k, k)."""
         at = self.solution
-        H, g = normal_equations(at.residuals[dropped], at.jacobian[dropped], at.scale[dropped], self.pool.overlap)
-        x: Floats = at.x + np.linalg.solve(at.information - H, g)
-        return x
+        both = [self._derivatives(self.pool.rows(i)) for i in range(len(self.pool.windows))]
+        gradients, curvatures = (np.array(one) for one in zip(*both, strict=True))
+        return gradients + at.own_pull, curvatures + at.own_prior
+
+    @cached_property
+    def _curvature(self) -> Floats:
+        """Second derivatives of the loss and the prior together (k, k)."""
+        prior = self.pool.prior(self.model)[1][: len(self.solution.information)] ** -2.0
+        return np.asarray(self._by_recording[1].sum(axis=0) + np.diag(prior), np.float64)
+
+    def _derivatives(self, rows: Bools | slice) -> tuple[Floats, Floats]:
+        """Return the first and second derivatives of the loss of some residuals."""
+        at = self.solution
+        residuals, jacobian, scale = at.residuals[rows], at.jacobian[rows], at.scale[rows]
+        weights = robust_weights(residuals, scale, self.pool.overlap)
+        # the second derivative of soft L1 is the cube of its weight
+        curvature, _ = normal_equations(residuals, jacobian, weights * soft_l1_weights(residuals / scale) ** 2)
+        return jacobian.T @ (weights * residuals), curvature
 
 
 def constant_std(model: MotionModel) -> Floats:
@@ -233,6 +294,7 @@ class Pool:
     Attributes
     ----------
     recording, start_m, end_m, length_m : (m,) of the window of each residual
+    first : (recordings + 1,) first residual of each, and the number of all
     group : (m,) stretches of distance whose residuals depend on one another
     overlap : how many windows cover a place on average
     """
@@ -241,7 +303,9 @@ class Pool:
         self.windows, self.widths_m = windows, widths_m
         both = [np.tile([w.start_m, w.end_m, w.length_m], 2) for w in windows]
         self.start_m, self.end_m, self.length_m = np.concatenate(both, axis=1)
-        self.recording = np.repeat(np.arange(len(windows)), [one.shape[1] for one in both])
+        sizes = [one.shape[1] for one in both]
+        self.first = np.cumsum([0, *sizes])
+        self.recording = np.repeat(np.arange(len(windows)), sizes)
         stretch = np.column_stack([self.recording, np.floor(self.start_m / STRETCH_M)])
         self.group = np.unique(stretch, axis=0, return_inverse=True)[1].reshape(-1)
         covered_m = STRETCH_M * (int(self.group.max()) + 1)
@@ -252,6 +316,10 @@ class Pool:
         own = np.tile(constant_std(model), len(self.windows))
         mean = np.concatenate([model.prior_mean, np.zeros(len(own))])
         return mean, np.concatenate([model.prior_std, own])
+
+    def rows(self, recording: int) -> slice:
+        """Return where the residuals of a recording are."""
+        return slice(self.first[recording], self.first[recording + 1])
 
     def clear_of(self, fold: Fold) -> Bools:
         """Return the residuals (m,) that share no distance with a fold."""
@@ -270,21 +338,21 @@ class Pool:
         ----------
         wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
         """
-        parts = [WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)]
-        k, own = len(model.terms), len(constant_std(model))
+        residuals_of = [
+            WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
+        ]
+        k, own, count = len(model.terms), len(constant_std(model)), len(self.windows)
         mean, std = self.prior(model)
-        edges = np.searchsorted(self.recording, np.arange(len(parts) + 1)).tolist()
 
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
-            residuals, jacobian = np.empty(len(self.group)), np.zeros((len(self.group), len(x)))
-            for i, part in enumerate(parts):
-                rows, columns = slice(edges[i], edges[i + 1]), slice(k + own * i, k + own * (i + 1))
-                residuals[rows], by = part(x[:k], x[columns])
-                jacobian[rows, :k], jacobian[rows, columns] = by[:, :k], by[:, k:]
+            residuals, jacobian = np.empty(len(self.group)), np.empty((len(self.group), k + own))
+            for i, constants in enumerate(x[k:].reshape(count, own)):
+                residuals[self.rows(i)], jacobian[self.rows(i)] = residuals_of[i](x[:k], constants)
             return residuals, jacobian
 
         found = robust_least_squares(
-            evaluate, mean, mean, std, group=self.group, overlap=self.overlap, settled=SETTLED
+            evaluate, mean, mean, std, group=self.group, parts=Parts(self.first, own if count > 1 else 0),
+            overlap=self.overlap, settled=SETTLED,
         )  # fmt: skip
         return PooledFit(
             model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found

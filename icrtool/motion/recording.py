@@ -158,6 +158,7 @@ class Windows(NamedTuple):
     start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
     reference : complex (w,), displacement forward + j right in the body frame of the start [m]
     turned : (w,) turn of the reference [rad]
+    moving : (w,) states in which the robot moved from this start to the next
     """
 
     steps: Steps
@@ -169,16 +170,29 @@ class Windows(NamedTuple):
     length_m: Floats
     reference: Complexes
     turned: Floats
+    moving: Ints
 
 
-def cut_windows(
-    recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Sequence[Recording] = ()
-) -> Windows:
+class Extent(NamedTuple):
+    """Distance [m] and time [s] of all recordings that are fitted together."""
+
+    metres: float
+    seconds: float
+
+
+def extent_of(*recordings: Recording) -> Extent:
+    """Return what recordings are together."""
+    return Extent(
+        sum(float(one.drive.distance[-1]) for one in recordings), sum(float(one.held_s.sum()) for one in recordings)
+    )
+
+
+def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Extent | None = None) -> Windows:
     """Cut a recording into windows of driven distance; none crosses a gap or a slip event, or ends in an outage.
 
     Parameters
     ----------
-    pooled : all recordings that are fitted together; the more there are, the coarser windows and steps
+    pooled : of all that is fitted together, default the recording: the more it is, the coarser windows and steps
 
     Raises
     ------
@@ -187,9 +201,8 @@ def cut_windows(
     """
     drive = recording.drive
     place = drive.north + 1j * drive.east
-    together = pooled or (recording,)
-    pooled_m = sum(float(one.drive.distance[-1]) for one in together)
-    every = min(max(EVERY_M, pooled_m / MOST_STARTS), LEAST_OFTEN_M)
+    pooled = pooled or extent_of(recording)
+    every = min(max(EVERY_M, pooled.metres / MOST_STARTS), LEAST_OFTEN_M)
     begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
     ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
@@ -204,7 +217,7 @@ def cut_windows(
     start, end = begins[row], ends[row, column]
     knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
     return Windows(
-        joined_steps(recording, samples_a_step(recording, sum(float(one.held_s.sum()) for one in together))),
+        joined_steps(recording, samples_a_step(recording, pooled.seconds)),
         knot_t=recording.t_s[knots],
         start=rows[: len(start)],
         end=rows[len(start) :],
@@ -213,7 +226,13 @@ def cut_windows(
         length_m=np.asarray(lengths_m, np.float64)[column],
         reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
         turned=drive.heading[end] - drive.heading[start],
+        moving=np.add.reduceat(moving_states(drive).astype(np.int64), begins)[row],
     )
+
+
+def moving_states(drive: Drive) -> Bools:
+    """Return the states (n,) in which the robot moves."""
+    return np.append(np.diff(drive.distance) > MOVING_MPS * drive.dt_s[:-1], False)
 
 
 def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:

@@ -11,12 +11,12 @@ from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.open_loop import ends_from
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
-    MOVING_MPS,
     NO_CONSTANTS,
     LogConstants,
     Recording,
     Steps,
     joined_steps,
+    moving_states,
     samples_a_step,
 )
 
@@ -45,9 +45,8 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     drive = recording.drive
     starts = np.arange(len(drive.distance))
     if not all_starts:
-        moving = np.append(np.diff(drive.distance) > MOVING_MPS * drive.dt_s[:-1], False)
         every = samples_a_step(recording)
-        starts = np.flatnonzero(moving)[::every]
+        starts = np.flatnonzero(moving_states(drive))[::every]
     return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
 
 

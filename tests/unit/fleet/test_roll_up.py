@@ -64,8 +64,8 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
 
 
 def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("icrtool.fleet.roll_up.MOST_POOLED", 1)
-    (one,) = pooled_calibrations(rows("a", "b", "copy"), place)
+    monkeypatch.setattr("icrtool.fleet.roll_up.MOST_POOLED_S", 300.0)
+    (one,) = pooled_calibrations(rows("a", "b", "copy", duration_s=300.0), place)
     assert (one.logs, one.left_out, one.reason) == (("a",), ("b", "copy"), "")
 
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.elimination import Parts
 from icrtool.kernels.robust import (
     LOSS_SIGMAS,
     RobustFit,
@@ -17,6 +18,7 @@ from icrtool.kernels.robust import (
     long_run_factor,
     mad_std,
     robust_least_squares,
+    robust_weights,
     sandwich_covariance,
     soft_l1_weights,
 )
@@ -134,8 +136,47 @@ def test_weights_that_differ_by_hundreds_of_decades_leave_variances() -> None:
     jacobian[5:, 0] = 0.0
     scale = np.where(np.arange(30) < 5, 1e147, 1.0)
     for pull in (np.full(3, 1.0), np.full(3, 1e-200)):
-        covariance = sandwich_covariance(rng.standard_normal(30), jacobian, scale, np.arange(30) // 5, pull)[0]
+        prior = np.diag(pull)
+        covariance = sandwich_covariance(rng.standard_normal(30), jacobian, scale, np.arange(30) // 5, prior)[0]
         assert (np.diag(covariance) > 0.0).all()
+
+
+def test_parts_with_parameters_of_their_own_give_what_the_dense_jacobian_gives() -> None:
+    """Witness: the same problem with every part's own parameters as parameters of all, zeros in between."""
+    rng = np.random.default_rng(6)
+    first, shared, own = np.array([0, 40, 130, 180]), 3, 2
+    part = np.repeat(np.arange(3), np.diff(first))
+    x = rng.normal(0.0, 1.0, shared + 3 * own)
+    design = rng.normal(0.0, 1.0, (180, shared + own))
+    dense = np.zeros((180, len(x)))
+    dense[:, :shared] = design[:, :shared]
+    for i in range(3):
+        columns = slice(shared + own * i, shared + own * (i + 1))
+        dense[part == i, columns] = design[part == i, shared:]
+    y = np.sinh(0.3 * dense @ x) + 0.1 * rng.standard_t(3, 180)
+
+    def evaluate(x: Floats, jacobian: Floats) -> tuple[Floats, Floats]:
+        return np.sinh(0.3 * dense @ x) - y, jacobian * (0.3 * np.cosh(0.3 * dense @ x))[:, None]
+
+    start, mean, std = x + 0.2, np.zeros(len(x)), rng.uniform(0.5, 2.0, len(x))
+    group = np.arange(180) // 5
+    one, other = (
+        robust_least_squares(
+            lambda x, jacobian=jacobian: evaluate(x, jacobian), start, mean, std, group=group, parts=parts, overlap=2.0
+        )
+        for jacobian, parts in ((design, Parts(first, own)), (dense, None))
+    )
+    np.testing.assert_allclose(one.x, other.x, rtol=1e-9)
+    np.testing.assert_allclose(one.residuals, other.residuals, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, other.covariance[:shared, :shared], rtol=1e-6)
+    inverse = np.linalg.inv(other.information)[:shared, :shared]
+    np.testing.assert_allclose(np.linalg.inv(one.information), inverse, rtol=1e-9)
+    # what each part adds, and the prior, are all of the information and of the gradient
+    weights = robust_weights(one.residuals, one.scale, 2.0)[:, None]
+    of_parts = one.jacobian.T @ (weights * one.jacobian) + one.own_prior.sum(axis=0)
+    np.testing.assert_allclose(one.information, of_parts + np.diag(std[:shared] ** -2.0), rtol=1e-9)
+    gradient = one.jacobian.T @ (weights[:, 0] * one.residuals) + one.own_pull.sum(axis=0)
+    assert np.all(np.abs(gradient + one.x[:shared] / std[:shared] ** 2) < 0.05 * np.sqrt(np.diag(one.information)))
 
 
 def test_groups_that_differ_are_covered_where_they_are_few() -> None:
@@ -148,7 +189,7 @@ def test_groups_that_differ_are_covered_where_they_are_few() -> None:
         for expected, errors in z.items():
             residuals = values.mean() - values
             covariance, _, _ = sandwich_covariance(
-                residuals, np.ones((len(groups), 1)), np.full(len(groups), spread), groups, np.array([1e-6]),
+                residuals, np.ones((len(groups), 1)), np.full(len(groups), spread), groups, np.array([[1e-6]]),
                 group_std=None if expected is None else np.array([expected]),
             )  # fmt: skip
             errors.append(abs(values.mean()) / np.sqrt(covariance[0, 0]))
