@@ -258,7 +258,12 @@ def _compared(
     kind = ladder["heading"] or ""
     recording = recording_of(kind)
     windows = cache(partial(cut_windows, recording))
-    path_turned = cache(lambda: tuple(column[rows] for column in turned_path(run, recording)))
+
+    @cache
+    def path_turned() -> tuple[Floats, Complexes]:
+        heading, place = turned_path(run, recording)
+        return heading[rows], place[rows]
+
     for row in ladder["models"]:
         name, turned = row["name"], row["heading"] != "wheels"
         base = name.removesuffix(f"_{kind}") if turned else name
