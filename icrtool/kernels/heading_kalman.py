@@ -98,7 +98,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> 
     stored, likelihood = len(out.innovation) > 0, 0.0
     for i in range(n):
         dt, turn = events.dt[i], events.turn[i]
-        # F is diag(phi) except its first row (1, -dt, turn, 0, ...)
+        # F is diag(phi) but for its first row (1, -dt, turn, 0, ...)
         x[0] += (1.0 + x[2]) * turn - x[1] * dt
         for a in range(k):
             if model.decay[a] > 0.0:
