@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import cast
 
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import recommend
@@ -14,6 +14,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit as fit_filter
 from icrtool.records.run import Run, WarmStart
+from icrtool.records.run_document import RecommendedDocument
 from icrtool.records.tables import RobotLog
 
 
@@ -56,7 +57,7 @@ def fit(
     return replace(run, summary=run.summary | {"recommended": recommendation(run)})
 
 
-def recommendation(run: Run) -> dict[str, Any] | None:
+def recommendation(run: Run) -> RecommendedDocument | None:
     """Return the model, parameters and controller numbers that `calibrate` recommends for a run, without scores.
 
     Returns
@@ -71,6 +72,5 @@ def recommendation(run: Run) -> dict[str, Any] | None:
     except DataError:
         return None
     robot = robot_of(run) | {"track_width_m": recording.width_m}
-    return {"label": found.fit.model.label, "why": found.why} | fitted_document(
-        found.fit, found.controller, robot, found.typical
-    )
+    plain = fitted_document(found.fit, found.controller, robot, found.typical)
+    return cast("RecommendedDocument", {"label": found.fit.model.label, "why": found.why} | plain)

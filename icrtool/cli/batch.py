@@ -16,6 +16,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
+from icrtool.cli.stages import signal_word
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def write_exports(
 def print_results(
     rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, *, quiet: bool, as_json: bool
 ) -> None:
-    """Print what the logs came to."""
+    """Print the results of the logs."""
     from icrtool.fleet.fleet_files import calibrations_text, fleet_document
 
     if as_json:
@@ -190,18 +191,18 @@ class View:
             self._clear()
 
     def stage(self, log: str, stage: str) -> None:
-        """Show that a log has come to a stage."""
+        """Show the stage of a log."""
         self._stages[log] = stage
         self._show()
 
     def row(self, row: Row) -> None:
-        """Show what a log has come to."""
+        """Show the result of a log."""
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
         self._clear()
         if row.status == "failed":
             if self._reports:
-                click.echo(options.error_line(escaped(row.reason), row.log), err=True)
+                click.echo(f"{signal_word('Error:', 'red')} {escaped(row.log)}: {escaped(row.reason)}", err=True)
                 if self._verbose and row.details:
                     click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
         elif self._prints:
@@ -251,7 +252,7 @@ def line_of(row: Row) -> str:
 
 
 def summary_of(rows: Sequence[Row], output: Path) -> str:
-    """Return the last line: how many logs came to what, and where the tables are."""
+    """Return the last line: how many logs were done or failed, and where the tables are."""
     counts = Counter(row.status for row in rows)
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)

@@ -22,7 +22,7 @@ from icrtool.records.unfinished import remove_unfinished
 INTERRUPTED, TERMINATED = 130, 143
 """Exit status of a program that a signal ended: 128 plus the number of the signal."""
 
-GRACE_S = 0.5
+GRACE_S = 0.3
 """Time in which a command may end in order after a signal [s]."""
 
 LLVMLITE = f"{os.sep}llvmlite{os.sep}"
@@ -55,9 +55,11 @@ def end_in_order(boundary: CodeType) -> Iterator[None]:
         yield
         return
     with _watched(ending):
+        before, sys.unraisablehook = sys.unraisablehook, _without_ends
         try:
             yield
         finally:
+            sys.unraisablehook = before
             for number in handled:
                 signal.signal(number, signal.SIG_DFL)
 
@@ -84,6 +86,12 @@ def _watched(ending: _Ending) -> Iterator[None]:
             # The end of the pipe would not be enough: a forked process has a copy of this side.
             os.write(signalled, bytes([OVER]))
             os.close(signalled)
+
+
+def _without_ends(lost: sys.UnraisableHookArgs) -> None:
+    """Print an exception that was lost, but not that of a signal: where one is, `_watch` ends the process."""
+    if not isinstance(lost.exc_value, KeyboardInterrupt | SystemExit):
+        sys.__unraisablehook__(lost)
 
 
 def _watch(arrived: int, over: threading.Event) -> None:

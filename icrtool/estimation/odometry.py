@@ -82,6 +82,8 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
             north[stretch] = table.north_m[first] + miss_north + ahead_north * cos - ahead_east * sin
             east[stretch] = table.east_m[first] + miss_east + ahead_north * sin + ahead_east * cos
             heading[stretch] = piece.heading + turned
+        elif last == len(table) - 1:
+            north, east, heading = piece
         else:
             north[stretch], east[stretch], heading[stretch] = piece
         miss_north, miss_east = north[last] - table.north_m[last], east[last] - table.east_m[last]

@@ -12,12 +12,10 @@ from typing import NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.fleet.row import as_text
-from icrtool.logs.containers.mcap_file import is_mcap
 from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, natural_order, storage_files
-from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.ros1_bag import is_ros1_bag
+from icrtool.logs.containers.open_log import container_of, open_log
 from icrtool.logs.containers.split_files import NumberedFile, log_name, numbered_file, split_files, split_path
-from icrtool.logs.containers.sqlite_bag import is_sqlite
+from icrtool.logs.containers.sqlite_bag import SqliteBag
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
@@ -190,18 +188,13 @@ def is_recording(file: Path) -> bool:
         return True
     try:
         with file.open("rb") as stream:
-            for is_kind in (is_mcap, is_ros1_bag):
-                stream.seek(0)
-                if is_kind(stream):
-                    return True
+            container = container_of(stream)
             stream.seek(0)
-            if is_sqlite(stream):
-                stream.seek(0)
-                first = stream.read(FIRST_BYTES)
-                return b"messages" in first and b"topics" in first
+            # Other programs keep SQLite files too.
+            first = stream.read(FIRST_BYTES) if container is SqliteBag else b"messages topics"
+            return container is not None and b"messages" in first and b"topics" in first
     except OSError:
-        pass
-    return False
+        return False
 
 
 def is_bag_directory(folder: Path) -> bool:

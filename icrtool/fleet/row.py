@@ -14,6 +14,10 @@ HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 SHOWN_ERROR = "icr_p95_10m_m"
 """The error of each log that is printed, drawn, and compared with the baseline."""
 
+BEFORE_ICRS = ("log", "status", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
+AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
+"""Columns of fleet.csv that a row holds as they are."""
+
 Status = Literal["done", "failed", "skipped"]
 
 
@@ -82,24 +86,14 @@ class Row:
 
     def columns(self) -> dict[str, Any]:
         """Return the row of fleet.csv."""
+        icrs = (*ICR_COLUMNS, *(f"std_{name}" for name in ICR_COLUMNS))
         return {
-            "log": self.log,
-            "status": self.status,
-            "reason": self.reason,
-            "robot": self.robot,
-            "group": self.group,
-            "start_utc": self.start_utc,
-            "duration_s": self.duration_s,
-            "distance_m": self.distance_m,
-            **{name: self.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{name}" for name in ICR_COLUMNS))},
+            **{name: getattr(self, name) for name in BEFORE_ICRS},
+            **{name: self.icr.get(name) for name in icrs},
             "multiplier": self.multiplier,
             "multiplier_std": self.multiplier_std,
             **self.errors,
-            "events": self.events,
-            "outages": self.outages,
-            "warnings": self.warnings,
-            "tool_version": self.tool_version,
-            "run": self.run,
+            **{name: getattr(self, name) for name in AFTER_ERRORS},
             "tags": ";".join(self.tags),
             "gates_failed": self.gates_failed if self.status != "failed" else None,
             "took_s": self.took_s,

@@ -215,8 +215,13 @@ def open_loop_path(
     integrate_path(compiled_drive(drive), float(y_icr_right), float(y_icr_left), float(x_icr), start, local)
     ahead, aside, turned = local
     cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
-    return OpenLoopPath(
-        drive.north[start] + (ahead * cos_psi - aside * sin_psi),
-        drive.east[start] + (ahead * sin_psi + aside * cos_psi),
-        drive.heading[start] + turned,
-    )
+    # In place: paths of whole drives are as long as a column of the run.
+    aside_north = aside * sin_psi
+    aside *= cos_psi
+    aside += ahead * sin_psi
+    aside += drive.east[start]
+    ahead *= cos_psi
+    ahead -= aside_north
+    ahead += drive.north[start]
+    turned += drive.heading[start]
+    return OpenLoopPath(*local)

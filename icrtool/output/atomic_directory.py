@@ -8,10 +8,8 @@ first; a process that is killed between the two renames leaves it there, and the
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from hashlib import blake2b
 from pathlib import Path, PurePosixPath
 
 from icrtool.errors import OutputError
@@ -22,9 +20,6 @@ from icrtool.records.unfinished import end, unfinished
 
 IsOurs = Callable[[Path], bool]
 """Whether a directory is one that we wrote and may replace."""
-
-LONGEST_NAME_BYTES = 200
-"""A hidden name is that of the place and some letters; a longer one is shortened to its hash."""
 
 NAMES_SHOWN = 5
 
@@ -132,9 +127,9 @@ def hidden_directory(place: Path, names: Collection[str] = ()) -> Iterator[Path]
     OSError
         It cannot be made.
     """
-    for left in _hidden(place):
+    for left in disk.hidden(place, ".partial", ".old"):
         _clean(left, place, names)
-    partial = place.with_name(f"{_prefix(place)}{secrets.token_hex(4)}.partial")
+    partial = disk.hidden_name(place, ".partial")
     try:
         with unfinished(partial):
             partial.mkdir()
@@ -155,7 +150,7 @@ def restore(directory: Path, ours: IsOurs) -> None:
     place = _resolved(directory)
     if os.path.lexists(place):
         return
-    aside = [path for path in _hidden(place) if path.suffix == ".old" and (ours(path) or kind_of(path) is not None)]
+    aside = [path for path in disk.hidden(place, ".old") if ours(path) or kind_of(path) is not None]
     if aside:
         disk.rename(max(aside, key=lambda path: path.stat().st_mtime_ns), place)
 
@@ -224,23 +219,6 @@ def _discard(left: Path, place: Path, names: Collection[str]) -> None:
         if kind_of(left) is not None and place.is_dir():
             carry(left, place, files_by_owner(left, names)[1])
         disk.remove(left)
-
-
-def _hidden(place: Path) -> list[Path]:
-    """Return the hidden directories beside a place that were or shall be that place."""
-    prefix = _prefix(place)
-    try:
-        beside = list(place.parent.iterdir())
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    return [path for path in beside if path.name.startswith(prefix) and path.suffix in (".partial", ".old")]
-
-
-def _prefix(place: Path) -> str:
-    name = os.fsencode(place.name)
-    if len(name) > LONGEST_NAME_BYTES:
-        return f".{blake2b(name, digest_size=16).hexdigest()}."
-    return f".{place.name}."
 
 
 def _is_ours(place: Path, ours: IsOurs, kind: str) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,9 @@ from pathlib import Path
 from icrtool.errors import OutputError
 from icrtool.output import disk
 from icrtool.records.unfinished import unfinished
+
+LONGEST_SUFFIX = 16
+"""Letters of a suffix that is kept, from which a library takes the format."""
 
 
 @contextmanager
@@ -28,11 +30,11 @@ def atomic_file(file: Path) -> Iterator[Path]:
     try:
         place = Path(os.path.realpath(file))
         _check_kind(file, place)
-        prefix, suffix = f".{place.stem[:100]}.", f".partial{place.suffix.lower()}"
-        for left in place.parent.glob(f"{_literal(prefix)}????????{_literal(suffix)}"):
+        end = f".partial{place.suffix.lower()[:LONGEST_SUFFIX]}"
+        for left in disk.hidden(place, end):
             if disk.is_abandoned(left):
                 disk.remove(left)
-        partial = place.with_name(f"{prefix}{secrets.token_hex(4)}{suffix}")
+        partial = disk.hidden_name(place, end)
         with unfinished(partial):
             partial.touch(exist_ok=False)
             with disk.locked(partial):
@@ -82,8 +84,3 @@ def _check_kind(path: Path, place: Path) -> None:
         raise OutputError(path, "is a directory", "name a file")
     if place.exists() and not place.is_file():
         raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
-
-
-def _literal(text: str) -> str:
-    """Return a text as `Path.glob` finds it: letter by letter."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in text)

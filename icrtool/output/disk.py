@@ -8,12 +8,15 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import re
+import secrets
 import shutil
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from hashlib import blake2b
 from pathlib import Path
 
 if sys.platform != "win32":
@@ -28,11 +31,38 @@ NO_EXCHANGE = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 NO_LINK = {errno.EPERM, errno.EXDEV, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EACCES}
 
+LONGEST_NAME_BYTES = 200
+"""A hidden name is that of the place and some letters; a longer one is shortened to its hash."""
+
+TOKEN_BYTES = 4
+
 LONGEST_WRITE_S = 86400.0
-"""Where a file system has no locks, what is being written is taken for abandoned after this time."""
+"""Where a file system has no locks, what is being written counts as abandoned after this time."""
 
 SYNC_THREADS = 8
 """A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
+
+
+def hidden_name(place: Path, end: str) -> Path:
+    """Return a new hidden name beside a place, for what shall get its name."""
+    return place.with_name(f"{_hidden_begin(place)}{secrets.token_hex(TOKEN_BYTES)}{end}")
+
+
+def hidden(place: Path, *ends: str) -> list[Path]:
+    """Return what has a name that `hidden_name` made of a place and one of these ends."""
+    begin = _hidden_begin(place)
+    # Of exactly this length: the directories a and a.b may be beside one another.
+    sought = [re.compile(f"{re.escape(begin)}[0-9a-f]{{{2 * TOKEN_BYTES}}}{re.escape(end)}") for end in ends]
+    try:
+        beside = list(place.parent.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [path for path in beside if any(one.fullmatch(path.name) for one in sought)]
+
+
+def _hidden_begin(place: Path) -> str:
+    name = os.fsencode(place.name)
+    return f".{blake2b(name, digest_size=16).hexdigest() if len(name) > LONGEST_NAME_BYTES else place.name}."
 
 
 def rename(source: Path, target: Path) -> None:

@@ -245,6 +245,31 @@ class FindingDocument(TypedDict):
     why: str
 
 
+class ParameterDocument(TypedDict):
+    """A parameter of a motion model."""
+
+    value: float
+    std: float
+
+
+class ControllerDocument(TypedDict):
+    """What a controller is given: its multiplier and the wheels' radii as factors of the configured one."""
+
+    multiplier: float
+    multiplier_std: float
+    left_radius: float
+    right_radius: float
+
+
+class RecommendedDocument(TypedDict):
+    """The recommended motion model."""
+
+    label: str
+    model: str
+    parameters: dict[str, ParameterDocument]
+    controller: ControllerDocument
+
+
 class RunDocument(TypedDict):
     """run.json; `recommended`: the motion model, of a run that `icrtool.fit` made."""
 
@@ -272,4 +297,4 @@ class RunDocument(TypedDict):
     wheel_gaps_ns: Spans
     filter: FilterDocument
     excitation: ExcitationDocument
-    recommended: NotRequired[dict[str, Any] | None]
+    recommended: NotRequired[RecommendedDocument | None]

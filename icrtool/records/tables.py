@@ -151,13 +151,15 @@ class States:
 
     @property
     def fault(self) -> str:
-        """What no filter's states can be: none, not in the order of time, not finite; empty where nothing is wrong."""
+        """What no filter's states can be: none, not in order, not finite; empty where nothing is wrong."""
         import numpy as np
 
         if not len(self):
             return "there are no states"
         if np.any(self.stamp_ns[1:] <= self.stamp_ns[:-1]):
             return "its states are not in the order of time"
+        if np.any(self.distance_m[1:] < self.distance_m[:-1]):
+            return "the distance of its states decreases"
         for name, values in self.columns().items():
             possible = np.abs(values) < LARGEST
             if name != "stamp_ns" and not possible.all():

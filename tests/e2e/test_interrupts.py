@@ -122,3 +122,31 @@ def test_a_thread_that_computes_does_not_hold_up_the_end() -> None:
     done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (143, "", "")
     assert time.monotonic() - begin < 10
+
+
+IN_A_CALLBACK = """
+import os, signal, time, weakref
+from icrtool.cli.interrupts import end_in_order
+
+def gone(_):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)
+
+def command():
+    thing = type("Thing", (), {})()
+    reference = weakref.ref(thing, gone)
+    del thing
+    time.sleep(60)
+
+with end_in_order(command.__code__):
+    command()
+"""
+
+
+def test_a_signal_whose_exception_the_interpreter_loses_ends_the_process_too() -> None:
+    begin = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", IN_A_CALLBACK], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "Aborted!\n")
+    assert time.monotonic() - begin < 10

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
@@ -48,8 +49,15 @@ def _open(path: Path) -> Container:
     with path.open("rb") as stream:
         if not stream.read(1):
             raise LogError(path, "an empty file", "the recording never began, or the copy failed")
-        for is_kind, container in ((is_mcap, McapFile), (is_ros1_bag, Ros1Bag), (is_sqlite, SqliteBag)):
-            stream.seek(0)
-            if is_kind(stream):
-                return container(path)
+        if (container := container_of(stream)) is not None:
+            return container(path)
     raise LogError(path, "not a log", f"a log is {KINDS}")
+
+
+def container_of(stream: BinaryIO) -> type[McapFile | Ros1Bag | SqliteBag] | None:
+    """Return which container the first bytes of a file are of; None where it is no log."""
+    for is_kind, container in ((is_mcap, McapFile), (is_ros1_bag, Ros1Bag), (is_sqlite, SqliteBag)):
+        stream.seek(0)
+        if is_kind(stream):
+            return container
+    return None

@@ -188,11 +188,11 @@ def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> 
 
 
 class Path(NamedTuple):
-    """The path of a model through the whole drive.
+    """The path of a model through the whole drive, at the steps of the page alone: a drive has many states and models.
 
     Attributes
     ----------
-    heading, place : (n,) [rad], forward + j right [m], of the robot; with `icrs` of the mean of its tracks
+    heading, place : [rad], forward + j right [m], of the robot at the steps; with `icrs` of the mean of its tracks
     icrs : y right, y left, x [m]; None: those of the start; empty where the path is the robot's
     """
 
@@ -212,10 +212,11 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
     recording = cache(lambda kind: heading_recording_of(run, kind, width_m=2.0 * half_width_m(b)))
-    paths = list(_calibrated(recording, report, labels))
-    paths += _compared(run, recording, report["ladder"], {*labels, *(one.name for one in paths)})
-    every = max(-(-len(paths) * len(steps.rows) // MOST_STEPS), 1)
-    rows = np.unique(np.append(steps.rows[::every], steps.rows[-1]))
+    paths = list(_calibrated(recording, report, labels, steps.rows))
+    paths += _compared(run, recording, report["ladder"], {*labels, *(one.name for one in paths)}, steps.rows)
+    count = len(steps.rows)
+    every = max(-(-len(paths) * count // MOST_STEPS), 1)
+    rows = np.unique(np.append(np.arange(0, count, every), count - 1))
     for one in paths:
         columns = {"forward": one.place.real, "right": one.place.imag, "turn": one.heading}
         path: dict[str, Any] = {"every": every, "first_turn": float(one.heading[0])}
@@ -232,7 +233,7 @@ def _last_icrs(run: Run) -> list[float]:
 
 
 def _calibrated(
-    recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str]
+    recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str], rows: Ints
 ) -> Iterator[Path]:
     """Yield the path of each calibration of the report, its own first; with the gyro too where there is one."""
     wanted = [(one["name"], one["label"], one["calibration"], one["with_gyro"]) for one in report["calibrations"]]
@@ -245,18 +246,24 @@ def _calibrated(
             # Too short a drive to find the delay of its wheels has no path.
             with suppress(DataError):
                 model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
-                yield Path(name, label, *predicted_path(recording, *model)(recording.t_s))
+                yield Path(name, label, *predicted_path(recording, *model)(recording.t_s[rows]))
 
 
 def _compared(
-    run: Run, recording_of: Callable[[str], Recording], ladder: Mapping[str, Any], known: set[str]
+    run: Run, recording_of: Callable[[str], Recording], ladder: Mapping[str, Any], known: set[str], rows: Ints
 ) -> Iterator[Path]:
     """Yield the path of each model of the comparison that is not `known`, as fitted to the whole drive."""
     if "left_out" in ladder:
         return
     kind = ladder["heading"] or ""
     recording = recording_of(kind)
-    windows, path_turned = cache(partial(cut_windows, recording)), cache(partial(turned_path, run, recording))
+    windows = cache(partial(cut_windows, recording))
+
+    @cache
+    def path_turned() -> tuple[Floats, Complexes]:
+        heading, place = turned_path(run, recording)
+        return heading[rows], place[rows]
+
     for row in ladder["models"]:
         name, turned = row["name"], row["heading"] != "wheels"
         base = name.removesuffix(f"_{kind}") if turned else name
@@ -267,7 +274,7 @@ def _compared(
             if base in FAMILY:
                 fitted = _fitted(ladder, base, turned=turned)
                 own = own_constants(windows(), fitted, recording.width_m)
-                yield Path(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s))
+                yield Path(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
             else:
                 icrs = None if base == "icr" else _last_icrs(run)
                 yield Path(name, row["label"], *path_turned(), icrs)

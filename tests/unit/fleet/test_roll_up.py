@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from icrtool.cli.batch import line_of, summary_of
 from icrtool.cli.compare import _groups
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
-from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
+from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_of_fleet
 from icrtool.fleet.row import File, Row
 from icrtool.output.calibration_file import open_calibration
 from icrtool.records.run import Run
@@ -93,3 +94,12 @@ def test_figures_show_what_there_is(tmp_path: Path) -> None:
     assert {file.name for file in (tmp_path / "plots").iterdir()} == {"icrs.svg", "errors.svg"}
     assert reason_of(failed) == "no wheels found"
     assert json.loads((tmp_path / "fleet.json").read_bytes())["calibrations"] == []
+
+
+def test_hostile_names_of_robots_and_groups_stay_text() -> None:
+    hostile = "\x1b[2J\nError: \u202e" + "n" * 300
+    found = PooledCalibration(hostile, hostile, ("a",), reason=hostile)
+    assert max(map(len, calibrations_text([found]).split("\n"))) < 600
+    row = Row(hostile, "runs/a", "done", robot=hostile, group=hostile)
+    for text in (calibrations_text([found]), line_of(row), summary_of([row], Path(hostile[:50]))):
+        assert text.replace("\n", "").isprintable()

@@ -313,3 +313,15 @@ def test_what_a_living_process_writes_is_not_cleaned(tmp_path: Path) -> None:
         assert (slow / "mark").exists()
     assert (tmp_path / "a" / "mark").read_text() == "slow"
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_what_a_killed_process_left_of_another_place_is_not_taken(tmp_path: Path) -> None:
+    for name in (".a.b.12345678.old", ".a.b.12345678.partial"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mark").write_text("of a.b")
+    check_directory(tmp_path / "a", marked, kind="report")
+    assert not (tmp_path / "a").exists()
+    write(tmp_path / "a")
+    assert {path.name for path in tmp_path.iterdir()} == {"a", ".a.b.12345678.old", ".a.b.12345678.partial"}
+    check_directory(tmp_path / "a.b", marked, kind="report")
+    assert (tmp_path / "a.b" / "mark").read_text() == "of a.b"

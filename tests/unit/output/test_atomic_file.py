@@ -8,7 +8,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output import disk
-from icrtool.output.atomic_file import atomic_file, check_place
+from icrtool.output.atomic_file import atomic_file, check_place, write_file
 from icrtool.output.exports.acceptance import write_junit, write_markdown
 
 
@@ -71,8 +71,15 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
 def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "a.txt").symlink_to("real/b.txt")
-    (tmp_path / "real" / ".b.12345678.partial.txt").write_text("of a killed process")
+    (tmp_path / "real" / ".b.txt.12345678.partial.txt").write_text("of a killed process")
     with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
     assert (tmp_path / "a.txt").is_symlink()
     assert [(path.name, path.read_text()) for path in (tmp_path / "real").iterdir()] == [("b.txt", "new")]
+
+
+@pytest.mark.parametrize("name", ["\u6f22" * 80 + ".json", "a." + "x" * 250, "b" * 250 + ".csv"])
+def test_the_longest_name_a_file_system_takes_can_be_written(tmp_path: Path, name: str) -> None:
+    for text in ("old", "new"):
+        write_file(tmp_path / name, text)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "new")]

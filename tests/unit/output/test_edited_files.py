@@ -62,6 +62,27 @@ def use_calibration(file: Path) -> None:
     found.warm_start()
 
 
+def test_states_whose_distance_decreases_are_refused(run_place: Path, tmp_path: Path) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    lines = (place / "states.csv").read_text().splitlines()
+    cells = lines[500].split(",")
+    cells[lines[0].split(",").index("distance_m")] = "0"
+    lines[500] = ",".join(cells)
+    (place / "states.csv").write_text("\n".join(lines) + "\n")
+    write_run(place, json.loads((place / "run.json").read_text()))
+    with pytest.raises(IcrToolError, match="distance of its states decreases"):
+        icrtool.open_run(place)
+
+
+@pytest.mark.parametrize("value", [{"model": 1e300}, {"parameters": {"b": 0}}, {"controller": {}}, {"parameters": []}])
+def test_a_recommendation_of_other_types_is_refused(run_place: Path, tmp_path: Path, value: dict[str, Any]) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    document = json.loads((place / "run.json").read_text())
+    write_run(place, document | {"recommended": document["recommended"] | value})
+    with pytest.raises(IcrToolError, match=r"recommended"):
+        icrtool.open_run(place)
+
+
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.stress), 23])
 def test_an_edited_run_is_refused_in_one_line_or_can_be_used(run_place: Path, tmp_path: Path, every: int) -> None:
     document = json.loads((run_place / "run.json").read_text())
