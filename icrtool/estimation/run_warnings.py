@@ -21,7 +21,7 @@ SMALLEST_MULTIPLIER = 0.9
 """ICRs nearer to each other than this share of the track width are no robot's that slips."""
 
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
-"""ICRs whose middle is off by more than this are not taken for even ones."""
+"""ICRs whose middle is off by more than this are not treated as even ones."""
 
 
 WORTH_WARNING_SHARE = 0.1

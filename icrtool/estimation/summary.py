@@ -211,7 +211,7 @@ def _end_errors(found: WheelPaths) -> dict[str, Any]:
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
-    """Return how many fixes of each class there were and what became of them, and the jumps of the position."""
+    """Return how many fixes of each class there were and how they were used, and the jumps of the position."""
     classes = {}
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
