@@ -74,7 +74,7 @@ class Convention(NamedTuple):
             count += FAULTS["pose mirrored"]
         else:
             count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
-            # an ENU yaw taken for a NED one, or the reverse, is turned by a quarter as well
+            # an ENU yaw read as a NED one, or the reverse, is turned by a quarter as well
             if self.heading < 0 and not drive.same_clock:
                 offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)

@@ -1,6 +1,6 @@
 """One estimate of what relates wheels, heading and positions: scales, ICRs, heading offset, delays.
 
-With the heading measured along the path, all of it is linear but for the heading offset and the delays. Windows of
+With the heading measured along the path, all of it is linear except the heading offset and the delays. Windows of
 driven distance from fix i to fix j, and windows of time of the heading itself:
 
     p_j - p_i = e^{j d} ∫(a v + m u + n |u| + j (c + l v) psi') e^{j psi},                           u = (V_l - V_r)/2

@@ -306,7 +306,7 @@ class _Problem:
         return self._at_rate_samples(causal, states, covariances, noises, mad_std(self._settled(causal), 0.0))
 
     def _settled(self, passes: HeadingPasses) -> Floats:
-        """Return the courses' innovations in standard deviations, but for the first ones."""
+        """Return the courses' innovations in standard deviations, except the first ones."""
         course = self.kind == COURSE
         z = passes.innovation[course] / np.sqrt(passes.variance[course])
         settled: Floats = z[len(z) // 20 + 2 :]

@@ -35,7 +35,7 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
 
     Parameters
     ----------
-    claimed : bool (m,), taken for fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
+    claimed : bool (m,), reported as fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
 
     A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
     """

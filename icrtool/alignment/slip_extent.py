@@ -93,7 +93,7 @@ def find_extent(t: Floats, steps: Windows, error: Floats, usable: Bools, core: s
 def missed_shares(steps: Windows, rows: slice) -> Floats:
     """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
 
-    Sums, and no least squares over steps: the noise of the fixes cancels but for that of the first and the last.
+    Sums, and no least squares over steps: the noise of the fixes cancels except that of the first and the last.
     """
     left, right = _sides(steps, rows)
     ahead, aside, turned = steps.ahead[rows], steps.aside[rows], steps.turned[rows]

@@ -1,4 +1,4 @@
-"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders; wheels that turn in vain."""
+"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders; a robot on a stand."""
 
 from __future__ import annotations
 

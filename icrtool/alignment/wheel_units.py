@@ -163,7 +163,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
 def _metres_per_unit(
     wheels: WheelSamples, gnss: PositionFixes, config: Config, topic: str
 ) -> tuple[float, str, list[str]]:
-    """Return metres per unit, how it is known in words, and what had to be estimated for want of a key."""
+    """Return metres per unit, how it is known in words, and what had to be estimated because a key is missing."""
     radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
     known: dict[WheelUnit, float] = {"m": 1.0}
     if radius is not None:

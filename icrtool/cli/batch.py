@@ -132,7 +132,7 @@ def write_exports(
 def print_results(
     rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, *, quiet: bool, as_json: bool
 ) -> None:
-    """Print what the logs came to."""
+    """Print the results of the logs."""
     from icrtool.fleet.fleet_files import calibrations_text, fleet_document
 
     if as_json:
@@ -191,12 +191,12 @@ class View:
             self._clear()
 
     def stage(self, log: str, stage: str) -> None:
-        """Show that a log has come to a stage."""
+        """Show the stage of a log."""
         self._stages[log] = stage
         self._show()
 
     def row(self, row: Row) -> None:
-        """Show what a log has come to."""
+        """Show the result of a log."""
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
         self._clear()
@@ -252,7 +252,7 @@ def line_of(row: Row) -> str:
 
 
 def summary_of(rows: Sequence[Row], output: Path) -> str:
-    """Return the last line: how many logs came to what, and where the tables are."""
+    """Return the last line: how many logs were done or failed, and where the tables are."""
     counts = Counter(row.status for row in rows)
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)

@@ -53,7 +53,7 @@ def _default_place(source: Path) -> Path:
 
 
 def _write(source: Path, place: Path, *, coordinates: bool) -> None:
-    """Write the page of one source, whatever it is."""
+    """Write the page of a run, a fleet or a comparison."""
     import json
 
     from icrtool.errors import RunError

@@ -57,6 +57,11 @@ class Excitation:
     spun_left_rad: float
     sentences: tuple[str, ...]
 
+    @property
+    def shows_sides(self) -> bool:
+        """Whether both y ICRs are shown, at least weakly."""
+        return all(self.verdicts[name] != "not shown" for name in ICR_COLUMNS[:2])
+
     def summary(self) -> dict[str, Any]:
         """Return plain data for run.json."""
         return {

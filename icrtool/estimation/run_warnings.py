@@ -12,20 +12,16 @@ from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
 from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.measurement_codes import UNSEEN
 from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import States
 
-SHORT_DRIVE_M, SMALL_TURN_RAD = 1.0, math.radians(20.0)
-"""What drives and turns less has shown nothing of the ICRs."""
-
 SMALLEST_MULTIPLIER = 0.9
 """ICRs nearer to each other than this share of the track width are no robot's that slips."""
 
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
-"""ICRs whose middle is off by more than this are not taken for even ones."""
+"""ICRs whose middle is off by more than this are not treated as even ones."""
 
 
 WORTH_WARNING_SHARE = 0.1
@@ -86,16 +82,16 @@ def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
 
 
 def run_warnings(
-    name: str, table: States, gnss: MeasurementOutcome, heading: MeasurementOutcome, multiplier: float | None
+    name: str,
+    table: States,
+    gnss: MeasurementOutcome,
+    heading: MeasurementOutcome,
+    multiplier: float | None,
+    excitation: Excitation,
 ) -> list[str]:
     """Return what a user should know before trusting the numbers; `multiplier` is (y_r - y_l) / b where b is known."""
     found = []
-    distance, turns = float(table.distance_m[-1]), _turns(table)
-    if distance < SHORT_DRIVE_M and not turns:
-        found.append(f"the robot drove {distance:.2f} m: the ICRs are the start's, nothing was learned")
-    elif not turns:
-        found.append("the robot hardly turned: the ICRs are not observable on a straight drive")
-    elif multiplier is not None and multiplier < SMALLEST_MULTIPLIER:
+    if multiplier is not None and multiplier < SMALLEST_MULTIPLIER and excitation.shows_sides:
         found.append(
             f"the ICRs are {multiplier:.2f} of the track width apart; slip makes it "
             "more than 1: check robot.track_width_m, wheel radius and sides"
@@ -125,8 +121,6 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
     An antenna off the centre line and sides that slip unequally look the same: only the difference shows
     (`icrtool.calibration.one_log`). So nothing is moved.
     """
-    if not _turns(table):
-        return []
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
     sigma = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
@@ -141,17 +135,3 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
             f"frames.antenna_right_m={-middle:.2f}, and frames.antenna_forward_m, from which x_icr is counted"
         )
     ]
-
-
-def _turns(table: States) -> bool:
-    """Return whether the robot turned enough to show its ICRs.
-
-    By the heading and, where it went nowhere, by the wheels too: a parked robot whose heading drifts has learned
-    nothing, and one that turned on the spot has.
-    """
-    turned = float(np.ptp(table.heading_rad))
-    if float(table.distance_m[-1]) < SHORT_DRIVE_M:
-        width = float(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
-        ahead = np.append(0.0, np.cumsum(np.diff(table.t_s) * (table.v_left_mps - table.v_right_mps)[:-1]))
-        turned = min(turned, float(np.ptp(ahead)) / max(abs(width), MIN_ICR_SEPARATION_M))
-    return turned >= SMALL_TURN_RAD

@@ -117,8 +117,12 @@ def _warnings(
     end_s = float(table.t_s[-1])
     return [
         *measurements.warnings,
-        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier),
-        *([] if measurements.antenna_is_known else antenna_warning(name, table, covariance)),
+        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier, excitation),
+        *(
+            []
+            if measurements.antenna_is_known or not excitation.shows_sides
+            else antenna_warning(name, table, covariance)
+        ),
         *(
             f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
             for t in filtered.changes_s
@@ -207,7 +211,7 @@ def _end_errors(found: WheelPaths) -> dict[str, Any]:
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
-    """Return how many fixes of each class there were and what became of them, and the jumps of the position."""
+    """Return how many fixes of each class there were and how they were used, and the jumps of the position."""
     classes = {}
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code

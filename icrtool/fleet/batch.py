@@ -31,7 +31,7 @@ LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
 """Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
 
 Watch = Callable[[str, str], None]
-"""Called with the name of a log and the stage it has come to."""
+"""Called with the name of a log and its stage."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ PLOTS = "plots"
 
 
 def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
-    """Return what fleet.json holds: how many logs came to what, all of each, and the pooled calibrations."""
+    """Return what fleet.json holds: how many logs were done or failed, all of each, and the pooled calibrations."""
     counts = Counter(row.status for row in rows)
     return {
         "schema": FLEET_SCHEMA,

@@ -216,12 +216,12 @@ def open_loop_path(
     ahead, aside, turned = local
     cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
     # In place: paths of whole drives are as long as a column of the run.
-    north = ahead * cos_psi
-    north -= aside * sin_psi
-    north += drive.north[start]
-    ahead *= sin_psi
+    aside_north = aside * sin_psi
     aside *= cos_psi
-    aside += ahead
+    aside += ahead * sin_psi
     aside += drive.east[start]
+    ahead *= cos_psi
+    ahead -= aside_north
+    ahead += drive.north[start]
     turned += drive.heading[start]
-    return OpenLoopPath(north, aside, turned)
+    return OpenLoopPath(*local)

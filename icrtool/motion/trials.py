@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop import ends_from
+from icrtool.kernels.open_loop import STARTS_A_CALL, ends_from
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -99,15 +99,22 @@ def predicted_path(
     Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
     of = steps if steps is not None else joined_steps(recording, 1)
-    gyro = of.gyro + own.gyro_later_s * of.gyro_change()
-    v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left, of.v_right, recording.width_m, gyro))
-    turned = of.held * (omega + own.gyro_bias_radps)
-    heading = np.concatenate([[0.0], np.cumsum(turned)])
-    angle = heading[:-1] + of.into * (omega + own.gyro_bias_radps)
-    moved = np.empty(len(turned), np.complex128)
-    cos, sin = np.cos(angle), np.sin(angle)
-    moved.real, moved.imag = of.held * (v_x * cos - v_y * sin), of.held * (v_x * sin + v_y * cos)
-    place = np.concatenate([[0.0], np.cumsum(moved)])
+    gyro = of.gyro + own.gyro_later_s * of.gyro_change() if own.gyro_later_s else of.gyro
+    count = len(of.t)
+    turned, heading = np.empty(count), np.zeros(count + 1)
+    moved, place = np.empty(count, np.complex128), np.zeros(count + 1, np.complex128)
+    # Some at a time: of a long drive, the columns between would take several times what is kept.
+    for lo in range(0, count, STARTS_A_CALL):
+        some, sums = slice(lo, lo + STARTS_A_CALL), slice(lo, lo + STARTS_A_CALL + 1)
+        held = of.held[some]
+        v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro[some]))
+        omega += own.gyro_bias_radps
+        turned[some] = held * omega
+        heading[sums] = np.cumsum(np.append(heading[lo], turned[some]))
+        angle = heading[:-1][some] + of.into[some] * omega
+        cos, sin = np.cos(angle), np.sin(angle)
+        moved.real[some], moved.imag[some] = held * (v_x * cos - v_y * sin), held * (v_x * sin + v_y * cos)
+        place[sums] = np.cumsum(np.append(place[lo], moved[some]))
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
         row, share = of.locate(at + own.wheels_later_s)

@@ -37,7 +37,7 @@ LONGEST_NAME_BYTES = 200
 TOKEN_BYTES = 4
 
 LONGEST_WRITE_S = 86400.0
-"""Where a file system has no locks, what is being written is taken for abandoned after this time."""
+"""Where a file system has no locks, what is being written counts as abandoned after this time."""
 
 SYNC_THREADS = 8
 """A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""

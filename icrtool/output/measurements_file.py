@@ -1,4 +1,4 @@
-"""``measurements.npz`` of a run: the sensors as the filter used them, and what became of each measurement.
+"""``measurements.npz`` of a run: the sensors as the filter used them, and the outcome of each measurement.
 
 The wheel samples from the first recorded state on are columns of the states; only those before it are here.
 """
@@ -68,7 +68,7 @@ def write_measurements(run: Run, path: Path) -> None:
 def read_measurements(
     path: Path, table: States, document: RunDocument
 ) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
-    """Read what `write_measurements` wrote: the sensors, and what became of fixes and headings.
+    """Read what `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
 
     The states come back with the columns of the wheels in the wheels' memory.
 

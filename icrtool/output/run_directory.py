@@ -24,7 +24,7 @@ RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
 CHECKSUM_FILE = "B2SUMS"
-"""Sums of all files but the pictures, as ``b2sum -c`` reads them: an edited run is not taken for a measured one."""
+"""Sums of all files except the pictures, as ``b2sum -c`` reads them: an edited run is recognised."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
 

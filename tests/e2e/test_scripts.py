@@ -115,7 +115,7 @@ def test_the_run_of_another_recording_is_not_replaced_unasked(icrtool, logs: Pat
     shutil.copy(logs / "monday" / "drive.mcap", logs / "drive.mcap")
     status, _, err = icrtool("fit", "drive.mcap", *FAST)
     assert status == 0, "so is a file in the same place"
-    assert "other content" in err
+    assert "replaced the run of another recording" in err
 
 
 def test_a_relative_path_from_another_folder_is_another_recording(icrtool, logs: Path, monkeypatch) -> None:

@@ -334,7 +334,7 @@ def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
 
 
 def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
-    """Return slices of messages of some sizes [bytes] (n,), each of bounded rows and, but for one message, bytes."""
+    """Return slices of messages of some sizes [bytes] (n,), each of bounded rows and, except single messages, bytes."""
     if len(sizes) <= most_rows and int(sizes.sum()) <= _MOST_BYTES_AT_ONCE:
         return [slice(0, len(sizes))]
     whole = np.cumsum(sizes) // _MOST_BYTES_AT_ONCE

@@ -19,7 +19,7 @@ from icrtool.output.text_format import error_text, run_title, xml_text
 from icrtool.records.dropout import Verdict
 
 Outcome = DropoutReport | IcrToolError
-"""What became of one argument: a report, or why there is none."""
+"""The outcome of one argument: a report, or why there is none."""
 
 
 class Suite(NamedTuple):

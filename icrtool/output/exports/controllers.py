@@ -154,9 +154,11 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     right, left, x = geometry[:3]
     std_right, std_left, std_x = np.sqrt(np.diag(covariance)[:3])
     robot = f", {_one_line(name)}" if (name := calibration.robot["name"]) else ""
+    # That of a report has no date: the same run, the same file.
+    fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
     origin = (
         f"icrtool {__version__}: {_one_line(calibration.log_names())}, driven {_date(calibration)}, "
-        f"{_distance_m(calibration):.0f} m{robot}, fitted {calibration.created[:10]}"
+        f"{_distance_m(calibration):.0f} m{robot}{fitted}"
     )
     icrs = (
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "

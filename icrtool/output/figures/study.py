@@ -95,7 +95,7 @@ def draw_sweep(result: StudyResult) -> Figure:
 
 
 def _error_range(result: StudyResult) -> tuple[float, float]:
-    """Return a range [m] that shows all medians; bars of settings where a run went astray are cut at the frame."""
+    """Return a range [m] that shows all medians; bars of settings where a run diverged are cut at the frame."""
     medians = [level["metrics"][f"error_{icr}_m"]["p50"] for level in result.levels for icr in ICR_NAMES]
     finite = [value for value in medians if np.isfinite(value)]
     reach = max(LEAST_RANGE_M, float(np.ptp([*finite, 0.0])))

@@ -26,7 +26,7 @@ CASE_DASHES = {"model": "-", "paper": (0, (6, 2)), "field": (0, (6, 1.5, 1.2, 1.
 
 
 def draw_initial(result: StudyResult) -> Figure:
-    """Draw, by guard, what became of every start, and y_icr_right over time from starts along one column."""
+    """Draw, by guard, the outcome of every start, and y_icr_right over time from starts along one column."""
     curves, starts = result.curves, result.curves["starts"]
     request = result.request
     figure = new_figure(

@@ -149,7 +149,7 @@ def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tup
 def _with_std(value: float, std: float) -> str:
     if std == 0.0:
         return f"{value:.3f}, not estimated"
-    return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f} ± less than 0.001"
+    return f"{value:.3f} ± {std:.3f}" if std >= SMALLEST_SHOWN else f"{value:.3f}, σ below 0.001"
 
 
 def _export(calibration: Calibration | None) -> str:

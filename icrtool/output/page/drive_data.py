@@ -257,7 +257,13 @@ def _compared(
         return
     kind = ladder["heading"] or ""
     recording = recording_of(kind)
-    windows, path_turned = cache(partial(cut_windows, recording)), cache(partial(turned_path, run, recording))
+    windows = cache(partial(cut_windows, recording))
+
+    @cache
+    def path_turned() -> tuple[Floats, Complexes]:
+        heading, place = turned_path(run, recording)
+        return heading[rows], place[rows]
+
     for row in ladder["models"]:
         name, turned = row["name"], row["heading"] != "wheels"
         base = name.removesuffix(f"_{kind}") if turned else name
@@ -271,8 +277,7 @@ def _compared(
                 yield Path(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
             else:
                 icrs = None if base == "icr" else _last_icrs(run)
-                heading, place = path_turned()
-                yield Path(name, row["label"], heading[rows], place[rows], icrs)
+                yield Path(name, row["label"], *path_turned(), icrs)
 
 
 def _fitted(ladder: Mapping[str, Any], row: str, *, turned: bool) -> FittedModel:

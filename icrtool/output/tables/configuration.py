@@ -39,7 +39,7 @@ def format_configuration(config: Config) -> str:
 
 
 def _toml(value: object) -> str:
-    """Return a value of the configuration as TOML: what JSON has is the same there, but for the escapes of a text."""
+    """Return a value of the configuration as TOML: JSON values are the same there, except the escapes of a text."""
     if isinstance(value, list):
         return f"[{', '.join(_toml(item) for item in value)}]"
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e6:
