@@ -23,7 +23,7 @@ from icrtool.estimation.fit import fit
 from icrtool.fleet.recordings import find_recordings
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
-from icrtool.motion.models import CONTROLLER, MODELS
+from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
 from icrtool.output.run_directory import RUN_FILE, is_run_directory
@@ -70,7 +70,7 @@ def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
     horizons = [f"{horizon:g} m" for horizon in wheels.horizons_m]
     yield "| model | " + " | ".join([*horizons, *(f"{one}, with gyro" for one in horizons)]) + " |"
     yield "|---|" + "---|" * (2 * len(horizons))
-    for name in (*MODELS, "recommended", CONTROLLER.name):
+    for name in (*MODELS, "recommended"):
         with_gyro = name if name == "recommended" else f"{name}_gyro"
         row = [*cells(wheels, name), *cells(gyro, with_gyro)]
         yield f"| `{name}` | " + " | ".join(row) + " |"

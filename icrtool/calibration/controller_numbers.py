@@ -60,7 +60,7 @@ def factor_to_old(calibration: Calibration) -> float | None:
 
 
 def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> ControllerErrors | None:
-    """Return the errors of what a controller can express of the models chosen without each fold, in that fold.
+    """Return the errors of what a controller can express, fitted without each fold, in that fold.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
         twist_variance=_variances(near[:, :3] / near[:, 3:4]),
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
-        p95_m=float(table.score(CONTROLLER.name).together.p95[h]),
+        p95_m=float(table.score(CONTROLLER).together.p95[h]),
         full_p95_m=float(table.score("recommended").together.p95[h]),
     )
 

@@ -72,5 +72,5 @@ def recommendation(run: Run) -> RecommendedDocument | None:
     except DataError:
         return None
     robot = robot_of(run) | {"track_width_m": recording.width_m}
-    document = {"label": found.fit.model.label, "why": found.why} | fitted_document(found.fit, robot, found.typical)
-    return cast("RecommendedDocument", document)
+    plain = fitted_document(found.fit, found.controller, robot, found.typical)
+    return cast("RecommendedDocument", {"label": found.fit.model.label, "why": found.why} | plain)

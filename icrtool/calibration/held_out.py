@@ -77,8 +77,7 @@ class HeldOut:
     ----------
     folds : recordings or, of a single one, blocks: models are chosen, and errors are listed, by fold
     trials : by recording, those of the table
-    scores : by model, in the order of the family, then what was recommended without each fold and, for wheels alone,
-        what a controller makes of that
+    scores : by model, in the order of the family, then what was recommended without each fold
     fits : of everything, by model name
     typical : curvature and speed at which ICRs and multiplier are stated
     recommended : name of the model chosen with all folds
@@ -105,13 +104,12 @@ class HeldOut:
         return self.fits[self.chosen[fold.number]].without(fold)
 
     def expressed(self, fold: Fold) -> Prediction | None:
-        """Return what a controller can express of what is recommended without a fold."""
-        fit = self.fits[self.chosen[fold.number]]
+        """Return what a controller drives with the numbers fitted without a fold."""
+        fit = self.fits[CONTROLLER]
         if (found := fit.without(fold)) is None:
             return None
         fitted, own = found
-        width_m = fit.pool.widths_m[fold.recording]
-        return controller_model(track_geometry(fitted.model, fitted.parameters, width_m, self.typical)), own
+        return controller_model(track_geometry(fitted.model, fitted.parameters, fit.pool.widths_m[fold.recording])), own
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
@@ -230,11 +228,13 @@ class Recommendation(NamedTuple):
 
     Attributes
     ----------
+    controller : what a controller can express, fitted to the same
     why : the reason, one sentence
     typical : curvature and speed at which ICRs and multiplier are stated
     """
 
     fit: PooledFit
+    controller: PooledFit
     why: str
     typical: TypicalDrive
 
@@ -251,8 +251,8 @@ def recommend(recordings: Sequence[Recording]) -> Recommendation:
     with ThreadPoolExecutor(AT_ONCE) as threads:
         fits = list(threads.map(tester.pool.fit, MODELS.values()))
     choice = tester.choose(fits)
-    best = next(fit for fit in fits if fit.model.name == choice.recommended)
-    return Recommendation(best, choice.why, tester.typical)
+    by_name = {fit.model.name: fit for fit in fits}
+    return Recommendation(by_name[choice.recommended], by_name[CONTROLLER], choice.why, tester.typical)
 
 
 class _Tested(NamedTuple):
@@ -295,8 +295,10 @@ class _Tester:
 
     def choose(self, fits: Sequence[PooledFit]) -> Choice:
         """Choose a model by the windows of each fold, and without each fold."""
-        inner = {fit.model.name: self._inner_errors(fit) for fit in fits}
-        sizes = {fit.model.name: len(fit.parameters) for fit in fits}
+        # what a controller can express has no x ICR: it is exported, not recommended
+        able = [fit for fit in fits if fit.model.name != CONTROLLER]
+        inner = {fit.model.name: self._inner_errors(fit) for fit in able}
+        sizes = {fit.model.name: len(fit.parameters) for fit in able}
         return nested_choice(inner, sizes)
 
     def _inner_errors(self, fit: PooledFit) -> Floats:
@@ -325,8 +327,8 @@ class _Tester:
             self._horizons_m, self._folds, tuple(self._tried(chosen)), (), fits, self.typical, choice.recommended,
             choice.chosen, choice.why,
         )  # fmt: skip
-        if not tested[0].fit.model.uses_gyro:
-            rows.append((CONTROLLER.name, CONTROLLER.label, self.errors(found.expressed)))
+        if CONTROLLER in fits:
+            rows = [(n, label, self.errors(found.expressed) if n == CONTROLLER else one) for n, label, one in rows]
         scores = []
         for name, label, errors in rows:
             by_fold = tuple(error_summary(errors[fold_of == f]) for f in range(len(self._folds)))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.motion.models import FittedModel, TrackGeometry, TypicalDrive, wheel_motion
+from icrtool.motion.models import CONTROLLER, FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart
@@ -71,7 +71,7 @@ class ControllerNumbers(NamedTuple):
 
 
 class ControllerErrors(NamedTuple):
-    """Errors of what a controller can express of the recommended model, on distance it was not fitted to.
+    """Errors of what a controller can express, on distance it was not fitted to.
 
     Attributes
     ----------
@@ -175,11 +175,12 @@ class Calibration:
         return float(self.robot["track_width_m"])
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs [m], multipliers and radius factors of the recommended model, and their covariance (7, 7)."""
-        return self.fitted.geometry(self.width_m, self.typical)
+        """Return ICRs [m] of the recommended model, multipliers and radius factors, and their covariance (7, 7)."""
+        # older files have no model of a controller
+        return self.fitted.geometry(self.width_m, self.typical, self.others.get(CONTROLLER))
 
     def controller_numbers(self) -> ControllerNumbers:
-        """Return multiplier and radius factors of the recommended model for a controller."""
+        """Return multiplier and radius factors for a controller, fitted to what it can express."""
         return _controller_numbers(*self.geometry(), self.robot)
 
     def log_names(self) -> str:
@@ -271,7 +272,7 @@ class Calibration:
             "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
             "recommended": self.recommended,
             "why": self.why,
-            **fitted_document(self.fitted, self.robot, self.typical),
+            **fitted_document(self.fitted, self.others.get(CONTROLLER), self.robot, self.typical),
             "gyro": None
             if self.gyro is None
             else {"model": self.gyro.model.name, **_plain(self.gyro), "error_sources": _sources(self.gyro_sources)},
@@ -286,9 +287,11 @@ class Calibration:
         }
 
 
-def fitted_document(fitted: FittedModel, robot: Mapping[str, Any], typical: TypicalDrive) -> dict[str, Any]:
+def fitted_document(
+    fitted: FittedModel, controller: FittedModel | None, robot: Mapping[str, Any], typical: TypicalDrive
+) -> dict[str, Any]:
     """Return plain data of a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
-    geometry, covariance = fitted.geometry(float(robot["track_width_m"]), typical)
+    geometry, covariance = fitted.geometry(float(robot["track_width_m"]), typical, controller)
     return {
         "model": fitted.model.name,
         **_plain(fitted),

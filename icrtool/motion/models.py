@@ -133,6 +133,9 @@ class MotionModel:
         return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*moves, *GYRO_TERMS), self.source)
 
 
+CONTROLLER = "controller"
+"""Fitted to what a differential-drive controller can express: multiplier and radius factors follow from it."""
+
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
 _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
 
@@ -145,6 +148,12 @@ MODELS: dict[str, MotionModel] = {
         ),
         MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
         MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
+        MotionModel(
+            CONTROLLER,
+            "separation and radii",
+            ("vx_v", "omega_w", "omega_v"),
+            "diff_drive_controller of ros2_controllers",
+        ),
         MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
         MotionModel("six", "ICRs, scales, side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
         MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains that depend on curvature and speed"),
@@ -203,6 +212,10 @@ class TrackGeometry(NamedTuple):
     multiplier_nominal: float
     radius_left: float
     radius_right: float
+
+
+ICRS = 3
+"""So many values of a `TrackGeometry`, the first, are ICRs."""
 
 
 class TypicalDrive(NamedTuple):
@@ -342,8 +355,21 @@ class FittedModel:
         """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
         return twist(self.model, self.parameters, self.complete(motion))
 
-    def geometry(self, width_m: float, typical: TypicalDrive) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs, multipliers and radius factors, and their covariance (7, 7)."""
+    def geometry(
+        self, width_m: float, typical: TypicalDrive, controller: FittedModel | None = None
+    ) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs, multipliers and radius factors, and their covariance (7, 7).
+
+        Parameters
+        ----------
+        controller : of the same windows, whose multipliers and radius factors are given; default this one's
+        """
+        if controller is not None:
+            icrs, of_icrs = self.geometry(width_m, typical)
+            numbers, whole = controller.geometry(width_m, typical)
+            whole[:ICRS, :ICRS] = of_icrs[:ICRS, :ICRS]
+            whole[:ICRS, ICRS:] = whole[ICRS:, :ICRS] = 0.0
+            return TrackGeometry(*icrs[:ICRS], *numbers[ICRS:]), whole
         at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
         by_parameter = np.zeros((len(at), len(self.parameters)))
         for k in range(len(self.parameters)):
@@ -354,15 +380,8 @@ class FittedModel:
         return TrackGeometry(*at.tolist()), covariance
 
 
-CONTROLLER = MotionModel(
-    "controller", "separation and radii", ("vx_v", "vx_w", "omega_w", "omega_v"),
-    "diff_drive_controller of ros2_controllers",
-)  # fmt: skip
-"""What a differential-drive controller can express; it follows from another model's geometry and is never fitted."""
-
-
 def controller_model(geometry: TrackGeometry) -> FittedModel:
-    """Return `CONTROLLER` with the multiplier and radius factors of a geometry.
+    """Return what a differential-drive controller with the multiplier and radius factors of a geometry drives.
 
     Notes
     -----
@@ -370,7 +389,7 @@ def controller_model(geometry: TrackGeometry) -> FittedModel:
     """
     left, right, m = geometry.radius_left, geometry.radius_right, geometry.multiplier
     values = [(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m]
-    return FittedModel(CONTROLLER, np.array(values), np.zeros((4, 4)))
+    return FittedModel(MotionModel("", "", _FIVE[:4], ""), np.array(values), np.zeros((4, 4)))
 
 
 def find_model(name: str) -> MotionModel:

@@ -103,7 +103,7 @@ def headline(report: DropoutReport) -> list[str]:
     interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
     model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
-    alone = controller_error_text(calibration.controller)
+    alone = controller_error_text(calibration.controller) if len(fitted.parameters) else ""
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
         f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",

@@ -128,13 +128,12 @@ def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration)
 
 def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -> None:
     """The twist of a diff_drive_controller with the exported numbers, written out, is that of the tested model."""
-    geometry, _ = calibration.geometry()
     numbers = calibration.controller_numbers()
     v_left, v_right, b = 0.4, 1.1, calibration.width_m
     left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
-    assert controller_model(geometry).twist(motion)[:, 0] == pytest.approx(expected)
+    assert controller_model(calibration.geometry()[0]).twist(motion)[:, 0] == pytest.approx(expected)
 
 
 def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:
