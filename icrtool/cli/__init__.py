@@ -27,7 +27,7 @@ def main() -> None:
 
         resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
     try:
-        with end_in_order(main.__code__):
+        with end_in_order(main.__code__) as ending:
             from icrtool.cli.standard_streams import standard_streams
 
             with standard_streams() as output:
@@ -35,6 +35,11 @@ def main() -> None:
                 if output.lost:
                     sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
                     status = status or 1
+            if ending.ended:
+                # The interpreter's own end takes up to a second more, in which no thread watches the time.
+                with suppress(OSError, ValueError):
+                    sys.stdout.flush()
+                os._exit(status)
     except KeyboardInterrupt:
         # During imports, or while a last message is printed.
         status = INTERRUPTED

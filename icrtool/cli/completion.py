@@ -96,7 +96,11 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def _topics(logs: object) -> tuple[str, ...]:
-    """Return the topics of the logs that were named before, as far as they can be read."""
+    """Return the topics of the logs that were named before, as far as they can be read and are names of ROS.
+
+    Bash puts a completion into the line without quoting it: no other text of a log must come there.
+    """
+    import re
     from pathlib import Path
 
     from icrtool.errors import IcrToolError
@@ -108,6 +112,6 @@ def _topics(logs: object) -> tuple[str, ...]:
             container = open_log(Path(log))
         except IcrToolError:
             continue
-        topics |= {str(channel.topic) for channel in container.channels}
+        topics |= {str(one.topic) for one in container.channels if re.fullmatch(r"[\w/~.-]+", one.topic, re.ASCII)}
         container.close()
     return tuple(sorted(topics))

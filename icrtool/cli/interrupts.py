@@ -32,7 +32,7 @@ OVER = 0
 
 
 @contextmanager
-def end_in_order(boundary: CodeType) -> Iterator[None]:
+def end_in_order(boundary: CodeType) -> Iterator[Ending]:
     """Have SIGINT raise KeyboardInterrupt and SIGTERM leave with `TERMINATED`, at the latest after `GRACE_S`.
 
     Where a module is being loaded, the process ends after that time. The limit holds until the process ends: at its
@@ -42,22 +42,22 @@ def end_in_order(boundary: CodeType) -> Iterator[None]:
     ----------
     boundary : code of the function that catches both; what is loaded further out is no matter
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     watched = hasattr(signal, "pthread_sigmask")  # not on Windows
-    ending = _Ending(boundary, watched=watched)
+    ending = Ending(boundary, watched=watched)
+    if threading.current_thread() is not threading.main_thread():
+        yield ending
+        return
     # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
     handled = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
     for number in handled:
         signal.signal(number, ending.come)
     if not watched:
-        yield
+        yield ending
         return
     with _watched(ending):
         before, sys.unraisablehook = sys.unraisablehook, _without_ends
         try:
-            yield
+            yield ending
         finally:
             sys.unraisablehook = before
             for number in handled:
@@ -65,7 +65,7 @@ def end_in_order(boundary: CodeType) -> Iterator[None]:
 
 
 @contextmanager
-def _watched(ending: _Ending) -> Iterator[None]:
+def _watched(ending: Ending) -> Iterator[None]:
     """End the process `GRACE_S` after a signal that came in the block, if it still is there."""
     arrived, signalled = os.pipe()
     os.set_blocking(signalled, False)
@@ -112,7 +112,7 @@ def end_by_force(status: int) -> None:
     os._exit(status)
 
 
-class _Ending:
+class Ending:
     """The end of a command, once a signal has asked for it; `ended`: its exception was raised."""
 
     def __init__(self, boundary: CodeType, *, watched: bool) -> None:

@@ -11,7 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
+from icrtool.cli.completion import _topics
 from icrtool.cli.stages import Stages, signal_word
 from icrtool.config import builtin_robots, load_config
 
@@ -157,6 +159,19 @@ def test_bash_completes_names_keys_and_topics(command: Path, words: list[str], c
     """
     done = subprocess.run([bash, "-c", script], capture_output=True, text=True, check=False, env=dict(os.environ))
     assert set(done.stdout.split()) == completed
+
+
+def test_only_names_of_ros_are_completed(tmp_path: Path) -> None:
+    """Bash does not quote what it puts into the line."""
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data")
+        for topic in ("/a;reboot", "/$(reboot)", "/two words", "/`id`", "/robot_1/gps/fix", "/\x1b[2J"):
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, 1, bytes(12), 1)
+        writer.finish()
+    assert _topics([tmp_path / "log.mcap"]) == ("/robot_1/gps/fix",)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
