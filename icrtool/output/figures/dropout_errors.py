@@ -45,6 +45,9 @@ the ICRs. The share of trials beyond it is written at its end."""
 
 MOSTLY_BEYOND_PCT = 90.0
 
+SHORT_NAMES, KEY_IN = 4, 0.19
+"""So many models have short names in the legend; height of a row of it."""
+
 
 @styled
 def dropout_summary(report: DropoutReport) -> Figure:
@@ -56,12 +59,15 @@ def dropout_summary(report: DropoutReport) -> Figure:
         f"Open-loop error over distance without GNSS, up to {int(report.counts.trials.max()):,} trials a distance"
     )
     apart = _flattened(report)
+    models = ("icr", "no_slip", *_constant_models(report), "icr_final")
+    # names of calibrations are long
+    columns = 4 if len(models) <= SHORT_NAMES else 3
+    more_in = KEY_IN * max(2 * len(models) // columns - 2, 0)
     figure = new_figure(
-        run_title(report.run_summary), subtitle + ("; right: no slip left out" if apart else ""), height_in=4.7,
-        margins_in=(0.7, 0.2, 0.65, 1.15), wspace=0.28,
+        run_title(report.run_summary), subtitle + ("; right: no slip left out" if apart else ""),
+        height_in=4.7 + more_in, margins_in=(0.7, 0.2, 0.65, 1.15 + more_in), wspace=0.28,
     )  # fmt: skip
     panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
-    models = ("icr", "no_slip", *_constant_models(report), "icr_final")
     outages = [one for one in report.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
     for axes, without in zip(panels, ("", "no_slip"), strict=False):
         for name in models:
@@ -78,7 +84,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
         axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
         axes.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]")
     keys = [*panels[0].get_legend_handles_labels()[0], Patch(color="0.8", linewidth=0, label="95 % interval")]
-    figure.legend(handles=keys, ncols=4, columnspacing=1.6)
+    figure.legend(handles=keys, ncols=columns, columnspacing=1.6)
     return figure
 
 
