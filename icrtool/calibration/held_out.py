@@ -18,8 +18,8 @@ import numpy as np
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import error_summary
-from icrtool.kernels.trials import Summary
+from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.trials import Summary
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import (
     CONTROLLER,

@@ -21,7 +21,7 @@ from icrtool.motion.fit import Pool, own_constants
 from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path
-from icrtool.output.calibration_file import open_calibration, write_calibration
+from icrtool.output.files.calibration_file import open_calibration, write_calibration
 from icrtool.output.tables.held_out import format_result
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors

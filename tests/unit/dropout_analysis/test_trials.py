@@ -17,8 +17,8 @@ from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.starts import first_learned
 from icrtool.dropout_analysis.trials import Model, dropout, models_of
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.kernels.trials import FrozenIcrs
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.records.run import ICR_COLUMNS, Run, drive_of
 
 EQUAL_M = 1e-9
