@@ -298,8 +298,7 @@ class _Tester:
         # what a controller can express has no x ICR: it is exported, not recommended
         able = [fit for fit in fits if fit.model.name != CONTROLLER]
         inner = {fit.model.name: self._inner_errors(fit) for fit in able}
-        sizes = {fit.model.name: len(fit.parameters) for fit in able}
-        return nested_choice(inner, sizes)
+        return nested_choice(inner)
 
     def _inner_errors(self, fit: PooledFit) -> Floats:
         """Return the expected error [m] (folds, folds) of the windows of fold g, fitted without f and g."""
