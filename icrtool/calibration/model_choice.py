@@ -57,7 +57,7 @@ def choose(errors: Mapping[str, Floats], baseline: str) -> tuple[str, str]:
     Notes
     -----
     The mean is that of the logarithms, as some folds are harder than others for every model. Every term has a prior:
-    one that the drive does not show costs nothing, so that a simpler model is not preferred for its own sake.
+    one that the drive does not show costs little, so that a simpler model is not preferred for its own sake.
     """
     means = {
         name: np.log(np.maximum(values[np.isfinite(values)], 1e-9)).mean()
