@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
-from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)

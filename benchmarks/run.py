@@ -70,7 +70,7 @@ def filter_speed(logs: dict[str, Path], repeats: int) -> None:
     import icrtool
     from icrtool.alignment.align import sensors_as_sent
     from icrtool.estimation.filter_setup import set_up_filter
-    from icrtool.kernels.ekf import run_ekf
+    from icrtool.kernels.filter.ekf import run_ekf
 
     config = icrtool.load_config(robot="segway-rmp400")
     setup = set_up_filter(sensors_as_sent(icrtool.read_log(logs["hour.mcap"], config), config), config)

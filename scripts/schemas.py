@@ -18,7 +18,7 @@ from icrtool.calibration.record import CalibrationLog, ControllerErrors, Control
 from icrtool.calibration.transfer import Difference
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
-from icrtool.kernels.block_sums import BlockSums
+from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.motion.models import TrackGeometry, TypicalDrive
 from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
 from icrtool.records.run_document import DriveDocument, IcrDocument, InputDocument, RunDocument

@@ -24,7 +24,7 @@ from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import File, Row
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.tables.forecast import forecast_document
 from icrtool.output.tables.transfer import transfer_document
 from icrtool.records.dropout import Verdict

@@ -10,12 +10,12 @@ import numpy as np
 
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.gnss_quality import GnssQuality, grade_fixes
-from icrtool.alignment.sensor_noise import heading_variance, position_variance
-from icrtool.alignment.slip_events import find_slip_events
+from icrtool.alignment.position.gnss_quality import GnssQuality, grade_fixes
+from icrtool.alignment.position.sensor_noise import heading_variance, position_variance
+from icrtool.alignment.slip.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.wheel_alignment import bridged
-from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheels.wheel_alignment import bridged
+from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.measurements import Fixes, Measurements, SensorData

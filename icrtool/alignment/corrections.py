@@ -20,8 +20,7 @@ from icrtool.alignment.conventions import (
 )
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
-from icrtool.alignment.gnss_steps import FixSteps, measure_steps
-from icrtool.alignment.heading_alignment import (
+from icrtool.alignment.heading.heading_alignment import (
     FEWEST_WINDOWS,
     OPPOSITE_SENSE,
     HeadingAlignment,
@@ -31,10 +30,17 @@ from icrtool.alignment.heading_alignment import (
     refuse_stuck,
     refuse_unexplained,
 )
-from icrtool.alignment.heading_choice import DerivedHeading, as_turn_rate, derive_heading, fuse_heading, stated_source
+from icrtool.alignment.heading.heading_choice import (
+    DerivedHeading,
+    as_turn_rate,
+    derive_heading,
+    fuse_heading,
+    stated_source,
+)
+from icrtool.alignment.position.gnss_steps import FixSteps, measure_steps
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.stream_delays import StreamDelays, find_delays
-from icrtool.alignment.wheel_alignment import (
+from icrtool.alignment.wheels.wheel_alignment import (
     WheelAlignment,
     align_wheels,
     configured_scales,
@@ -42,7 +48,7 @@ from icrtool.alignment.wheel_alignment import (
     refuse_standing,
     scaled,
 )
-from icrtool.alignment.wheel_units import refuse_parked
+from icrtool.alignment.wheels.wheel_units import refuse_parked
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.run import half_width_m

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.gnss_steps import bend_std_m, unbroken
+from icrtool.alignment.position.gnss_steps import bend_std_m, unbroken
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.records.measurements import Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples

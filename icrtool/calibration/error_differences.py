@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import error_summary
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.trials import Drive
 
 RESAMPLES, LEVEL = 300, 0.95
 

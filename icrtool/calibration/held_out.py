@@ -18,8 +18,8 @@ import numpy as np
 from icrtool.calibration.model_choice import FEWEST_TO_CHOOSE, Choice, nested_choice
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import error_summary
-from icrtool.kernels.trials import Summary
+from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.trials import Summary
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import (
     CONTROLLER,
@@ -298,8 +298,7 @@ class _Tester:
         # what a controller can express has no x ICR: it is exported, not recommended
         able = [fit for fit in fits if fit.model.name != CONTROLLER]
         inner = {fit.model.name: self._inner_errors(fit) for fit in able}
-        sizes = {fit.model.name: len(fit.parameters) for fit in able}
-        return nested_choice(inner, sizes)
+        return nested_choice(inner)
 
     def _inner_errors(self, fit: PooledFit) -> Floats:
         """Return the expected error [m] (folds, folds) of the windows of fold g, fitted without f and g."""

@@ -24,10 +24,10 @@ from icrtool.calibration.pooled import (
 )
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.error_statistics import error_summary
-from icrtool.kernels.open_loop import STARTS_A_CALL
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive, FrozenIcrs, Summary
+from icrtool.kernels.open_loop.direct import STARTS_A_CALL
+from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Summary
 from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials

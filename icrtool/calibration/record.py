@@ -251,7 +251,7 @@ class Calibration:
         OutputError
             Something that is not a calibration is there, or it cannot be written.
         """
-        file: Path = call_output("calibration_file", "write_calibration", self.summary(), Path(path))
+        file: Path = call_output("files.calibration_file", "write_calibration", self.summary(), Path(path))
         return file
 
     def __repr__(self) -> str:

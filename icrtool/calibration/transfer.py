@@ -28,7 +28,7 @@ from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, hel
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import bootstrap_intervals, cut_blocks, error_summary
+from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials

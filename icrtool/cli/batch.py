@@ -110,7 +110,7 @@ def write_exports(
     rows: Sequence[Row], missing: Sequence[str], page: Path | None, *, junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
-    from icrtool.output.atomic_file import write_file
+    from icrtool.output.files.atomic_file import write_file
 
     if junit is not None:
         from icrtool.fleet.acceptance import suites_of

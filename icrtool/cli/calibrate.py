@@ -46,8 +46,8 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import IcrToolError
-    from icrtool.output.calibration_file import calibration_file, write_calibration
-    from icrtool.output.picture_file import check_picture
+    from icrtool.output.files.calibration_file import calibration_file, write_calibration
+    from icrtool.output.files.picture_file import check_picture
     from icrtool.output.tables.calibration import format_calibration
     from icrtool.output.tables.held_out import format_result
 
@@ -119,11 +119,11 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
     from icrtool.alignment.corrections import align_streams
     from icrtool.alignment.estimator import window_residuals
-    from icrtool.alignment.reference_choice import choose_reference
-    from icrtool.alignment.wheel_units import with_wheel_speeds
+    from icrtool.alignment.position.reference_choice import choose_reference
+    from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibration import residuals_figure
-    from icrtool.output.picture_file import save_picture
+    from icrtool.output.files.picture_file import save_picture
     from icrtool.output.stored_run import log_of
 
     log = read_log(source if run.directory is None else log_of(run), run.config)

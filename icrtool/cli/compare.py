@@ -48,9 +48,9 @@ def command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
-    from icrtool.output.atomic_file import check_place, write_file
-    from icrtool.output.json_file import json_bytes
-    from icrtool.output.picture_file import check_picture, save_picture
+    from icrtool.output.files.atomic_file import check_place, write_file
+    from icrtool.output.files.json_file import json_bytes
+    from icrtool.output.files.picture_file import check_picture, save_picture
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)

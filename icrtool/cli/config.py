@@ -29,7 +29,7 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.atomic_file import check_place, write_file
+    from icrtool.output.files.atomic_file import check_place, write_file
 
     check_place(output)
     write_file(output, text)

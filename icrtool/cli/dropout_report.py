@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.fleet.fit_and_report import ReportOptions
-    from icrtool.output.baseline_file import Baseline
     from icrtool.output.exports.acceptance import Outcome
+    from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.run import Run
 
 EPILOG_GATE = (
@@ -100,7 +100,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     lengths = parse_horizons(horizons) if horizons is not None else ()
     config = options.load(config_file, robot, sets)
-    from icrtool.output.calibration_file import open_calibration
+    from icrtool.output.files.calibration_file import open_calibration
 
     further = {
         "calibrations": tuple(open_calibration(file) for file in calibrations), "outage_at_s": outages_at,
@@ -233,7 +233,7 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
                 click.echo(verdict.line(), err=True)
     if request.verbose:
         from icrtool.dropout_analysis.trials import BOOTSTRAP_RESAMPLES
-        from icrtool.kernels.open_loop_fast import TOLERANCE_M
+        from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 
         blocks = "moving blocks as long as the horizon"
         click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {report.seed}", err=True)

@@ -51,7 +51,7 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import check_place
+    from icrtool.output.files.atomic_file import check_place
 
     if target in TRAJECTORIES and output is not None and (output.is_dir() or not output.suffix):
         _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
@@ -92,7 +92,7 @@ def _leave(text: str, output: Path | None) -> None:
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.atomic_file import write_file
+    from icrtool.output.files.atomic_file import write_file
 
     write_file(output, text)
 
@@ -115,10 +115,10 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
-    from icrtool.output.atomic_file import atomic_file, check_place, write_file
     from icrtool.output.exports.foxglove import write_foxglove
     from icrtool.output.exports.foxglove_layout import foxglove_layout
-    from icrtool.output.json_file import json_bytes
+    from icrtool.output.files.atomic_file import atomic_file, check_place, write_file
+    from icrtool.output.files.json_file import json_bytes
 
     layout = output.with_name(f"{output.stem}.layout.json")
     check_place(layout)
@@ -156,7 +156,7 @@ def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibra
     from icrtool.output.stored_run import newest_run, open_run
 
     if source is not None and source.is_file() and source.suffix == ".json":
-        from icrtool.output.calibration_file import open_calibration
+        from icrtool.output.files.calibration_file import open_calibration
 
         return source.name, open_calibration(source)
     from icrtool.calibration.from_runs import calibrate

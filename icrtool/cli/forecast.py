@@ -42,9 +42,9 @@ def command(
       icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.atomic_file import check_place, write_file
-    from icrtool.output.calibration_file import open_calibration
-    from icrtool.output.picture_file import check_picture, save_picture
+    from icrtool.output.files.atomic_file import check_place, write_file
+    from icrtool.output.files.calibration_file import open_calibration
+    from icrtool.output.files.picture_file import check_picture, save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
     if output is not None:

@@ -25,7 +25,7 @@ def print_json(command: str, document: Mapping[str, Any]) -> None:
     document : plain data and numpy's; numbers that are not finite become null
     """
     from icrtool import __version__
-    from icrtool.output.json_file import json_bytes
+    from icrtool.output.files.json_file import json_bytes
 
     own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
     click.echo(json_bytes(own | {key: value for key, value in document.items() if key not in own}), nl=False)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
-    from icrtool.output.baseline_file import Baseline
+    from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -122,7 +122,7 @@ def report(command: Command) -> Command:
         page: bool, junit: Path | None, markdown: Path | None, **others: object,
     ) -> object:  # fmt: skip
         from icrtool.fleet.fit_and_report import ReportOptions
-        from icrtool.output.atomic_file import check_place
+        from icrtool.output.files.atomic_file import check_place
 
         for file in (junit, markdown):
             if file is not None:
@@ -158,7 +158,7 @@ def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
 
     relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]
     if place is not None:
-        from icrtool.output.baseline_file import open_baseline
+        from icrtool.output.files.baseline_file import open_baseline
 
         return open_baseline(place)
     if relative:

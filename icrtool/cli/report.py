@@ -32,7 +32,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
       icrtool report results/
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import ConfigError
-    from icrtool.output.atomic_file import check_place
+    from icrtool.output.files.atomic_file import check_place
     from icrtool.output.stored_run import newest_run
 
     sources = sources or (newest_run(RUNS),)
@@ -57,8 +57,8 @@ def _write(source: Path, place: Path, *, coordinates: bool) -> None:
     import json
 
     from icrtool.errors import RunError
-    from icrtool.output.atomic_file import write_file
-    from icrtool.output.json_file import FLEET_FILE, schema_of
+    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.json_file import FLEET_FILE, schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
     from icrtool.output.page.fleet_page import FLEET_FAMILY, fleet_page
     from icrtool.output.run_directory import is_run_directory

@@ -86,7 +86,7 @@ def command(
     plan, sensors = _plan(config, given), _sensors(config, given)
     writing = _write_options(log, config, sensors, given)
     from icrtool.logs.writing.log import write_log
-    from icrtool.output.truth_file import log_and_truth, truth_path, write_truth
+    from icrtool.output.files.truth_file import log_and_truth, truth_path, write_truth
     from icrtool.simulation.record import simulate
 
     with log_and_truth(log, force=given["force"]) as (fresh_log, fresh_truth):
@@ -131,7 +131,7 @@ def _plan(config: Config, given: dict[str, Any]) -> DrivePlan:
     path: Any = PathPlan(**given_fields(PathPlan, given))
     duration = given["duration_s"]
     if given["speeds"] is not None:
-        from icrtool.output.truth_file import read_speeds
+        from icrtool.output.files.truth_file import read_speeds
 
         path = read_speeds(given["speeds"])
         duration = duration if duration is not None else float(path.t_s[-1])

@@ -13,8 +13,8 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.block_sums import BlockSums
-from icrtool.kernels.trials import Summary
+from icrtool.kernels.open_loop.block_sums import BlockSums
+from icrtool.kernels.open_loop.trials import Summary
 from icrtool.records.dropout import BudgetDistance, Gate, Verdict
 from icrtool.records.plain_data import plain
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import ConfigError
-from icrtool.kernels.block_sums import BlockSums, variance_of_sum
+from icrtool.kernels.open_loop.block_sums import BlockSums, variance_of_sum
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
 

@@ -7,9 +7,9 @@ import numpy as np
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.direct import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import ExampleTrial
 from icrtool.records.run import Run, drive_of
 

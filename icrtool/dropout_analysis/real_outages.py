@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop import open_loop_path
-from icrtool.kernels.trials import OpenLoopPath
+from icrtool.kernels.open_loop.direct import open_loop_path
+from icrtool.kernels.open_loop.trials import OpenLoopPath
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, drive_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import ReferenceErrors
 from icrtool.records.run import Run
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.trials import TrialCounts
+from icrtool.kernels.open_loop.trials import TrialCounts
 from icrtool.records.dropout import (
     BudgetDistance,
     EventCost,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.open_loop import STANDING
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.direct import STANDING
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, Run
 
 Starts = Literal["moving", "all"]
@@ -34,7 +34,7 @@ def standing_states(drive: Drive) -> Bools:
 
 
 def leave_out_standing(ends: NDArray[np.signedinteger], standing: Bools) -> None:
-    """Mark the trials of standing starts in the ends (n, h) of `icrtool.kernels.open_loop.trial_ends` as none."""
+    """Mark the trials of standing starts as none, in the ends (n, h) of `trial_ends`."""
     ends[standing[:, None] & (ends >= 0)] = STANDING
 
 

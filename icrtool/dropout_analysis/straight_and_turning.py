@@ -10,9 +10,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop import trial_ends
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.direct import trial_ends
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import TurningSplit
 from icrtool.records.run import Run, drive_of
 

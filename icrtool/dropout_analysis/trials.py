@@ -15,8 +15,9 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.block_sums import block_sums
-from icrtool.kernels.error_statistics import (
+from icrtool.kernels.open_loop.block_sums import block_sums
+from icrtool.kernels.open_loop.direct import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop.error_statistics import (
     Blocks,
     bootstrap_intervals,
     cut_blocks,
@@ -26,9 +27,8 @@ from icrtool.kernels.error_statistics import (
     sort_trials,
     summary_of_sorted,
 )
-from icrtool.kernels.open_loop import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.run import Run, drive_of, straight_drive

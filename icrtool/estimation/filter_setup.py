@@ -12,8 +12,8 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.ekf import REFERENCE_STEP_S
-from icrtool.kernels.filter_records import FilterInputs, FilterParameters
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
+from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m

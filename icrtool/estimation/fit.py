@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from icrtool.alignment.align import align
-from icrtool.alignment.reference_choice import choose_reference
+from icrtool.alignment.position.reference_choice import choose_reference
 from icrtool.config import Config
 from icrtool.estimation import smooth as smoother
 from icrtool.estimation.run_filter import run_filter

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.ekf import REFERENCE_STEP_S
 from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
-from icrtool.kernels.trials import Drive
 from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
 from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.tables import States

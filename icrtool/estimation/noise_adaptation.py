@@ -10,9 +10,9 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.ekf import run_ekf
-from icrtool.kernels.filter_records import FilterOutput
-from icrtool.kernels.measurement_codes import UNSEEN
+from icrtool.kernels.filter.ekf import run_ekf
+from icrtool.kernels.filter.filter_records import FilterOutput
+from icrtool.kernels.filter.measurement_codes import UNSEEN
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
 

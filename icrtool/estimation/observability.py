@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.estimation.icr_uncertainty import DriveWindows, prior_std
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
 from icrtool.records.run_document import Excited
 from icrtool.records.tables import States

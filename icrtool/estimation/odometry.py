@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.open_loop import open_loop_path
+from icrtool.kernels.open_loop.direct import open_loop_path
 from icrtool.records.run import Run, make_drive
 from icrtool.records.tables import States
 

@@ -20,8 +20,8 @@ from icrtool.estimation.filter_setup import (
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.ekf_step import PLACES
-from icrtool.kernels.filter_records import Codes, FilterOutput
+from icrtool.kernels.filter.ekf_step import PLACES
+from icrtool.kernels.filter.filter_records import Codes, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.samples import WheelSamples

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
+from icrtool.alignment.wheels.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
 from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.measurement_codes import UNSEEN
+from icrtool.kernels.filter.measurement_codes import UNSEEN
 from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import States

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.alignment.gnss_quality import CLASSES
+from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
@@ -19,8 +19,8 @@ from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
+from icrtool.kernels.filter.measurement_codes import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.measurement_codes import RECOVERED
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain

@@ -13,9 +13,9 @@ import msgspec
 from icrtool import __version__
 from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
 from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
-from icrtool.output.atomic_file import atomic_file, write_file
-from icrtool.output.csv_file import csv_bytes
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.atomic_file import atomic_file, write_file
+from icrtool.output.files.csv_file import csv_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText, counted, escaped
 
@@ -98,7 +98,7 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
     """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed."""
     from icrtool.output.figure_catalogue import FIGURES, figures_of
     from icrtool.output.figures.fleet import FleetNumbers, IcrPoint
-    from icrtool.output.picture_file import save_picture
+    from icrtool.output.files.picture_file import save_picture
 
     points: list[IcrPoint] = []
     errors: dict[str, list[float]] = {}

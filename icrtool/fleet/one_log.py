@@ -74,7 +74,7 @@ def process(request: Request, stage: Stage) -> Row:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.atomic_file import write_file
+    from icrtool.output.files.atomic_file import write_file
 
     begun = time.monotonic()
     try:
@@ -116,7 +116,7 @@ def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File,
 
 def _results(request: Request, stage: Stage) -> Row:
     """Fit and analyse a log, write run and report."""
-    from icrtool.output.baseline_file import open_baseline
+    from icrtool.output.files.baseline_file import open_baseline
 
     directory, place = path_of(request.directory), path_of(request.baseline) if request.baseline else None
     run = fit_and_write(

@@ -17,8 +17,8 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.fleet.row import Row
-from icrtool.output.atomic_file import write_file
-from icrtool.output.json_file import FLEET_FILE, json_bytes, logs_of_fleet
+from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.json_file import FLEET_FILE, json_bytes, logs_of_fleet
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"

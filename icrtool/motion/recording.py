@@ -11,8 +11,8 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.open_loop import ends_from
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.direct import ends_from
+from icrtool.kernels.open_loop.trials import Drive
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop import STARTS_A_CALL, ends_from
+from icrtool.kernels.open_loop.direct import STARTS_A_CALL, ends_from
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -92,7 +92,7 @@ def predicted_path(
     Parameters
     ----------
     own : constants of the recording
-    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop`
+    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop.direct`
 
     Notes
     -----

@@ -14,15 +14,15 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.block_sums import BlockSums
-from icrtool.kernels.open_loop_fast import TOLERANCE_M
-from icrtool.kernels.trials import Summary
-from icrtool.output.atomic_directory import atomic_directory
-from icrtool.output.csv_file import csv_bytes
-from icrtool.output.json_file import json_bytes, schema_of
+from icrtool.kernels.open_loop.block_sums import BlockSums
+from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
+from icrtool.kernels.open_loop.trials import Summary
+from icrtool.output.files.atomic_directory import atomic_directory
+from icrtool.output.files.csv_file import csv_bytes
+from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.trials_file import trials_file
 from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
-from icrtool.output.trials_file import trials_file
 from icrtool.records.dropout import ExampleTrial, ModelResult
 
 REPORT_FILE = "report.json"

@@ -110,7 +110,7 @@ FIGURES = {
     ),
     "ladder": Entry(
         "report", "Model comparison",
-        "Each model on distance it was not fitted to. Take the simplest of those that are about as good as the best.",
+        "Each model on distance it was not fitted to: the further left, the better.",
         "model_comparison.model_comparison", _where(lambda report: report.comparison),
     ),
     "icrs": Entry(

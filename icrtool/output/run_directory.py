@@ -11,12 +11,12 @@ from typing import Any
 
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
-from icrtool.output.atomic_directory import atomic_directory, check_directory
-from icrtool.output.csv_file import csv_bytes
-from icrtool.output.json_file import json_bytes, schema_of
-from icrtool.output.measurements_file import MEASUREMENTS_FILE, write_measurements
-from icrtool.output.own_files import made_from
-from icrtool.output.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.output.files.atomic_directory import atomic_directory, check_directory
+from icrtool.output.files.csv_file import csv_bytes
+from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
+from icrtool.output.files.own_files import made_from
+from icrtool.output.files.states_file import StatesFormat, file_b2sum, write_states
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS
 

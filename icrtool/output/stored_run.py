@@ -14,7 +14,8 @@ import numpy as np
 from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
-from icrtool.output.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
+from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
+from icrtool.output.files.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
 from icrtool.output.run_directory import (
     CHECKSUM_FILE,
     RUN_FILE,
@@ -23,7 +24,6 @@ from icrtool.output.run_directory import (
     STATES_FILES,
     is_run_directory,
 )
-from icrtool.output.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.block_sums import BlockSums
-from icrtool.kernels.trials import Histogram, Intervals, OpenLoopPath, Summary
+from icrtool.kernels.open_loop.block_sums import BlockSums
+from icrtool.kernels.open_loop.trials import Histogram, Intervals, OpenLoopPath, Summary
 
 OutageKind = Literal["forced", "real"]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
 from icrtool.records.tables import States
@@ -43,7 +43,7 @@ class MeasurementOutcome:
     ----------
     stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
     nis : (m,) normalised innovation squared, NaN where unseen
-    code : uint8 (m,), see `icrtool.kernels.measurement_codes`
+    code : uint8 (m,), see `icrtool.kernels.filter.measurement_codes`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
 

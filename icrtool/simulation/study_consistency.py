@@ -10,8 +10,8 @@ import numpy as np
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.batch_filter import model_states, run_batch
-from icrtool.kernels.ekf_step import PLACES
+from icrtool.kernels.filter.batch_filter import model_states, run_batch
+from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.simulation.drives import Readings, Sensors, sample_times
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics

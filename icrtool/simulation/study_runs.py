@@ -14,8 +14,8 @@ from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.batch_filter import Batch, run_batch
-from icrtool.kernels.ekf_step import PLACES
+from icrtool.kernels.filter.batch_filter import Batch, run_batch
+from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog

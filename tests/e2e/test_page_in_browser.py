@@ -25,10 +25,10 @@ from icrtool.calibration.pooled import (
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
-from icrtool.kernels.open_loop import open_loop_path, trial_ends
+from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
 from icrtool.motion.trials import Trials, predicted_path
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page

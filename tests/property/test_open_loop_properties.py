@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icrtool.kernels import open_loop_fast
-from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop_fast import open_loop_errors
-from icrtool.kernels.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop import prefix_sums as open_loop_fast
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
 EQUAL_M = 1e-9  # what the fast algorithm promises; moving the world by 1e5 m rounds positions to 1.5e-11 m
 HORIZONS = np.array([0.3, 1.0, 2.5, 6.0])

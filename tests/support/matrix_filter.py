@@ -1,4 +1,4 @@
-"""The ICR EKF in matrices, as the paper writes it: an independent oracle of `icrtool.kernels.ekf`.
+"""The ICR EKF in matrices, as the paper writes it: an independent oracle of `icrtool.kernels.filter.ekf`.
 
 Pentzer 2014, Section 3. F is assembled from Eqs. 17 and 27-29, updates are joint (north, east) with
 K = P H^T (H P H^T + R)^-1. Slow; shares no equation with the compiled filter.
@@ -11,11 +11,11 @@ import math
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.ekf import REFERENCE_STEP_S, empty_output
-from icrtool.kernels.ekf_step import wrap
-from icrtool.kernels.filter_records import FilterInputs, FilterOutput, FilterParameters
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_output
+from icrtool.kernels.filter.ekf_step import wrap
+from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
+from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.measurement_codes import GATED, RECOVERED, USED
 
 
 def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
@@ -56,7 +56,7 @@ def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float, step_hea
 
 
 def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
-    """Do what `icrtool.kernels.ekf.run_ekf` does, with matrices; the same arguments and result."""
+    """Do what `icrtool.kernels.filter.ekf.run_ekf` does, with matrices; the same arguments and result."""
     first = int(np.searchsorted(data.wheel_t, t0))
     out = empty_output(data, len(data.wheel_t) - first)
     x, P, t, travelled = x0.astype(float), P0.astype(float), t0, 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.trials import Drive
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import PathAt, Trials, trial_errors

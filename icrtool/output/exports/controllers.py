@@ -14,7 +14,7 @@ from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, e
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
 

@@ -9,10 +9,10 @@ import numpy as np
 import orjson
 
 from icrtool import __version__
-from icrtool.alignment.gnss_quality import CLASSES
+from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.measurement_codes import GATED, UNSEEN
+from icrtool.kernels.filter.measurement_codes import GATED, UNSEEN
 from icrtool.output.decimate import places
 from icrtool.output.exports.paths import (
     LABELS,

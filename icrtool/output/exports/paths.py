@@ -16,7 +16,7 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import OdometryPath, odometry
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.trials import FrozenIcrs
+from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.output.decimate import places
 from icrtool.records.run import Run
 from icrtool.records.tables import States

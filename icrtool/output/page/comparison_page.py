@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from icrtool.motion.models import MODELS
-from icrtool.output.json_file import schema_of
+from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
 from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render

@@ -13,9 +13,9 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
-from icrtool.output.atomic_file import write_file
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
-from icrtool.output.json_file import schema_of
+from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from icrtool.calibration.transfer import Cell, Pair, Transfer
-from icrtool.output.csv_file import csv_bytes
+from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.dropout import CHOICE_HORIZON_M
 

@@ -14,7 +14,7 @@ from icrtool.config import parse_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.kernels.trials import FrozenIcrs
+from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run

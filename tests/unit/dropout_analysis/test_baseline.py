@@ -18,9 +18,9 @@ from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
 from icrtool.fleet.row import File, Row
-from icrtool.kernels.block_sums import BlockSums, block_sums
-from icrtool.kernels.error_statistics import cut_blocks, error_summary, sort_trials
-from icrtool.output.baseline_file import open_baseline, read_report
+from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums
+from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
+from icrtool.output.files.baseline_file import open_baseline, read_report
 from icrtool.records.run import Run
 from support.edits import edited
 

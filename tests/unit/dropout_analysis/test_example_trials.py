@@ -10,7 +10,7 @@ import pytest
 
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.trials import models_of
-from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.records.run import Run, drive_of
 
 EQUAL_M = 1e-9

@@ -9,7 +9,7 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.kernels.open_loop import SHORT, open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.direct import SHORT, open_loop_errors_direct, trial_ends
 from icrtool.records.run import drive_of
 
 LOGS = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.straight_and_turning import CELLS, STRAIGHT_RAD, heading_range
-from icrtool.kernels.trials import Drive
+from icrtool.kernels.open_loop.trials import Drive
 
 HORIZON_M, STEP_M = 5.0, 0.6
 

@@ -17,8 +17,8 @@ from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.starts import first_learned
 from icrtool.dropout_analysis.trials import Model, dropout, models_of
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.open_loop import open_loop_errors_direct, trial_ends
-from icrtool.kernels.trials import FrozenIcrs
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.records.run import ICR_COLUMNS, Run, drive_of
 
 EQUAL_M = 1e-9
@@ -275,7 +275,7 @@ def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
     code = (
         "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
-        "from icrtool.kernels import error_statistics, open_loop, open_loop_fast as fast\n"
+        "from icrtool.kernels.open_loop import direct as open_loop, error_statistics, prefix_sums as fast\n"
         "kernels = [open_loop.find_trial_ends, open_loop.integrate_trials, open_loop.integrate_path, fast.last_end,\n"
         "    fast.plan_block, fast.solve_block, error_statistics.resample_blocks]\n"
         "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"

@@ -11,7 +11,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.estimation.fit import fit
-from icrtool.kernels.open_loop import trial_ends
+from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.events import SlipEvent
 from icrtool.records.run import Run, drive_of

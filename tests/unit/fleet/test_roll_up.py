@@ -15,7 +15,7 @@ from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
 from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_of_fleet
 from icrtool.fleet.row import File, Row
-from icrtool.output.calibration_file import open_calibration
+from icrtool.output.files.calibration_file import open_calibration
 from icrtool.records.run import Run
 
 

@@ -20,7 +20,6 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError
-from icrtool.output import disk
 from icrtool.output.dropout_directory import (
     TRIALS_FILE,
     is_dropout_directory,
@@ -28,8 +27,9 @@ from icrtool.output.dropout_directory import (
     write_report,
     write_tables,
 )
-from icrtool.output.json_file import json_bytes
-from icrtool.output.trials_file import trials_file
+from icrtool.output.files import disk
+from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.trials_file import trials_file
 from icrtool.records.run import Run
 
 HORIZONS_M = [1.0, 5.0, 10.0, 900.0]

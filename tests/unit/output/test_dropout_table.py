@@ -15,8 +15,8 @@ from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
-from icrtool.output.atomic_file import check_place
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
+from icrtool.output.files.atomic_file import check_place
 from icrtool.output.tables.dropout import (
     budget_lines,
     error_text,

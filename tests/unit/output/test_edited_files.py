@@ -15,10 +15,10 @@ import pytest
 
 import icrtool
 from icrtool.errors import IcrToolError
-from icrtool.output.calibration_file import open_calibration
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.calibration_file import open_calibration
+from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.run_directory import events_csv
-from icrtool.output.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.stored_run import log_of
 from icrtool.output.tables.run import format_run
 from support.edits import edited

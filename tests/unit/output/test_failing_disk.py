@@ -22,14 +22,14 @@ from icrtool.config import Config
 from icrtool.errors import OutputError
 from icrtool.fleet.fleet_files import write_fleet
 from icrtool.fleet.row import Row
-from icrtool.output import disk
-from icrtool.output.atomic_file import atomic_file, write_file
-from icrtool.output.calibration_file import write_calibration
 from icrtool.output.exports.foxglove import write_foxglove
 from icrtool.output.figures.style import new_figure
-from icrtool.output.picture_file import save_picture
+from icrtool.output.files import disk
+from icrtool.output.files.atomic_file import atomic_file, write_file
+from icrtool.output.files.calibration_file import write_calibration
+from icrtool.output.files.picture_file import save_picture
+from icrtool.output.files.truth_file import log_and_truth
 from icrtool.output.study_directory import write_study
-from icrtool.output.truth_file import log_and_truth
 from icrtool.records.run import Run
 from icrtool.simulation.studies import default_request, run_study
 

@@ -9,7 +9,7 @@ import pytest
 
 from icrtool.calibration.model_comparison import ModelComparison, compare_models
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.tables.model_comparison import (
     COMPARISON_COLUMNS,
     comparison_blocks,

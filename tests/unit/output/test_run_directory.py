@@ -13,7 +13,7 @@ import pytest
 from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output import run_directory
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
 from icrtool.records.run import Run

@@ -20,7 +20,7 @@ from icrtool.output import run_directory
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import picture_bytes
-from icrtool.output.json_file import json_bytes
+from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import write_run
 from icrtool.output.stored_run import log_of, newest_run, open_run
 from icrtool.output.tables.dropout import format_dropout

@@ -12,9 +12,9 @@ import pytest
 
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
+from icrtool.output.files.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.output.study_directory import check_study_target, write_study
 from icrtool.output.tables.study import finding_text, format_study, runs_text
-from icrtool.output.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.record import simulate

@@ -1,0 +1,369 @@
+"""Heading from turn rates, courses over ground and absolute headings, in a Kalman filter and smoother.
+
+Each source has an error model whose sizes the likelihood of the log chooses: a turn rate has a random walk of its
+integral and of its bias; a course over ground has the noise of the fixes and an ICR that varies from window to
+window; an absolute heading (attitude sensor, bearing between two antennas) has a constant offset, an error that
+wanders slowly, white noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale,
+delays, ICR) come from the whole log; what varies in time has a causal estimate (the past alone, constants excepted)
+and a smoothed one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.drive_windows import DriveArrays
+from icrtool.alignment.heading.courses import Guess, TurnRate, fit_middle, measure_courses
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.robust import long_run_factor, mad_std
+
+if TYPE_CHECKING:
+    from icrtool.kernels.filter.heading_kalman import HeadingEvents, HeadingModel, HeadingPasses
+
+PSI, BIAS, SCALE, X, DELAY = range(5)
+OFFSET, WANDER, LAG = 5, 6, 7
+"""States of the first absolute heading; those of the next one follow."""
+STATES, STATES_OF_A_SOURCE = 5, 3
+COURSE, STANDING, NOTHING, ABSOLUTE = range(4)
+
+SETTLED_SIGMAS = 3.0
+LEAST_OFFSET_SIGMAS = 4.0
+LARGEST_RATE_HZ = 20.0
+
+STANDING_S = 0.6
+STANDING_RATE_STD = math.radians(0.05)
+FEWEST_COURSES = 8
+PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
+ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
+LONGEST_STEP_S = 1.0
+"""A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
+
+LEAST_COURSE_STD_RAD = math.radians(0.05)
+ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
+MOST_SWEEPS = 3
+"""A delay of the fixes up to this, and a bias that turns a window by this, are linear; larger ones take rounds."""
+
+MOST_EVENTS = 2000
+"""The likelihood looks at so many events."""
+
+NOISES = {
+    "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
+    "bias": np.radians([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0]),
+    "fixes": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
+    "slip": np.array([0.003, 0.01, 0.02, 0.04, 0.08, 0.16]),
+}
+"""Random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)]; noise of the fixes in the stated
+one; standard deviation of the ICR from window to window [m]."""
+
+NOISES_OF_A_SOURCE = {
+    "white": np.array([0.25, 0.5, 1.0, 2.0, 4.0]),
+    "rate": np.radians([0.01, 0.03, 0.1, 0.2, 0.4, 1.0]),
+    "size": np.radians([0.03, 0.1, 0.3, 0.6, 1.2, 2.5, 5.0]),
+}
+"""White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
+
+
+class AbsoluteHeading(NamedTuple):
+    """Headings with an offset, thinned to independent ones.
+
+    Attributes
+    ----------
+    t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
+    rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
+    offset_std : of the offset, about zero [rad]; aligned_std : the same where no offset is significant
+    """
+
+    t: Floats
+    heading: Floats
+    std: Floats
+    rate: Floats
+    offset_std: float = math.inf
+    aligned_std: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingEstimate:
+    """Headings at times t (n,) [s].
+
+    Attributes
+    ----------
+    causal, causal_std : (n,) from the past alone, constants excepted; smoothed, smoothed_std : (n,) from all
+    constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
+        error at the end, delay of each absolute heading
+    noises : what the likelihood chose; those of an absolute heading have its number in front
+    spread : robust standard deviation of the courses' innovations, in theirs
+    """
+
+    t: Floats
+    causal: Floats
+    causal_std: Floats
+    smoothed: Floats
+    smoothed_std: Floats
+    constants: Floats
+    constants_std: Floats
+    noises: dict[str, float]
+    spread: float
+
+    @property
+    def has_offset(self) -> bool:
+        """Whether the offset of the first absolute heading is significant."""
+        offset = math.remainder(float(self.constants[OFFSET]), 2.0 * math.pi)
+        return abs(offset) > LEAST_OFFSET_SIGMAS * float(self.constants_std[OFFSET])
+
+    @property
+    def median_std(self) -> float:
+        """Median standard deviation of the smoothed heading [rad]."""
+        return float(np.median(self.smoothed_std))
+
+
+def estimate_heading(
+    drive: DriveArrays, turn: TurnRate, absolute: Sequence[AbsoluteHeading] = (), *, stands: bool = True
+) -> HeadingEstimate | None:
+    """Estimate the heading; None with too few courses.
+
+    Parameters
+    ----------
+    turn : of a gyro, or of the wheels with a wide prior of its scale
+    absolute : further headings
+    stands : whether the rate is zero while the wheels stand
+    """
+    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
+    if problem.courses < FEWEST_COURSES:
+        return None
+    noises = problem.usual()
+    guess = problem.guess(noises)
+    for _ in range(ROUNDS):
+        problem = _Problem(drive, turn, guess, (), stands=stands)
+        if problem.courses < FEWEST_COURSES:
+            return None
+        # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
+        noises = problem.choose(NOISES, noises)
+        better = problem.guess(noises)
+        turned = float(np.abs(better.bias - guess.bias).max()) * problem.window_s
+        if turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S:
+            break
+        guess = better
+    if absolute:
+        problem = _Problem(drive, turn, guess, absolute, stands=stands)
+        grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
+        noises = problem.choose(grids, problem.usual() | noises)
+    found = problem.solve(noises)
+    if absolute and math.isfinite(absolute[0].aligned_std) and not found.has_offset:
+        # not significant: that of a sensor mounted along the robot
+        problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
+        found = problem.solve(noises)
+    return found
+
+
+def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
+    """Return ends of spans [s] in which the wheels stood, and the mean rate in each [rad/s]."""
+    edges = drive.wheel_t[0] + STANDING_S * np.unique(np.floor((drive.wheel_t - drive.wheel_t[0]) / STANDING_S))
+    begin, end = edges[:-1], edges[1:]
+    gone = np.concatenate([[0.0], np.cumsum((np.abs(drive.v_left) + np.abs(drive.v_right))[:-1] * drive.wheel_dt[:-1])])
+    still = np.interp(end, drive.wheel_t, gone) - np.interp(begin - STANDING_S, drive.wheel_t, gone) < 1e-3
+    still &= (end - begin < 1.5 * STANDING_S) & (begin >= turn.t[0]) & (end <= turn.t[-1])
+    G = turn.integrated()
+    rate = (np.interp(end, turn.t, G) - np.interp(begin, turn.t, G)) / (end - begin)
+    return end[still], rate[still]
+
+
+class _Problem:
+    """The events of a log, in order, and what is not known of their noise."""
+
+    def __init__(
+        self, drive: DriveArrays, turn: TurnRate, guess: Guess, absolute: Sequence[AbsoluteHeading], *, stands: bool
+    ) -> None:
+        """Measure the courses about a guess."""
+        self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
+        courses = measure_courses(drive, turn, guess)
+        self.courses = len(courses.end)
+        if self.courses < FEWEST_COURSES:
+            return
+        self.middle = fit_middle(courses, guess)
+        self.window_s = float(np.median(courses.end - courses.begin))
+        still_t, still_rate = _standing(drive, turn) if stands else (np.empty(0), np.empty(0))
+        t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
+        kind = np.repeat(
+            [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute))],
+            [len(courses.end), len(still_t), *(len(one.t) for one in absolute)],
+        )
+        k = STATES + STATES_OF_A_SOURCE * len(absolute)
+        h = np.zeros((len(t), k))
+        h[kind != STANDING, PSI] = 1.0
+        h[kind == STANDING, BIAS] = 1.0
+        rows = kind == COURSE
+        h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
+            courses.of_bias, courses.of_scale, courses.of_x, courses.of_delay,
+        )  # fmt: skip
+        for i, one in enumerate(absolute):
+            rows, first = kind == ABSOLUTE + i, STATES_OF_A_SOURCE * i
+            h[rows, first + OFFSET] = h[rows, first + WANDER] = 1.0
+            h[rows, first + LAG] = -one.rate
+        z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute)])
+        std = np.concatenate([courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute)])
+        of_x = np.concatenate([courses.of_x, np.zeros(len(t) - len(courses.of_x))])
+        self._order(t, kind, h, z, std, of_x)
+
+    def _order(self, t: Floats, kind: Ints, h: Floats, z: Floats, std: Floats, of_x: Floats) -> None:
+        """Sort the events by time, with steps that measure nothing between those far apart."""
+        sorted_t = np.sort(t)
+        gap = np.flatnonzero(np.diff(sorted_t) > 2.0 * LONGEST_STEP_S)
+        fill = [
+            np.arange(sorted_t[i] + LONGEST_STEP_S, sorted_t[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in gap
+        ]
+        extra = np.concatenate([*fill, np.empty(0)])
+        n = len(extra)
+        t, kind = np.concatenate([t, extra]), np.concatenate([kind, np.full(n, NOTHING)])
+        order = np.lexsort((kind, t))
+        self.t, self.kind = t[order], kind[order]
+        self.h = np.concatenate([h, np.zeros((n, h.shape[1]))])[order]
+        self.z, self.of_x = np.concatenate([z, np.zeros(n)])[order], np.concatenate([of_x, np.zeros(n)])[order]
+        self.std = np.concatenate([std, np.ones(n)])[order]
+        self.at = np.interp(self.t, self.turn.t, self.G)
+        self.holes = np.diff(self.turn.hole_variance(self.t), prepend=0.0)
+
+    def events(self, noises: dict[str, float], alike: float = 1.0) -> HeadingEvents:
+        """Return the events with the variances of some noises."""
+        from icrtool.kernels.filter.heading_kalman import HeadingEvents
+
+        r = self.std**2
+        course = self.kind == COURSE
+        r[course] = alike * (
+            (noises["fixes"] * self.std[course]) ** 2
+            + (noises["slip"] * self.of_x[course]) ** 2
+            + LEAST_COURSE_STD_RAD**2
+        )
+        for i in range(len(self.absolute)):
+            r[self.kind == ABSOLUTE + i] *= noises[f"{i} white"] ** 2
+        angle = (self.kind == COURSE) | (self.kind >= ABSOLUTE)
+        return HeadingEvents(
+            np.diff(self.t, prepend=self.t[:1]),
+            np.diff(self.at, prepend=self.at[:1]),
+            self.holes,
+            self.z,
+            self.h,
+            r,
+            angle,
+        )
+
+    def model(self, noises: dict[str, float]) -> HeadingModel:
+        """Return start and process of the states."""
+        from icrtool.kernels.filter.heading_kalman import HeadingModel
+
+        count = len(self.absolute)
+        std = np.concatenate([PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
+        std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
+        x, q, decay = np.zeros(len(std)), np.zeros(len(std)), np.zeros(len(std))
+        first = int(np.argmax(self.kind == COURSE))
+        x[PSI] = self.z[first] - (self.at[first] - self.at[0])
+        q[PSI], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
+        for i in range(count):
+            one = int(np.argmax(self.kind == ABSOLUTE + i))
+            at = STATES_OF_A_SOURCE * i
+            x[at + OFFSET] = math.remainder(self.z[one] - x[PSI] - (self.at[one] - self.at[0]), 2 * math.pi)
+            growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
+            std[at + OFFSET] = self.absolute[i].offset_std
+            x[at + OFFSET] *= math.isinf(std[at + OFFSET])
+            std[at + OFFSET] = min(std[at + OFFSET], math.pi)
+            std[at + WANDER], decay[at + WANDER], q[at + WANDER] = size, growth / (2.0 * size**2), growth
+        return HeadingModel(x, np.diag(std**2), q, decay, np.zeros(len(std), np.bool_))
+
+    def guess(self, noises: dict[str, float]) -> Guess:
+        """Return where to measure the courses next."""
+        from icrtool.kernels.filter.heading_kalman import filter_headings, smooth_headings
+
+        events, model = self.events(noises), self.model(noises)
+        states, covariances = smooth_headings(events, model, filter_headings(events, model))
+        bias = np.interp(self.turn.t, self.t, states[:, BIAS])
+        bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
+        x, delay_s = float(states[-1, X]), float(states[-1, DELAY])
+        return Guess(bias, float(bias_std), float(scale_std), x, delay_s, self.middle)
+
+    def solve(self, noises: dict[str, float]) -> HeadingEstimate:
+        """Return the estimate with some noises."""
+        from icrtool.kernels.filter.heading_kalman import filter_headings, smooth_headings
+
+        events, model = self.events(noises), self.model(noises)
+        passes = filter_headings(events, model)
+        alike = self._alike(passes)
+        if alike > 1.0:
+            events = self.events(noises, alike)
+            passes = filter_headings(events, model)
+        states, covariances = smooth_headings(events, model, passes)
+        fixed = np.ones(len(model.x), np.bool_)
+        fixed[[PSI, BIAS]] = False
+        fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
+        x, P = model.x.copy(), model.P.copy()
+        x[fixed] = states[-1][fixed]
+        P[np.ix_(fixed, fixed)] = covariances[-1][np.ix_(fixed, fixed)]
+        causal = filter_headings(events, model._replace(x=x, P=P, fixed=fixed))
+        return self._at_rate_samples(causal, states, covariances, noises, mad_std(self._settled(causal), 0.0))
+
+    def _settled(self, passes: HeadingPasses) -> Floats:
+        """Return the courses' innovations in standard deviations, except the first ones."""
+        course = self.kind == COURSE
+        z = passes.innovation[course] / np.sqrt(passes.variance[course])
+        settled: Floats = z[len(z) // 20 + 2 :]
+        return settled
+
+    def _alike(self, passes: HeadingPasses) -> float:
+        """Return by how much courses of windows that follow one another err alike, by slip that the model lacks."""
+        z = np.clip(self._settled(passes), -SETTLED_SIGMAS, SETTLED_SIGMAS)
+        return float(long_run_factor(z[:, None])[0])
+
+    def usual(self) -> dict[str, float]:
+        """Return noises to start from."""
+        grids = dict(NOISES)
+        for i in range(len(self.absolute)):
+            grids |= {f"{i} {name}": values for name, values in NOISES_OF_A_SOURCE.items()}
+        return {name: float(values[len(values) // 2]) for name, values in grids.items()}
+
+    def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
+        """Return the noises with those of the grids that have the largest likelihood, one after the other."""
+        from icrtool.kernels.filter.heading_kalman import heading_log_likelihood
+
+        def likelihood(name: str, value: float) -> float:
+            tried = noises | {name: value}
+            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
+
+        for _ in range(MOST_SWEEPS):
+            before = dict(noises)
+            for name, values in grids.items():
+                costs = [likelihood(name, float(value)) for value in values]
+                noises = noises | {name: float(values[int(np.argmax(costs))])}
+            if noises == before:
+                break
+        return noises
+
+    def _at_rate_samples(
+        self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float], spread: float
+    ) -> HeadingEstimate:
+        """Return the estimates at samples of the rate: carried on from the last event, or between events."""
+        t, turn, G = self.t, self.turn, self.G
+        constants, variances = states[-1].copy(), np.diagonal(covariances[-1])
+        every = max(1, round(1.0 / (LARGEST_RATE_HZ * float(np.median(np.diff(turn.t))))))
+        rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
+        s = turn.t[rows]
+        last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
+        dt, dG = s - t[last], G[rows] - self.at[last]
+        x, P = causal.x, causal.P
+        carried = x[last, PSI] + (1 + x[last, SCALE]) * dG - x[last, BIAS] * dt
+        variance = noises["angle"] ** 2 * dt
+        f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
+        for i, j in product(f, f):
+            variance += f[i] * P[last, i, j] * f[j]
+        variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
+        scaled = (1 + constants[SCALE]) * G
+        smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))
+        stamp = turn.stamp_std()[rows] ** 2
+        smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
+        return HeadingEstimate(
+            s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
+            constants, np.sqrt(variances), noises, spread,
+        )  # fmt: skip

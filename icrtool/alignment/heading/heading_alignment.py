@@ -1,0 +1,313 @@
+"""The heading compared with the course over ground: its offset and noise, what is applied, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.conventions import Convention
+from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
+from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
+from icrtool.alignment.heading.heading_offset_cause import NO_NAME, OffsetName, name_offset
+from icrtool.alignment.position.gnss_steps import unbroken
+from icrtool.config import Config
+from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
+from icrtool.records.tables import RobotLog
+
+FEWEST_WINDOWS = 8
+SIGNIFICANT_SIGMAS = 4.0
+SMALLEST_OFFSET_RAD = math.radians(1.0)
+OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
+
+EXPLAINED = 0.8
+"""Mean resultant length of heading minus course over ground above which they are one direction."""
+
+NEAR_RAD, NEAR_SHARE = math.radians(45.0), 0.6
+"""A heading without agreement is refused where no offset brings this share of the windows this near to the course
+over ground: outliers among the fixes disturb some windows, not most."""
+
+STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
+"""A heading that is constant for so long, while one side gains so much on the other, over this share of the distance,
+is stuck."""
+
+TURN_M, TURN_SHARE = 1.0, 0.1
+"""A side that gains less than this share of the distance, over so much of it, shows no turn: wheels of unequal size do
+so on a straight row."""
+
+
+class CourseAngles(NamedTuple):
+    """Windows of distance: displacement by the fixes, and by the wheels laid along the heading.
+
+    Attributes
+    ----------
+    angle : (w,) heading minus course over ground [rad], in (-pi, pi]
+    mirrored : (w,) the same for a heading of the other handedness
+    scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
+    duration_s : median duration of a window
+    """
+
+    angle: Floats
+    mirrored: Floats
+    scattered: int
+    duration_s: float
+
+    @property
+    def agreement(self) -> float:
+        """Mean resultant length of `angle`: 1 where heading and course over ground agree, about 0 at random."""
+        return _resultant_length(self.angle)
+
+    @property
+    def mirrored_agreement(self) -> float:
+        """The same of `mirrored`."""
+        return _resultant_length(self.mirrored)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether there are enough windows, and the heading follows the course over ground in one of the senses."""
+        return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
+
+
+def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngles:
+    """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
+    begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
+    v, nose = drive.mean_speed, drive.nose
+    seen = drive.fix[end] - drive.fix[begin]
+    along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
+    laid, other = (at[end] - at[begin] for at in (along, mirrored))
+    went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
+    moved = went & led
+    return CourseAngles(
+        np.angle(laid * np.conj(seen))[moved],
+        np.angle(other * np.conj(seen))[moved],
+        int(np.count_nonzero(went & ~led)),
+        float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingAlignment:
+    """What is known of the heading, and what is done with it.
+
+    Attributes
+    ----------
+    source : what the heading is made of; parts : in words, with its standard deviation, empty for a stated heading
+    windows : stretches of distance compared
+    offset_rad, offset_std_rad : heading minus course over ground at no curvature; NaN when there was nothing to compare
+    scatter_rad : robust standard deviation of the differences
+    agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
+    applied_mirror : the heading is turned over; applied_offset_rad : what is subtracted from it, after that
+    name : what a significant offset may come from
+    applied_std_rad, applied_correlation_s : the least noise, and how long it is correlated, that the filter uses
+    std_rad : median standard deviation of an estimated heading; NaN for a stated one
+    """
+
+    source: str
+    parts: str = ""
+    windows: int = 0
+    offset_rad: float = math.nan
+    offset_std_rad: float = math.nan
+    scatter_rad: float = math.nan
+    agreement: float = math.nan
+    mirrored_agreement: float = math.nan
+    applied_mirror: bool = False
+    applied_offset_rad: float = 0.0
+    applied_std_rad: float = 0.0
+    applied_correlation_s: float = 0.0
+    std_rad: float = math.nan
+    name: OffsetName = NO_NAME
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the log's heading is an estimate, which holds every correction."""
+        return math.isfinite(self.std_rad)
+
+    @property
+    def remaining_offset_rad(self) -> float:
+        """Offset of the log's heading that is still to be corrected."""
+        return 0.0 if self.is_estimated else self.applied_offset_rad
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers for run.json, angles in degrees, None for what is not known."""
+        degrees = {
+            "offset_deg": self.offset_rad,
+            "offset_std_deg": self.offset_std_rad,
+            "scatter_deg": self.scatter_rad,
+            "applied_offset_deg": self.applied_offset_rad,
+            "applied_std_deg": self.applied_std_rad,
+            "std_deg": self.std_rad,
+        }
+        numbers = {name: math.degrees(value) if math.isfinite(value) else None for name, value in degrees.items()}
+        return {
+            "source": self.source,
+            "parts": self.parts or None,
+            "windows": self.windows,
+            "applied_mirror": self.applied_mirror,
+            **numbers,
+            **self.name.summary(),
+            "agreement": self.agreement if math.isfinite(self.agreement) else None,
+            "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
+        }
+
+
+def align_heading(
+    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str, convention: Convention
+) -> HeadingAlignment:  # fmt: skip
+    """Return offset and noise of a stated heading, and what is applied.
+
+    Parameters
+    ----------
+    fit : of this heading; None where the drive is too short
+    source : kind of sensor
+    convention : that the streams were found to have
+    """
+    mirrored = convention.heading < 0
+    given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
+    fixed = -math.radians(given) if given != "auto" and corrects else 0.0
+    nothing = HeadingAlignment(
+        source, windows=len(course.angle), agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
+        applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
+    )  # fmt: skip
+    if fit is None:
+        return nothing
+    pose_mirrored = mirrored and convention.position < 0 and fit.drive.same_clock
+    turn, std = fit.estimate("offset")
+    offset = math.remainder(-turn, 2 * math.pi)
+    scatter = fit.across_scatter
+    text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
+    significant = _significant(offset - fixed, std)
+    applied, notes = fixed, []
+    if mirrored and not corrects:
+        notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+    elif mirrored and pose_mirrored:
+        applied = offset if given == "auto" else fixed
+        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
+    elif mirrored:
+        applied = offset if given == "auto" else fixed
+        notes.append(
+            f"{OPPOSITE_SENSE}: its yaw is of the other convention (ENU/NED), "
+            f"offset {text}: applied; frames.heading sets it"
+        )
+    elif significant and given == "auto" and corrects:
+        applied = offset
+        notes.append(_offset_note(text, applied))
+    elif significant:
+        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied")
+    noisy = corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
+    if noisy:
+        notes.append(
+            f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground: "
+            "its noise is raised to that"
+        )
+    return replace(
+        nothing, offset_rad=offset, offset_std_rad=std, scatter_rad=scatter, applied_offset_rad=applied,
+        applied_std_rad=scatter if noisy else 0.0, applied_correlation_s=course.duration_s if noisy else 0.0,
+        name=name, warnings=tuple(f"{log.name}: {note}" for note in notes),
+    )  # fmt: skip
+
+
+def align_estimated_heading(
+    log: RobotLog, derived: DerivedHeading, stated: HeadingAlignment | None
+) -> HeadingAlignment:
+    """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
+    std = derived.estimate.median_std
+    estimated = f"{log.name}: the heading is estimated: {derived.why}"
+    own = HeadingAlignment(derived.source, derived.why, std_rad=std, warnings=(estimated,))
+    if stated is None or derived.attitude_offset is None:
+        return own
+    offset, offset_std = derived.attitude_offset
+    text, name = _offset_in_words(log, offset, offset_std, mirrored=stated.applied_mirror)
+    notes = [note for note in stated.warnings if OPPOSITE_SENSE in note]
+    if not notes and _significant(offset, offset_std):
+        notes = [f"{log.name}: {_offset_note(text, offset)}"]
+    return replace(
+        stated, source=own.source, parts=own.parts, offset_rad=offset, offset_std_rad=offset_std,
+        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std,
+        name=name, warnings=tuple(notes),
+    )  # fmt: skip
+
+
+def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:
+    """Return an offset with its deviation and its cause; that of a yaw, where the yaw is of the other convention."""
+    rest = offset + math.pi / 2 if mirrored else offset
+    name = name_offset(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_NAME
+    cause = f" ({name.text})" if name.text else ""
+    return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(std):.1f}°{cause}", name
+
+
+def _offset_note(text: str, applied: float) -> str:
+    return (
+        f"heading is {text} off the course over ground: {-math.degrees(applied):+.1f}° is applied; "
+        "frames.heading_offset_deg sets it"
+    )
+
+
+def _significant(offset: float, std: float) -> bool:
+    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)
+
+
+def refuse_unexplained(log: RobotLog, course: CourseAngles) -> None:
+    """Raise where the heading points nowhere, or no convention and no offset makes it follow the course over ground."""
+    windows, scattered = len(course.angle), course.scattered
+    if scattered >= FEWEST_WINDOWS and scattered > windows:
+        raise _no_heading(
+            log, "scatters over all directions", f"in {scattered} of the windows in which it was averaged"
+        )
+    if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
+        return
+    best = max(course.agreement, course.mirrored_agreement)
+    if best < EXPLAINED:
+        spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
+        tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° or more ({windows} windows)"
+        raise _no_heading(log, "does not follow the course over ground", tried)
+
+
+def refuse_stuck(log: RobotLog) -> None:
+    """Raise where the heading stays constant over much of the distance while the wheels turn the robot."""
+    stamps, heading, wheels = log.heading.stamp_ns, log.heading.heading_rad, log.wheels
+    if len(stamps) < 2 or len(wheels.stamp_ns) < 2:
+        return
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(heading) != 0) + 1, [len(stamps)]])
+    begin, end = stamps[edges[:-1]], stamps[edges[1:] - 1]
+    long = end - begin > STUCK_S * 1e9
+    if not long.any():
+        return
+    interval = unbroken(np.diff(wheels.stamp_ns) / 1e9)
+    left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
+    gone = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
+    ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), gone)
+    rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin, end])[long])
+    turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
+    constant = np.diff(gone[np.minimum(rows[turning], len(gone) - 1)]).sum()
+    share = float(constant) / max(float(gone[-1]), 1e-9)
+    if share > STUCK_SHARE:
+        seconds = float((end - begin)[long][turning].sum()) / 1e9
+        raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")
+
+
+def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
+    """Return `ahead` (n,) [m] without what it gains where it gains too little of `gone` (n,) [m] to be a turn."""
+    later = np.minimum(np.searchsorted(gone, gone + TURN_M), len(gone) - 1)
+    turning = np.abs(ahead[later] - ahead) >= TURN_SHARE * (gone[later] - gone)
+    return np.concatenate([[0.0], np.cumsum(np.where(turning[:-1], np.diff(ahead), 0.0))])
+
+
+def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
+    advice = "choose another with topics.heading, or use this one with --set frames.heading_offset_deg=0"
+    return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
+
+
+def _near_share(angle: Floats) -> float:
+    """Return the largest share of angles within `NEAR_RAD` of one of 16 directions."""
+    directions = np.arange(16) * math.pi / 8
+    away = np.abs(np.angle(np.exp(1j * (angle[:, None] - directions))))
+    return float((away < NEAR_RAD).mean(axis=0).max())
+
+
+def _resultant_length(angle: Floats) -> float:
+    return float(abs(np.exp(1j * angle).mean())) if len(angle) else math.nan

@@ -1,0 +1,261 @@
+"""The heading of a log: as a sensor states it, or estimated from turn rates, positions, antennas and that sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from icrtool.alignment.drive_windows import DriveArrays, drive_arrays
+from icrtool.alignment.estimator import ATTITUDE_STD_RAD
+from icrtool.alignment.heading.absolute_headings import antenna_heading, attitude_heading
+from icrtool.alignment.heading.courses import TurnRate
+from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
+from icrtool.alignment.heading.turn_rates import gyro_rate, wheel_rate
+from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
+from icrtool.records.samples import GyroAxes, GyroSamples, HeadingSamples, StreamChoice
+from icrtool.records.tables import RobotLog
+
+Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
+
+DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING", "Heading2", "HEADING2")
+
+LARGEST_START_STD_RAD = math.radians(5.0)
+"""Headings less certain than this are not given to the filter."""
+
+LARGEST_SPREAD = 2.0
+"""Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
+
+LARGEST_DRIFT = math.radians(10.0)
+"""A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
+
+LONGEST_HOLE_S = 1.0
+"""No heading is estimated within a longer hole of the turn rate."""
+
+NOISY_SCATTER_RAD = math.radians(6.0)
+"""Scatter about the course over ground above which a heading is no attitude sensor's: it drifts, or is noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class DerivedHeading:
+    """A heading that was estimated.
+
+    Attributes
+    ----------
+    source : what it was made of; topic : of its parts
+    estimate : causal and smoothed; causal, smoothed : the same as samples, the causal ones for the filter
+    gyro : the turn rate that was used, None where it is the wheels'
+    attitude : the attitude sensor's own heading, corrected, None where none was used; attitude_offset : what was
+        subtracted from it, and its standard deviation [rad]
+    why : its parts and standard deviation, for the user
+    """
+
+    source: Source
+    topic: str
+    estimate: HeadingEstimate
+    causal: HeadingSamples
+    smoothed: HeadingSamples
+    gyro: GyroSamples | None
+    attitude: HeadingSamples | None
+    attitude_offset: tuple[float, float] | None
+    why: str
+
+    def apply(self, log: RobotLog) -> RobotLog:
+        """Return the log with the causal heading, for the filter, and the turn rate that agrees with it."""
+        heading = self.causal
+        rate = 1e9 / float(np.median(np.diff(heading.stamp_ns)))
+        stream = StreamChoice("heading", self.topic, "estimated", len(heading.stamp_ns), rate, "header", 0.0, self.why)
+        streams = (*(one for one in log.streams if one.role != "heading"), stream)
+        return replace(log, heading=heading, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
+
+
+def stated_source(log: RobotLog) -> Source:
+    """Return what kind of sensor states the heading of a log."""
+    kind = next((stream.message_type for stream in log.streams if stream.role == "heading"), "")
+    return "dual_antenna_message" if any(name in kind for name in DUAL_ANTENNA_TYPES) else "orientation"
+
+
+def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
+    """Estimate the heading of a log without one, from the best of what it holds.
+
+    Raises
+    ------
+    DataError
+        Too little distance.
+    """
+    if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2:
+        raise DataError(
+            log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
+        )
+    drive = drive_arrays(log)
+    found = _with_gyro(log, drive, None)
+    if found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT:
+        return found
+    turn = wheel_rate(drive, width_m)
+    pair, length = _pair(log, turn)
+    estimate = estimate_heading(drive, turn, [pair] if pair is not None else [], stands=False)
+    if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
+        return _derived(log, estimate, turn, None, length, None)
+    if found is None:
+        raise DataError(
+            log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
+        )
+    return found
+
+
+def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
+    """Estimate the heading from gyro, course over ground and the heading that the log states.
+
+    None without a gyro, where the gyro contradicts the courses over ground, where the stated heading alone is as good,
+    and where it is the position reference's own.
+
+    Parameters
+    ----------
+    drive : of the log
+    """
+    if drive.same_clock:
+        return None
+    found = _with_gyro(log, drive, log.heading)
+    if found is None or found.estimate.median_std > math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD):
+        return None
+    return found
+
+
+def attitude_error(estimate: HeadingEstimate) -> float:
+    """Return the standard deviation of the wandering error of the first absolute heading [rad]."""
+    return estimate.noises["0 size"]
+
+
+def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None) -> DerivedHeading | None:
+    """Return the estimate with the gyro that follows the courses over ground best; None where none does."""
+    best: DerivedHeading | None = None
+    epoch = int(log.wheels.stamp_ns[0])
+    for gyro in log.gyros:
+        found = gyro_rate(drive, gyro, epoch)
+        if found is None:
+            continue
+        turn, axis = found
+        absolute: list[AbsoluteHeading] = []
+        if stated is not None:
+            absolute.append(attitude_heading(drive, turn)._replace(aligned_std=ATTITUDE_STD_RAD))
+        pair, length = _pair(log, turn)
+        absolute += [pair] if pair is not None else []
+        estimate = estimate_heading(drive, turn, absolute)
+        if estimate is None or estimate.spread > LARGEST_SPREAD:
+            continue
+        if best is None or estimate.median_std < best.estimate.median_std:
+            topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
+            best = _derived(log, estimate, turn, topic, length, stated)
+    return best
+
+
+def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
+    """Return the bearing of the longest baseline between two antennas, and its length [m]."""
+    found = [one for one in (antenna_heading(log, other.fixes, turn) for other in log.other_receivers) if one]
+    return max(found, key=lambda one: one[1]) if found else (None, 0.0)
+
+
+def _derived(
+    log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None,
+    baseline_m: float, stated: HeadingSamples | None,
+) -> DerivedHeading:  # fmt: skip
+    """Return the record of an estimate."""
+    epoch = int(log.wheels.stamp_ns[0])
+    bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
+    parts = [bias if gyro_topic else "wheels (no usable turn rate in the log)", "course over ground"]
+    names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
+    source: Source = "gyro_course" if gyro_topic else "wheels_course"
+    if baseline_m > 0.0:
+        source = "antenna_pair"
+        parts.insert(0, f"two antennas {baseline_m:.2f} m apart")
+        names.insert(0, log.other_receivers[0].topic)
+    attitude, attitude_offset = None, None
+    if stated is not None:
+        source = "fused"
+        parts.insert(0, f"orientation (error {math.degrees(attitude_error(estimate)):.1f}°)")
+        names.insert(0, log.topic("heading", "orientation"))
+        offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
+        attitude_offset = offset, float(estimate.constants_std[OFFSET])
+        lag = round(float(estimate.constants[LAG]) * 1e9)
+        attitude = replace(stated, stamp_ns=stated.stamp_ns - lag, heading_rad=stated.heading_rad - attitude_offset[0])
+    std = math.degrees(estimate.median_std)
+    causal, smoothed = _samples(estimate, turn, epoch)
+    gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None
+    return DerivedHeading(
+        source,
+        " + ".join(names),
+        estimate,
+        causal,
+        smoothed,
+        gyro,
+        attitude,
+        attitude_offset,
+        f"{', '.join(parts)}; σ {std:.2f}°",
+    )
+
+
+def _samples(found: HeadingEstimate, turn: TurnRate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
+    """Return causal and smoothed headings as samples, none within a long hole."""
+    inside = np.ones(len(found.t), np.bool_)
+    for begin, end in turn.holes[turn.holes[:, 1] - turn.holes[:, 0] > LONGEST_HOLE_S]:
+        inside &= (found.t <= begin) | (found.t >= end)
+    rows = np.flatnonzero(inside)
+    stamps = epoch + np.round(found.t[rows] * 1e9).astype(np.int64)
+
+    def as_samples(psi: Floats, std: Floats, some: slice) -> HeadingSamples:
+        return HeadingSamples(stamps[some], np.angle(np.exp(1j * psi[rows]))[some], (std[rows] ** 2)[some])
+
+    sure = found.causal_std[rows] < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(found.causal_std)))
+    first = int(np.argmax(sure))
+    return (
+        as_samples(found.causal, found.causal_std, slice(first, None)),
+        as_samples(found.smoothed, found.smoothed_std, slice(None)),
+    )
+
+
+def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:
+    """Return a log whose heading is a turn rate only, where it drifts and its rate gives a better one; else None.
+
+    An orientation without a magnetometer is an integrated gyro: its offset wanders with the bias.
+
+    Parameters
+    ----------
+    scatter_rad : of the heading about the course over ground
+    width_m : the track width b
+    """
+    if scatter_rad < NOISY_SCATTER_RAD:
+        return None
+    rate = rate_of_heading(log)
+    if rate is None:
+        return None
+    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    streams = tuple(one for one in log.streams if one.role != "heading")
+    note = (
+        f"{log.name}: the heading drifts ({math.degrees(scatter_rad):.0f}° about the course over ground): "
+        "only turn rates are used"
+    )
+    bare = replace(log, heading=nothing, gyros=(*log.gyros, rate), streams=streams, warnings=(*log.warnings, note))
+    try:
+        found = derive_heading(bare, width_m)
+    except DataError:
+        return None
+    std = found.estimate.median_std
+    return bare if found.source != "wheels_course" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
+
+
+def rate_of_heading(log: RobotLog) -> GyroAxes | None:
+    """Return the turn rate of the measured heading about a sensor's upward axis; None with too few samples."""
+    heading = log.heading
+    stamps, rows = np.unique(heading.stamp_ns, return_index=True)
+    if len(stamps) < 3:
+        return None
+    turned = np.diff(np.unwrap(heading.heading_rad)[rows])
+    rate = -turned / (np.diff(stamps) / 1e9)
+    return GyroAxes(
+        log.topic("heading", "heading"),
+        stamps[:-1] + np.diff(stamps) // 2,
+        np.column_stack([0.0 * rate, 0.0 * rate, rate]),
+    )

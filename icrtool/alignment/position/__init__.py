@@ -1,0 +1,1 @@
+"""Position fixes: which reference, which class, how noisy, where they jump."""

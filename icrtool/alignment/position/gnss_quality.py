@@ -1,0 +1,220 @@
+"""Classes of the fixes: fixed, float or other by what they state and how they move; noise by class; jumps counted.
+
+A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
+tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icrtool.alignment.position.gnss_steps import FixSteps
+from icrtool.alignment.position.misreported_fixes import find_misreported
+from icrtool.config import Config
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.records.measurements import FixStatistics
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, PositionFixes
+from icrtool.records.tables import RobotLog
+
+LARGEST_SANE_GNSS_STD_M = 100.0
+"""A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""
+
+REFERENCE = 0
+CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED_FIX: "fixed"}
+"""Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and has one class."""
+
+FIXED_STD_M = 0.1
+"""What states more than this is no fixed solution; nmea_navsat_driver states 0.02 m times HDOP of one, 4 m of float."""
+
+SURELY_FIXED_STD_M = 0.05
+"""... and what states less is one, where no status is given."""
+
+NORM_SHARE = 0.5
+"""Where at least this share of the fixes is fixed, the others are RTK losses."""
+
+CLASS_STD_M = {OTHER_FIX: 1.0, FLOAT_FIX: 0.4}
+"""Least standard deviation of fixes that are not fixed, in a log where fixed is the norm."""
+
+CORRELATION_S = 10.0
+"""How long such a fix errs alike."""
+
+NOISIER = 1.5
+"""White noise from step to step that is this many times what the messages state is used instead."""
+
+SHORTEST_LOSS_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class GnssQuality:
+    """Classes of the fixes of a log, and their noise.
+
+    Attributes
+    ----------
+    log : with the variances that the fixes deserve; the given one in preset ``paper``
+    fix_class : uint8 (m,), keys of `CLASSES`
+    misreported : bool (m,), reported as fixed and are not
+    down_weighted : bool (m,), given a larger variance for their class
+    statistics : of the classes, and the jumps
+    losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
+    """
+
+    log: RobotLog
+    fix_class: Bytes
+    misreported: Bools
+    down_weighted: Bools
+    statistics: FixStatistics
+    losses_ns: Ints
+    warnings: tuple[str, ...]
+
+
+def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
+    """Return the classes of the fixes, and the noise of each.
+
+    The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
+    fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
+    other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
+    number of samples that err alike. Preset ``paper`` takes every fix as it is.
+    """
+    gnss, changes = log.gnss, config.filter.preset != "paper"
+    stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    kinds, misreported = _classes(log, stated, steps)
+    white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
+    fixed = kinds == FIXED_FIX
+    norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
+    variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
+    raised: list[str] = []
+    if changes:
+        variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
+    down = ~fixed & norm
+    variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
+    if raised or down.any():
+        gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
+    quality = GnssQuality(
+        log=replace(log, gnss=gnss),
+        fix_class=kinds,
+        misreported=misreported,
+        down_weighted=down,
+        statistics=FixStatistics(_class_std(gnss, kinds), white, gnss.stamp_ns[steps.jump_row], steps.jump_m),
+        losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
+        warnings=(),
+    )
+    notes = _notes(quality, stated, raised, changes=changes)
+    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
+
+
+def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
+    """Return the class of each fix (m,), and which are reported as fixed and are not (m,)."""
+    gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
+    if log.datum is None:
+        return np.full(len(stated), REFERENCE, np.uint8), none
+    stated_kind = _stated_class(gnss.stated_class, stated)
+    flagged = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
+    misreported = find_misreported(gnss.stamp_ns, steps, stated_kind == FIXED_FIX, flagged)
+    return np.where(misreported, FLOAT_FIX, stated_kind).astype(np.uint8), misreported
+
+
+def _stated_class(stated_kind: Bytes | None, stated: Floats) -> Bytes:
+    """Return the class of each fix by what its message states: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
+    stated_kind = np.full(len(stated), NOT_STATED, np.uint8) if stated_kind is None else stated_kind
+    rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
+    silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
+    kinds: Bytes = np.select([stated_kind == RTK_FIX, stated_kind == NOT_STATED], [rtk, silent], stated_kind).astype(
+        np.uint8
+    )
+    return kinds
+
+
+def _at_least_white(
+    variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float
+) -> tuple[Floats, list[str]]:
+    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated.
+
+    Returns the variances, and the names of the classes that were raised.
+    """
+    raised, names = variance.copy(), []
+    for code, name in CLASSES.items():
+        rows, std = kinds == code, white.get(name, math.nan)
+        if not rows.any() or not math.isfinite(std):
+            continue
+        stated = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_std_m**2)
+        if std**2 > NOISIER**2 * float(np.median(stated)):
+            raised[rows] = np.maximum(stated, std**2)
+            names.append(name)
+    return raised, names
+
+
+def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
+    """Return variances (m, 2) of fixes that are not fixed: at least their class's, and shared by all that err alike."""
+    least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
+    interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
+    alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
+    own = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
+    # Beyond the largest sane value the filter would take a variance for unknown, and the fix for a good one.
+    grown: Floats = np.minimum(alike * own, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
+    return grown
+
+
+def _losses(stamps: Ints, fixed: Bools) -> Ints:
+    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough.
+
+    Others before the first and after the last fixed one make a span with the log's end.
+    """
+    rows = np.flatnonzero(fixed)
+    begin, end = rows[:-1], rows[1:]
+    lost = (end - begin > 1) & (stamps[end] - stamps[begin] > SHORTEST_LOSS_S * 1e9)
+    spans = [(int(stamps[i]), int(stamps[k])) for i, k in zip(begin[lost], end[lost], strict=True)]
+    if len(rows) and stamps[rows[0]] - stamps[0] > SHORTEST_LOSS_S * 1e9:
+        spans.insert(0, (int(stamps[0]), int(stamps[rows[0]])))
+    if len(rows) and rows[-1] + 1 < len(stamps) and stamps[-1] - stamps[rows[-1]] > SHORTEST_LOSS_S * 1e9:
+        spans.append((int(stamps[rows[-1]]), int(stamps[-1]) + 1))
+    return _spans(spans)
+
+
+def _spans(pairs: list[tuple[int, int]]) -> Ints:
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
+    """Return sentences on what the fixes do not state, and on what was done to their noise."""
+    notes, misreported, rows = [], quality.misreported, quality.fix_class
+    if misreported.any():
+        notes.append(
+            f"{_counted(misreported)} state {_accuracy(stated[misreported], 'that they are fixed')} "
+            f"but scatter or jump like RTK float{': taken as float' if changes else ''}"
+        )
+    down = quality.down_weighted & ~misreported
+    if down.any():
+        gnss = quality.log.gnss
+        given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
+        notes.append(
+            f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{np.median(given):.2g} m"
+        )
+    for code, name in CLASSES.items():
+        if name in raised and not quality.down_weighted[rows == code].all():
+            kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
+            notes.append(
+                f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
+                f"{quality.statistics.step_std_m[name]:.2g} m: the scatter is used"
+            )
+    return notes
+
+
+def _class_std(gnss: PositionFixes, kinds: Bytes) -> dict[str, float]:
+    """Return the median standard deviation of the fixes of each class [m], by its name; NaN for no such fixes."""
+    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    given = {name: std[(kinds == code) & np.isfinite(std)] for code, name in CLASSES.items()}
+    return {name: float(np.median(one)) if len(one) else math.nan for name, one in given.items()}
+
+
+def _counted(rows: Bools) -> str:
+    count = int(np.count_nonzero(rows))
+    return f"{count:,} fixes ({100 * count / len(rows):.0f} %)"
+
+
+def _accuracy(stated: Floats, silent: str) -> str:
+    """Return the median accuracy stated (m,) [m] in words, `silent` where none is."""
+    known = stated[np.isfinite(stated) & (stated > 0)]
+    return f"±{np.median(known):.2g} m" if len(known) else silent

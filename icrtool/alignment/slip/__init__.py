@@ -1,0 +1,1 @@
+"""Slip events: where wheels and motion disagree."""

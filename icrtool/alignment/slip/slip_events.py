@@ -1,0 +1,307 @@
+"""Slip events: where wheels and motion disagree beyond what the motion model and the noise of the sensors allow.
+
+Pentzer 2014, Sections 2 and 7: ICRs that grow without bound mean pure slip or a robot that is stuck. Here it is found
+from the aligned measurements, before any filter, by a test over windows of half a second and more.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.slip.slip_extent import Extent, find_extent
+from icrtool.alignment.slip.slip_windows import Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import SensorData
+
+WINDOWS_S = (0.5, 1.0, 2.0)
+LONGEST_WINDOW_S = 16.0
+"""Windows are doubled to this where the fixes are too noisy for shorter ones."""
+
+LEAST_DISTANCE2 = 36.0
+"""Squared Mahalanobis distance of a window in which an event is seen."""
+
+LEAST_SHARE = 0.3
+"""... and the least share of the wheels' motion that the robot does not make, or makes sideways."""
+
+STUCK_SHARE = 0.2
+"""Robot that moves and turns less than this share of what its wheels do: immobilised."""
+
+FEWEST_INTERVALS = 2
+"""An event is seen in at least so many intervals between fixes: one alone may be a jump."""
+
+RESPONSE_STD_S = 0.1
+"""How far the time differs by which a robot follows its wheels."""
+
+LEAST_MODEL_ERROR = 0.03
+FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
+"""The model's error is what this share of the windows stays within: the first time events are still among them."""
+
+NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
+"""Of the absolute value of a standard normal."""
+
+MOST_FALSE = 0.25
+"""Most windows that show what slip cannot do, for each that shows slip as clearly."""
+
+JUMP_SIGMAS = 6.0
+JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
+"""A step beyond the noise by so many deviations, and beyond what wheels and a slide can do, is no motion."""
+
+RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
+"""A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
+
+MOVING_SHARE = 0.2
+"""Windows in which the wheels do less than this part of the usual show nothing of the model's error."""
+
+TURNING_MPS = 0.05
+"""Wheels slower than this do not turn."""
+
+
+class _Evidence(NamedTuple):
+    """Windows of all durations that disagree with the model.
+
+    Attributes
+    ----------
+    begin, end : (w,) rows of the knots
+    distance2 : (w,) squared Mahalanobis distance
+    false_rate : (w,) expected share of errors among windows as clear as this one; inf where slip cannot be the cause
+    """
+
+    begin: Ints
+    end: Ints
+    distance2: Floats
+    false_rate: Floats
+
+
+def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
+    """Find the spans in which the robot did not do what its wheels did.
+
+    Parameters
+    ----------
+    sensors : aligned: sides, signs, scale, conventions and delays corrected
+    width_m : distance b between the track centre lines, or what stands for it
+
+    Returns
+    -------
+    tuple of SlipEvent
+        In order of time; none where the motion model cannot be fitted.
+
+    Notes
+    -----
+    Windows of 0.5 to 2 s (longer where the fixes are noisy): displacement ahead and aside and turn, reference minus
+    model, over their standard deviations: noise of fixes and heading, wheel values held by the recorder, response time
+    at changes of speed, and the model's own error, a share of the distance, which is estimated from the log. The
+    squared Mahalanobis distance is chi-squared with 3 degrees of freedom.
+
+    A reference that is worse than it states makes the robot do too much as often as too little. Windows in which a side
+    does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
+    (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
+    """
+    try:
+        return _found_events(sensors, width_m)
+    except np.linalg.LinAlgError:
+        # Exact data, or intervals of very different lengths: nothing separates the parameters of the motion.
+        return ()
+
+
+def _found_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
+    knots = lay_knots(sensors)
+    if knots is None:
+        return ()
+    knots = _without_jumps(knots)
+    quiet = np.ones(len(knots.t), np.bool_)
+    events: list[SlipEvent] = []
+    for quantile in (FIRST_QUANTILE, LATER_QUANTILE):
+        model = fit_motion(knots, width_m, quiet)
+        if model is None:
+            return ()
+        evidence, error = _weigh(knots, model, quiet, quantile)
+        quiet = np.ones(len(knots.t), np.bool_)
+        events = []
+        for extent, row in _separate(knots, model, evidence, error):
+            quiet[max(extent.first - 1, 0) : extent.last + 2] = False
+            events.append(_event(knots, extent, float(evidence.distance2[row]), float(evidence.false_rate[row])))
+    return tuple(sorted(events, key=lambda event: event.begin_ns))
+
+
+def _without_jumps(knots: Knots) -> Knots:
+    """Return the knots without single outliers; a jump that stays becomes a hole, which no window spans."""
+
+    def impossible(first: Ints, last: Ints) -> Bools:
+        noise = np.sqrt(knots.variance[first] + knots.variance[last])
+        path, duration = knots.path_m[last] - knots.path_m[first], knots.t[last] - knots.t[first]
+        most = JUMP_SIGMAS * noise + JUMP_SPEED_SHARE * path + JUMP_MPS * duration
+        return np.asarray(np.abs(knots.place[last] - knots.place[first]) > most)
+
+    row = np.arange(len(knots.t))
+    step, over = impossible(row[:-1], row[1:]), impossible(row[:-2], row[2:])
+    kept = np.ones(len(row), np.bool_)
+    kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
+    knots = knots.rows(kept)
+    row = row[: len(knots.t)]
+    return knots._replace(holes=knots.holes + np.concatenate([[0], np.cumsum(impossible(row[:-1], row[1:]))]))
+
+
+def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple[_Evidence, Floats]:
+    """Return the windows that disagree with the model, and the model's error (3,) over the shortest of them.
+
+    Parameters
+    ----------
+    quiet : (m,) knots that the model's error is taken from
+    """
+    begin, end, distance2, excess, stuck, doubled = ([] for _ in range(6))
+    error = np.full(3, LEAST_MODEL_ERROR)
+    for duration in reversed(_durations(knots)):
+        first, last = cut(knots, duration)
+        long = last - first >= FEWEST_INTERVALS
+        windows = compare(knots, motion, first[long], last[long], RESPONSE_STD_S)
+        error = _model_error(windows, quiet, quantile)
+        # while the robot parks, sensors without noise leave no variance to divide by
+        windows = windows.rows(windows.path_m > TURNING_MPS * duration)
+        square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
+        missed = np.abs(windows.residual).max(axis=1)
+        shows = (square > LEAST_DISTANCE2) & (missed > LEAST_SHARE * windows.path_m)
+        windows, square = windows.rows(shows), square[shows]
+        begin.append(windows.begin)
+        end.append(windows.end)
+        distance2.append(square)
+        excess.append(_exceeds(windows))
+        stuck.append(windows.made < STUCK_SHARE * windows.path_m)
+        doubled.append(_from_doubled(windows) < STUCK_SHARE * windows.path_m)
+    first, last = np.concatenate(begin), np.concatenate(end)
+    square, beyond, still, twice = (np.concatenate(parts) for parts in (distance2, excess, stuck, doubled))
+
+    def clearest(kind: Bools) -> Floats:
+        return _clearest_of_runs(first[kind], last[kind], square[kind])
+
+    # what stands still is rarer than any slip, and so is its opposite
+    of_stuck = _false_rate(square, clearest(still), clearest(twice))
+    of_others = _false_rate(square, clearest(~beyond & ~still), clearest(beyond))
+    return _Evidence(first, last, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others))), error
+
+
+def _durations(knots: Knots) -> list[float]:
+    """Return the durations of the windows: doubled until the usual distance stands out of the noise of the fixes."""
+    path, dt = np.diff(knots.path_m), np.diff(knots.t)
+    moving = path > TURNING_MPS * dt
+    if not moving.any():
+        return list(WINDOWS_S)
+    speed = float(np.median(path[moving] / dt[moving]))
+    needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
+    durations = list(WINDOWS_S)
+    while speed * durations[-1] < needed and durations[-1] < LONGEST_WINDOW_S:
+        durations.append(2 * durations[-1])
+    return durations
+
+
+def _model_error(windows: Windows, quiet: Bools, quantile: float) -> Floats:
+    """Return the standard deviation of the model's error (3,), a share of the wheels' motion.
+
+    Sensor noise s and model error k p leave a share q of the residuals r within n standard deviations where k is the
+    q-quantile of sqrt(r^2 / n^2 - s^2) / p.
+    """
+    disturbed = np.concatenate([[0], np.cumsum(~quiet)])
+    used = disturbed[windows.end + 1] == disturbed[windows.begin]
+    used &= windows.path_m > MOVING_SHARE * (float(np.quantile(windows.path_m, 0.9)) if len(used) else 0.0)
+    if not used.any():
+        return np.full(3, LEAST_MODEL_ERROR)
+    excess = (windows.residual[used] / NORMAL_QUANTILE[quantile]) ** 2 - windows.sensor[used]
+    square = np.quantile(excess / windows.path_m[used, None] ** 2, quantile, axis=0)
+    return np.asarray(np.sqrt(np.maximum(square, LEAST_MODEL_ERROR**2)))
+
+
+def _exceeds(windows: Windows) -> Bools:
+    """Return which windows show more motion than the wheels', of a side and of distance or turn, or the opposite.
+
+    A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
+    """
+    least = LEAST_SHARE * windows.path_m
+    ahead, turned = (windows.model_ahead, windows.ahead), (windows.model_turned, windows.turned)
+    left, right = ([one + sign * other for one, other in zip(ahead, turned, strict=True)] for sign in (1.0, -1.0))
+
+    def beyond(model: Floats, residual: Floats) -> Bools:
+        missed = -np.sign(model) * residual
+        return np.asarray((missed < -least) | (missed > np.abs(model) + least))
+
+    return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned))
+
+
+def _from_doubled(windows: Windows) -> Floats:
+    """Return how far the robot is from twice the motion of its wheels (w,) [m]: the opposite of standing still."""
+    place = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
+    return np.maximum(place, np.abs(windows.turned - windows.model_turned))
+
+
+def _clearest_of_runs(begin: Ints, end: Ints, distance2: Floats) -> Floats:
+    """Return the largest squared distance of each run of windows that overlap (r,), ascending."""
+    if not len(begin):
+        return np.empty(0)
+    order = np.argsort(begin, kind="stable")
+    begin, end, distance2 = begin[order], end[order], distance2[order]
+    apart = np.flatnonzero(begin[1:] >= np.maximum.accumulate(end)[:-1]) + 1
+    return np.sort(np.maximum.reduceat(distance2, np.concatenate([[0], apart])))
+
+
+def _false_rate(distance2: Floats, targets: Floats, decoys: Floats) -> Floats:
+    """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,)."""
+    beyond = [len(values) - np.searchsorted(values, distance2) for values in (decoys, targets)]
+    return np.asarray(beyond[0] / np.maximum(beyond[1], 1))
+
+
+def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) -> list[tuple[Extent, int]]:
+    """Return events and the window that shows each, the clearest first; events do not overlap."""
+    row = np.arange(len(knots.t))
+    steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_STD_S)
+    free = knots.holes[1:] == knots.holes[:-1]
+    whole, found = free.copy(), []
+    for at in np.argsort(-evidence.distance2, kind="stable"):
+        core = slice(int(evidence.begin[at]), int(evidence.end[at]))
+        if evidence.false_rate[at] > MOST_FALSE or not free[core].all():
+            continue
+        extent = find_extent(knots.t, steps, error, whole & free, core)
+        if extent is not None and extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent):
+            free[extent.first : extent.last] = False
+            found.append((extent, int(at)))
+    return found
+
+
+def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
+    """Return whether the reference makes up, shortly before or after, for the distance that is missing in the event.
+
+    A position that is wrong for a while comes back; distance lost by slip does not.
+    """
+    middle = (knots.heading[1:] + knots.heading[:-1]) / 2
+    low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
+    rows = np.arange(max(int(low), 0), min(int(high), len(steps.begin)))
+    step = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
+    inside = (rows >= extent.first) & (rows < extent.last)
+    missed = complex(step[inside].sum())
+    if abs(missed) < RETURN_SIGMAS * math.sqrt(float(knots.variance[extent.first] + knots.variance[extent.last])):
+        return False
+    made_up = -(step * np.conj(missed)).real / abs(missed) ** 2
+    after, before = np.cumsum(made_up[rows >= extent.last]), np.cumsum(made_up[rows < extent.first][::-1])
+    return float(max(after.max(initial=0.0), before.max(initial=0.0))) > RETURNED_SHARE
+
+
+def _event(knots: Knots, extent: Extent, distance2: float, false_rate: float) -> SlipEvent:
+    tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
+    place = complex(knots.place[extent.first])
+    stuck = extent.made_share < STUCK_SHARE
+    return SlipEvent(
+        kind="immobilised" if stuck else extent.kind,
+        begin_ns=knots.epoch_ns + round(extent.begin_s * 1e9),
+        end_ns=knots.epoch_ns + round(extent.end_s * 1e9),
+        north_m=place.real,
+        east_m=place.imag,
+        distance_m=extent.distance_m,
+        severity=extent.severity,
+        confidence=(1.0 - false_rate) * max(0.0, 1.0 - tests * _tail(distance2)),
+    )
+
+
+def _tail(distance2: float) -> float:
+    """Return the probability that chi-squared with 3 degrees of freedom exceeds a value."""
+    return math.erfc(math.sqrt(distance2 / 2)) + math.sqrt(2 * distance2 / math.pi) * math.exp(-distance2 / 2)

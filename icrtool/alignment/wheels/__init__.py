@@ -1,0 +1,1 @@
+"""Wheels: their units, and what is known of each side."""

@@ -1,0 +1,1 @@
+"""Filters and smoothers, event by event."""

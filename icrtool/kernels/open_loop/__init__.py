@@ -1,0 +1,1 @@
+"""Open-loop trials and the statistics of their errors."""

@@ -1,0 +1,227 @@
+"""Open-loop propagation from every recorded state: where trials end, one path, and the direct integration.
+
+The dropout analysis of Pentzer 2014, Section 6.4: freeze the ICRs estimated at a state, drive on with wheel speeds
+alone, and compare with the reference when the path has grown by a horizon. ``open_loop_errors_direct`` integrates every
+trajectory and is the oracle; ``icrtool.kernels.open_loop.prefix_sums`` gives the same numbers far sooner.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.compiled import njit
+from icrtool.kernels.kinematics import euler_step
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
+
+SHORT = -1
+"""No trial: less than the horizon is left of the log's distance."""
+GAP = -2
+"""No trial: the trial spans a gap in the wheel data."""
+OUTAGE = -3
+"""No trial: it ends at a state without a reference (a real outage)."""
+STARTS_A_CALL = 1 << 16
+"""States whose trials are cut, or driven, at a time."""
+
+STANDING = -4
+"""No trial: the robot stands at the start, and another start counts for this standstill."""
+
+
+@njit
+def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> None:
+    """Fill `ends` (n_horizons, n_starts) for the starts from `lo` on: two pointers a horizon, O(n).
+
+    Notes
+    -----
+    Both pointers only move forward: distance[j] - distance[k] never grows with k, in floating point too.
+    """
+    distance, gap = drive.distance, drive.gap
+    for h in range(ends.shape[0]):
+        end = lo
+        next_gap = lo
+        for row in range(ends.shape[1]):
+            start = lo + row
+            end = max(end, start)
+            while end < len(distance) and distance[end] - distance[start] < horizons_m[h]:
+                end += 1
+            if end == len(distance):
+                ends[h, row] = SHORT
+                continue
+            next_gap = max(next_gap, start)
+            while next_gap < end and not gap[next_gap]:
+                next_gap += 1
+            if next_gap < end:
+                ends[h, row] = GAP
+            elif drive.in_outage[end]:
+                ends[h, row] = OUTAGE
+            else:
+                ends[h, row] = end
+
+
+@njit
+def integrate_trials(
+    drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int, row_lo: int, row_hi: int, errors: Floats
+) -> None:
+    """Fill rows [row_lo, row_hi) of `errors` (n_horizons, n_starts): each path is integrated once for all horizons.
+
+    Notes
+    -----
+    The path is integrated from the origin with heading zero and turned into place at its end: the same path, but its
+    rounding does not depend on where the datum is or how often the robot has turned.
+    """
+    each = 0 if len(icrs.x_icr) == 1 else 1
+    for row in range(row_lo, row_hi):
+        start = lo + row
+        y_icr_right, y_icr_left = icrs.y_icr_right[start * each], icrs.y_icr_left[start * each]
+        x_icr = icrs.x_icr[start * each]
+        cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
+        ahead, aside, turned = 0.0, 0.0, 0.0
+        state, reached = start, start - 1
+        while True:
+            end = -1
+            for h in range(ends.shape[0]):
+                if ends[h, row] > reached and (end < 0 or ends[h, row] < end):
+                    end = ends[h, row]
+            if end < 0:
+                break
+            for i in range(state, end):
+                ahead, aside, turned = euler_step(
+                    ahead,
+                    aside,
+                    turned,
+                    drive.dt_s[i],
+                    drive.v_left[i],
+                    drive.v_right[i],
+                    y_icr_right,
+                    y_icr_left,
+                    x_icr,
+                )
+            state, reached = end, end
+            miss_north = ahead * cos_psi - aside * sin_psi - (drive.north[end] - drive.north[start])
+            miss_east = ahead * sin_psi + aside * cos_psi - (drive.east[end] - drive.east[start])
+            for h in range(ends.shape[0]):
+                if ends[h, row] == end:
+                    errors[h, row] = math.sqrt(miss_north * miss_north + miss_east * miss_east)
+
+
+@njit
+def integrate_path(drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, path: Floats) -> None:
+    """Fill `path` (3, m): north, east, heading from the origin with heading zero."""
+    path[0, 0], path[1, 0], path[2, 0] = 0.0, 0.0, 0.0
+    for i in range(path.shape[1] - 1):
+        path[0, i + 1], path[1, i + 1], path[2, i + 1] = euler_step(
+            path[0, i],
+            path[1, i],
+            path[2, i],
+            drive.dt_s[start + i],
+            drive.v_left[start + i],
+            drive.v_right[start + i],
+            y_icr_right,
+            y_icr_left,
+            x_icr,
+        )
+
+
+def compiled_drive(drive: Drive) -> Drive:
+    """Return `drive` with its columns in the one form the kernels are compiled for; copies only what is not in it.
+
+    Notes
+    -----
+    A read-only column (pandas hands those out) would be another type to numba, and cost a second compilation.
+    """
+    floats = [np.require(column, np.float64, ["C", "A", "W"]) for column in drive[:7]]
+    flags = [np.require(column, np.bool_, ["C", "A", "W"]) for column in drive[7:]]
+    return Drive(*floats, *flags)
+
+
+def compiled_icrs(icrs: FrozenIcrs) -> FrozenIcrs:
+    """Return `icrs` in the one form the kernels are compiled for (see `compiled_drive`)."""
+    return FrozenIcrs(*[np.require(column, np.float64, ["C", "A", "W"]) for column in icrs])
+
+
+def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Ints:
+    """Find the state at which the trial from each start in [lo, hi) ends, for every horizon.
+
+    Parameters
+    ----------
+    drive : recorded states (n,)
+    horizons_m : float64 (n_horizons,), path lengths [m] in any order
+    lo, hi : the range of starts; all of them by default
+
+    Returns
+    -------
+    int64 (hi - lo, n_horizons), one horizon contiguous: index of the first state j with
+    ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`. The same for every model.
+    """
+    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
+    stop = len(drive.distance) if hi is None else hi
+    ends = np.empty((len(horizons), stop - lo), dtype=np.int64)
+    find_trial_ends(compiled_drive(drive), horizons, lo, ends)
+    return ends.T
+
+
+def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
+    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending; a table of all would need more memory."""
+    ends = np.empty((len(starts), len(horizons_m)), np.int64)
+    for lo in range(0, len(drive.distance), STARTS_A_CALL):
+        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+        some = slice(*np.searchsorted(starts, [lo, hi]))
+        ends[some] = trial_ends(drive, horizons_m, lo, hi)[starts[some] - lo]
+    return ends
+
+
+def count_trials(ends: Ints) -> TrialCounts:
+    """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
+    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING)]
+    return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)
+
+
+def open_loop_errors_direct(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
+    """Integrate every trajectory step by step: O(starts x steps), the oracle.
+
+    Parameters
+    ----------
+    drive : recorded states (n,)
+    icrs : what each start drives with
+    ends : int64 (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
+
+    Returns
+    -------
+    float64 (n_starts, n_horizons) [m], one horizon contiguous: horizontal distance between the open-loop position and
+    the reference at the trial's end; NaN where there is no trial.
+
+    Notes
+    -----
+    Section 6.4 with the kinematics of Eqs. 8-12 and the guard of Eqs. 32-34.
+    """
+    by_horizon = np.ascontiguousarray(ends.T)
+    errors = np.full(by_horizon.shape, np.nan)
+    integrate_trials(compiled_drive(drive), compiled_icrs(icrs), by_horizon, lo, 0, len(ends), errors)
+    return errors.T
+
+
+def open_loop_path(
+    drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
+) -> OpenLoopPath:
+    """Drive open loop from state `start` to state `end` with constant ICRs [m].
+
+    Returns
+    -------
+    The path at every state from `start` to `end`, both included, beginning at the reference pose of `start`.
+    """
+    local = np.empty((3, end - start + 1))
+    integrate_path(compiled_drive(drive), float(y_icr_right), float(y_icr_left), float(x_icr), start, local)
+    ahead, aside, turned = local
+    cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
+    # In place: paths of whole drives are as long as a column of the run.
+    aside_north = aside * sin_psi
+    aside *= cos_psi
+    aside += ahead * sin_psi
+    aside += drive.east[start]
+    ahead *= cos_psi
+    ahead -= aside_north
+    ahead += drive.north[start]
+    turned += drive.heading[start]
+    return OpenLoopPath(*local)

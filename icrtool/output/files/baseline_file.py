@@ -1,0 +1,174 @@
+"""Baselines on disk: a report.json, a run, a folder of runs, or the folder of a batch."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrtool.dropout_analysis.baseline import BaselineReport, BaselineRow
+from icrtool.errors import ConfigError
+from icrtool.kernels.open_loop.block_sums import BlockSums
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
+from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
+from icrtool.records.text import escaped
+
+METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
+
+LARGEST = 1e12
+"""Of a number in a report [m]: beyond it is damage, whose squares overflow."""
+
+ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The reports of a baseline, read when they are needed.
+
+    Attributes
+    ----------
+    path : as it was named
+    reports : report.json by name of the log
+    sha256 : of each log's files
+    sources : the files that name the reports: fleet.json of a batch, else the reports
+    """
+
+    path: Path
+    reports: Mapping[str, Path]
+    sha256: Mapping[str, tuple[str, ...]]
+    sources: tuple[Path, ...]
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        return sha256(b"".join(file.read_bytes() for file in self.sources)).hexdigest()
+
+    def missing(self, logs: Iterable[str]) -> list[str]:
+        """Return the logs of the baseline that are not among some others, by name."""
+        return sorted(set(self.reports) - set(logs))
+
+    def find(self, name: str, inputs: Sequence[Mapping[str, Any]]) -> BaselineReport | None:
+        """Return the report of a log: that of the same content, else of the same name; None where there is none.
+
+        A baseline that is one report file is that of any log.
+
+        Raises
+        ------
+        ConfigError
+            The report cannot be read.
+        """
+        content = {file["sha256"] for file in inputs}
+        found = next((log for log, files in self.sha256.items() if content and content <= set(files)), None)
+        if found is None and self.path.is_file():
+            found = next(iter(self.reports))
+        found = found if found is not None else name if name in self.reports else None
+        return read_report(self.reports[found], found) if found is not None else None
+
+
+def open_baseline(path: Path) -> Baseline:
+    """Find the reports of a baseline.
+
+    Raises
+    ------
+    ConfigError
+        There is none, or one cannot be read.
+    RunError
+        The fleet.json of a batch cannot be read.
+    """
+    if not path.is_file() and (path / FLEET_FILE).is_file():
+        return _fleet_baseline(path)
+    reports: dict[str, Path] = {}
+    files: dict[str, tuple[str, ...]] = {}
+    for file in [path] if path.is_file() else _report_files(path):
+        one = read_report(file)
+        if one.log in reports:
+            why = f"two reports of logs named {one.log}"
+            raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
+        reports[one.log], files[one.log] = file, one.sha256
+    if not reports:
+        raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
+    return Baseline(path, reports, files, tuple(reports.values()))
+
+
+def read_report(path: Path, log: str = "") -> BaselineReport:
+    """Read a report.json as a baseline.
+
+    Parameters
+    ----------
+    log : its name in a batch; default: that in the report
+
+    Raises
+    ------
+    ConfigError
+        It is not a dropout report.
+    """
+    try:
+        document = json.loads(path.read_bytes())
+        run = document["run"]
+        if not document["schema"].startswith(SCHEMA_FAMILY):
+            raise ValueError(document["schema"])
+        content = tuple(str(one["sha256"]) for one in run["inputs"])
+        return BaselineReport(
+            escaped(log or run["log"]), str(path), content, escaped(document["tool_version"]), dict(run["config"]),
+            dict(_rows(document)),
+        )  # fmt: skip
+    except OSError as err:
+        raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as err:
+        raise ConfigError(f"--baseline {path}", "not a complete dropout report", ADVICE) from err
+
+
+def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:
+    """Yield the rows of a report; those of the model comparison first, which others of the same name replace."""
+    ladder = document.get("ladder") or {}
+    for model in ladder.get("models", ()):
+        for h, horizon_m in enumerate(ladder["horizons_m"]):
+            values = {metric: _number(model[column][h]) for metric, column in METRICS.items()}
+            yield (model["name"], float(horizon_m)), BaselineRow(values, None)
+    for model in document["models"]:
+        sums = {float(one["horizon_m"]): _sums(one) for one in model.get("blocks", ())}
+        for row in model["by_horizon"]:
+            values = {metric: _number(row[column]) for metric, column in METRICS.items()}
+            yield (model["name"], float(row["horizon_m"])), BaselineRow(values, sums.get(float(row["horizon_m"])))
+
+
+def _sums(one: Mapping[str, Any]) -> BlockSums:
+    trials, p50, p95 = (np.array(one[name], np.int64) for name in ("trials", "above_p50", "above_p95"))
+    errors = np.array([_number(error) for error in one["errors_m"]])
+    if not trials.shape == p50.shape == p95.shape == errors.shape or len(errors) < 2:
+        raise ValueError("blocks of unequal number")
+    if min(column.min() for column in (trials, p50, p95)) < 0 or trials.max() > LARGEST:
+        raise ValueError("a number of trials")
+    return BlockSums(trials, errors, p50, p95, _number(one["p50_slope_m"]), _number(one["p95_slope_m"]))
+
+
+def _number(value: float | None) -> float:
+    number = math.nan if value is None else float(value)
+    if abs(number) > LARGEST:
+        raise ValueError("a length")
+    return number
+
+
+def _fleet_baseline(path: Path) -> Baseline:
+    """Return the baseline of a batch: its fleet.json names logs, content and runs."""
+    logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
+    present = {log: found for log, found in logs.items() if os.path.isfile(found[0])}  # noqa: PTH113 - any text may be a path here
+    if not present:
+        raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
+    files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+    return Baseline(path, {log: file for log, (file, _) in present.items()}, files, (path / FLEET_FILE,))
+
+
+def _report_files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        raise ConfigError(f"--baseline {path}", "no such file or directory", ADVICE)
+    if (path / REPORT_FILE).is_file():
+        return [path / REPORT_FILE]
+    return sorted(path.glob(f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"))

@@ -1,0 +1,73 @@
+"""The calibration file: written whole or not at all, read back as a `Calibration`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration
+from icrtool.calibration.stored import calibration_of
+from icrtool.errors import OutputError, RunError
+from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.json_file import json_bytes, schema_of
+
+FILE_NAME = "calibration.json"
+
+
+def open_calibration(file: Path | str) -> Calibration:
+    """Read a calibration file.
+
+    Parameters
+    ----------
+    file : what ``icrtool calibrate -o`` or `Calibration.write` wrote
+
+    Raises
+    ------
+    RunError
+        It cannot be read, or is not a calibration.
+    """
+    path = Path(file)
+    try:
+        return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)
+    except OSError as err:
+        raise RunError(path, "cannot be read", err.strerror or str(err)) from err
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as err:
+        why = "not a calibration with a motion model"
+        raise RunError(path, why, "make one with icrtool calibrate -o") from err
+
+
+def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
+    """Write plain data of a calibration: into `place` where that is a folder, else as `place`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        Something that is not a calibration is there, or it cannot be written.
+    """
+    file = calibration_file(place)
+    write_file(file, json_bytes(document))
+    return file
+
+
+def calibration_file(place: Path) -> Path:
+    """Return where a calibration asked for at `place` goes.
+
+    Raises
+    ------
+    OutputError
+        Its folder does not exist, or something that is not a calibration is there.
+    """
+    file = place / FILE_NAME if place.is_dir() else place
+    if not file.parent.is_dir():
+        raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
+    if file.exists() and schema_of(file) != CALIBRATION_SCHEMA:
+        raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
+    return file

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from icrtool.errors import OutputError
+from icrtool.output.exports.acceptance import write_junit, write_markdown
+from icrtool.output.files import disk
+from icrtool.output.files.atomic_file import atomic_file, check_place, write_file
+
+
+def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
+    with atomic_file(tmp_path / "a.txt") as partial:
+        partial.write_text("new")
+        assert not (tmp_path / "a.txt").exists()
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "new")]
+
+
+def write_half(file: Path, failure: BaseException) -> None:
+    with atomic_file(file) as partial:
+        partial.write_text("half")
+        raise failure
+
+
+def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(OutputError, match=r"a\.txt: cannot be written; No space"):
+        write_half(tmp_path / "a.txt", OSError(errno.ENOSPC, "No space left on device"))
+    with pytest.raises(KeyboardInterrupt):
+        write_half(tmp_path / "a.txt", KeyboardInterrupt())
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+@pytest.mark.parametrize("write", [write_junit, write_markdown])
+def test_a_file_system_that_only_reads_is_one_error(tmp_path: Path, monkeypatch, write) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for name in ("touch", "write_bytes", "replace", "unlink"):
+        monkeypatch.setattr(Path, name, refuse)
+    with pytest.raises(OutputError, match="cannot be written; Read-only file system"):
+        write(tmp_path / "a", [])
+
+
+@pytest.mark.parametrize("call", ["sync", "replace"])
+def test_a_disk_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch, call: str) -> None:
+    (tmp_path / "a.txt").write_text("old")
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(disk, call, fail)
+    with pytest.raises(OutputError, match="Input/output error"), atomic_file(tmp_path / "a.txt") as partial:
+        partial.write_text("new")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path(os.devnull)):
+        with pytest.raises(OutputError, match="device or pipe"):
+            check_place(place)
+        with pytest.raises(OutputError, match="device or pipe"), atomic_file(place):
+            pass
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "a.txt").symlink_to("real/b.txt")
+    (tmp_path / "real" / ".b.txt.12345678.partial.txt").write_text("of a killed process")
+    with atomic_file(tmp_path / "a.txt") as partial:
+        partial.write_text("new")
+    assert (tmp_path / "a.txt").is_symlink()
+    assert [(path.name, path.read_text()) for path in (tmp_path / "real").iterdir()] == [("b.txt", "new")]
+
+
+@pytest.mark.parametrize("name", ["\u6f22" * 80 + ".json", "a." + "x" * 250, "b" * 250 + ".csv"])
+def test_the_longest_name_a_file_system_takes_can_be_written(tmp_path: Path, name: str) -> None:
+    for text in ("old", "new"):
+        write_file(tmp_path / name, text)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "new")]
