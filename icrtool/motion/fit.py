@@ -116,7 +116,7 @@ class PooledFit(FittedModel):
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
-            others = Pool([w for w in pool.windows if w is not pool.windows[i]], pool.widths_m[1:])
+            others = pool.without(i)
             fitted = others.fit(self.model, self.wheels and others.fit(self.wheels.model)).fitted
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
@@ -316,6 +316,11 @@ class Pool:
         own = np.tile(constant_std(model), len(self.windows))
         mean = np.concatenate([model.prior_mean, np.zeros(len(own))])
         return mean, np.concatenate([model.prior_std, own])
+
+    def without(self, recording: int) -> Pool:
+        """Return the windows of the other recordings."""
+        others = [i for i in range(len(self.windows)) if i != recording]
+        return Pool([self.windows[i] for i in others], [self.widths_m[i] for i in others])
 
     def rows(self, recording: int) -> slice:
         """Return where the residuals of a recording are."""
