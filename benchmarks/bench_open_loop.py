@@ -21,7 +21,7 @@ from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)
-STARTS_A_CALL = 65_536
+ROWS_AT_ONCE = 65_536
 NO_SLIP = FrozenIcrs.constant(0.305, -0.305, 0.0)
 
 
@@ -64,8 +64,8 @@ def seconds(job: Callable[[], object], repeats: int) -> float:
 def by_ranges(drive: Drive, icrs: FrozenIcrs) -> None:
     """Compute all errors, a range of starts at a time, as memory allows on the longest logs."""
     n = len(drive.dt_s)
-    for lo in range(0, n, STARTS_A_CALL):
-        ends = trial_ends(drive, HORIZONS_M, lo, min(lo + STARTS_A_CALL, n))
+    for lo in range(0, n, ROWS_AT_ONCE):
+        ends = trial_ends(drive, HORIZONS_M, lo, min(lo + ROWS_AT_ONCE, n))
         open_loop_errors(drive, icrs, ends, lo)
 
 
@@ -114,7 +114,7 @@ def main() -> None:
     by_ranges(*drive_around(0.01))
     open_loop_errors_direct(*drive_around(0.01), np.zeros((1, 1), dtype=np.int64))
     compare(1 / 6 if quick else 1.0)
-    print(f"ends and errors by ranges of {STARTS_A_CALL} starts, momentary ICRs")
+    print(f"ends and errors by ranges of {ROWS_AT_ONCE} starts, momentary ICRs")
     grow([1 / 6, 1.0] if quick else [1 / 6, 1.0, 10.0])
 
 

@@ -22,8 +22,19 @@ class IcrToolError(Exception):
         self.what = what
         self.why = why
         self.advice = advice
-        text = f"{what}: {why}; {advice}" if advice else f"{what}: {why}"
-        super().__init__(shortened(escaped(text), LONGEST_MESSAGE))
+        super().__init__(_line(f"{what}: {self._reason}"))
+
+    @property
+    def _reason(self) -> str:
+        return f"{self.why}; {self.advice}" if self.advice else self.why
+
+    def beside(self, *names: str) -> str:
+        """Return the line as it is read beside one of some names: without that name."""
+        return _line(self._reason) if str(self.what) in names else str(self)
+
+
+def _line(text: str) -> str:
+    return shortened(escaped(text), LONGEST_MESSAGE)
 
 
 class ConfigError(IcrToolError):

@@ -21,7 +21,7 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, cut_windows, extent_of
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, cut_windows, totals_of
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -197,7 +197,7 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     """
     stretches: Counter[float] = Counter()
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    pooled = extent_of(*recordings)
+    pooled = totals_of(*recordings)
     for i, recording in enumerate(recordings):
         try:
             windows = cut_windows(recording, LENGTHS_M, pooled)

@@ -31,7 +31,7 @@ from icrtool.motion.models import (
     typical_drive,
     wheel_motion,
 )
-from icrtool.motion.recording import Recording, Steps, cut_windows, extent_of
+from icrtool.motion.recording import Recording, Steps, cut_windows, totals_of
 from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -268,7 +268,7 @@ class _Tester:
     def __init__(self, recordings: Sequence[Recording], horizons_m: Sequence[float] = ()) -> None:
         self._folds = plan_folds(recordings)
         self._recordings, self._horizons_m = recordings, tuple(horizons_m)
-        pooled = extent_of(*recordings)
+        pooled = totals_of(*recordings)
         windows = [cut_windows(one, pooled=pooled) for one in recordings]
         self.pool = Pool(windows, [one.width_m for one in recordings])
         choosing = self.pool.length_m == CHOICE_HORIZON_M

@@ -24,7 +24,7 @@ from icrtool.calibration.pooled import (
 )
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.open_loop.direct import STARTS_A_CALL
+from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.error_statistics import error_summary
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Summary
@@ -188,8 +188,8 @@ def _errors_of_filter(drive: Drive, icrs: FrozenIcrs, trials: Trials) -> Floats:
     """Return the errors (k, h) [m] of the filter's ICRs, some starts at a time."""
     order = np.argsort(trials.starts, kind="stable")
     starts, errors = trials.starts[order], np.empty(trials.ends.shape)
-    for lo in range(0, len(drive.distance), STARTS_A_CALL):
-        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+    for lo in range(0, len(drive.distance), ROWS_AT_ONCE):
+        hi = min(lo + ROWS_AT_ONCE, len(drive.distance))
         some = slice(*np.searchsorted(starts, [lo, hi]))
         ends = np.full((hi - lo, trials.ends.shape[1]), -1, np.int64)
         ends[starts[some] - lo] = trials.ends[order[some]]
@@ -219,8 +219,8 @@ def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
     moved = held * (run.table.v_left_mps + run.table.v_right_mps) / 2.0
     place = np.zeros(last + 1, np.complex128)
-    for lo in range(0, last, STARTS_A_CALL):
-        hi = min(lo + STARTS_A_CALL, last)
+    for lo in range(0, last, ROWS_AT_ONCE):
+        hi = min(lo + ROWS_AT_ONCE, last)
         place[lo + 1 : hi + 1] = moved[lo:hi] * np.exp(0.5j * (psi[lo:hi] + psi[lo + 1 : hi + 1]))
     return psi, np.cumsum(place, out=place)
 

@@ -17,7 +17,7 @@ import click
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import signal_word
-from icrtool.records.text import LogText, escaped
+from icrtool.records.text import LogText, counted, escaped
 
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
@@ -259,5 +259,4 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
-    logs = f"{len(rows)} log{'s' if len(rows) != 1 else ''}"
-    return f"\n{logs}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"
+    return f"\n{counted(len(rows), 'log')}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"

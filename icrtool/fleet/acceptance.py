@@ -39,7 +39,6 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
             f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
         )
         lines += [met, ""]
-    if shown:
         shown.sort(key=lambda pair: pair[1].passed)
         limits = []
         for row, one in shown:

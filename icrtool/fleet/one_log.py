@@ -17,7 +17,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions, Stage, fit_and_write, report_and_write
 from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
-from icrtool.logs.containers.split_files import file_sha256, files_of_log
+from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
 
@@ -81,10 +81,8 @@ def process(request: Request, stage: Stage) -> Row:
         row = _results(request, stage)
     except IcrToolError as err:
         # A full disk may not be full the next time; the log's own errors come again.
-        # Row and message name the log already.
-        reason = str(err)
-        for name in (request.path, request.directory):
-            reason = reason.removeprefix(f"{path_of(name)}: ")
+        path, directory = path_of(request.path), path_of(request.directory)
+        reason = err.beside(str(path), str(directory), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError))
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     row_file = path_of(request.row_file)
@@ -135,6 +133,7 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         request.row,
         status="done",
         reason=f"not usable: {summary['unusable_because']}" if not summary["usable"] else "",
+        usable=summary["usable"],
         robot=request.row.robot or request.config.robot.name or "",
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary["drive"]["duration_s"],

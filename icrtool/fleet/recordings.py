@@ -189,10 +189,12 @@ def is_recording(file: Path) -> bool:
     try:
         with file.open("rb") as stream:
             container = container_of(stream)
+            if container is not SqliteBag:
+                return container is not None
             stream.seek(0)
             # Other programs keep SQLite files too.
-            first = stream.read(FIRST_BYTES) if container is SqliteBag else b"messages topics"
-            return container is not None and b"messages" in first and b"topics" in first
+            first = stream.read(FIRST_BYTES)
+            return b"messages" in first and b"topics" in first
     except OSError:
         return False
 

@@ -95,7 +95,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     RunError
         The folder does not hold the result of a batch.
     """
-    logs = [one for one in logs_of_fleet(directory) if one.multiplier is not None]
+    logs = [one for one in logs_of_fleet(directory) if one.usable]
     robots = {one.robot for one in logs}
     found: dict[str, list[Path]] = {}
     for one in logs:

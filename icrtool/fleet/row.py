@@ -40,7 +40,7 @@ class Row:
     log : path below the common parent
     run : directory of the run below that of the batch
     status : ``skipped``: done by an earlier batch from the same input, configuration and version
-    reason : why it failed, was skipped, or its ICRs are not usable
+    reason : why it failed, was skipped, or its ICRs are not usable; `usable` : whether they are
     details : last lines of the process that failed
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
@@ -56,6 +56,7 @@ class Row:
     run: str
     status: Status
     reason: str = ""
+    usable: bool = True
     details: str = ""
     repeatable: bool = True
     robot: str = ""

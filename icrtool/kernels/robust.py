@@ -225,8 +225,11 @@ def sandwich_covariance(
     count = len(gradients)
     meat = gradients.T @ gradients * (count / max(count - 1, 1))
     if group_std is not None:
-        rows = [np.flatnonzero(group == one) for one in np.unique(group)]
-        of_groups = [normal_equations(residuals[one], jacobian[one], weights[one])[0] * group_std for one in rows]
+        order, first = _grouped(group)
+        of_groups = [
+            normal_equations(residuals[one], jacobian[one], weights[one])[0] * group_std
+            for one in np.split(order, first[1:])
+        ]
         meat = (count * meat + sum(one @ one.T for one in of_groups)) / (count + 1)
     meat = meat + prior
     inverse = np.linalg.solve(information, np.eye(len(prior)))
@@ -241,10 +244,15 @@ def sandwich_covariance(
     return (covariance + covariance.T) / 2.0, information, count
 
 
+def _grouped(group: Ints) -> tuple[Ints, Ints]:
+    """Return the rows (m,) group by group, and where each group begins among them (g,)."""
+    order = np.argsort(group, kind="stable")
+    return order, np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
+
+
 def _gradients(residuals: Floats, jacobian: Floats, weights: Floats, group: Ints) -> Floats:
     """Return the gradient (g, k) of each group, in their order."""
-    order = np.argsort(group, kind="stable")
-    first = np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
+    order, first = _grouped(group)
     gradients: Floats = np.add.reduceat((jacobian * (weights * residuals)[:, None])[order], first)
     return gradients
 

@@ -173,21 +173,21 @@ class Windows(NamedTuple):
     moving: Ints
 
 
-class Extent(NamedTuple):
+class Totals(NamedTuple):
     """Distance [m] and time [s] of all recordings that are fitted together."""
 
     metres: float
     seconds: float
 
 
-def extent_of(*recordings: Recording) -> Extent:
-    """Return what recordings are together."""
-    return Extent(
+def totals_of(*recordings: Recording) -> Totals:
+    """Return distance and time of recordings together."""
+    return Totals(
         sum(float(one.drive.distance[-1]) for one in recordings), sum(float(one.held_s.sum()) for one in recordings)
     )
 
 
-def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Extent | None = None) -> Windows:
+def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Totals | None = None) -> Windows:
     """Cut a recording into windows of driven distance; none crosses a gap or a slip event, or ends in an outage.
 
     Parameters
@@ -201,7 +201,7 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
     """
     drive = recording.drive
     place = drive.north + 1j * drive.east
-    pooled = pooled or extent_of(recording)
+    pooled = pooled or totals_of(recording)
     every = min(max(EVERY_M, pooled.metres / MOST_STARTS), LEAST_OFTEN_M)
     begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]

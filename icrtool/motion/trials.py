@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import STARTS_A_CALL, ends_from
+from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -104,8 +104,8 @@ def predicted_path(
     turned, heading = np.empty(count), np.zeros(count + 1)
     moved, place = np.empty(count, np.complex128), np.zeros(count + 1, np.complex128)
     # Some at a time: of a long drive, the columns between would take several times what is kept.
-    for lo in range(0, count, STARTS_A_CALL):
-        some, sums = slice(lo, lo + STARTS_A_CALL), slice(lo, lo + STARTS_A_CALL + 1)
+    for lo in range(0, count, ROWS_AT_ONCE):
+        some, sums = slice(lo, lo + ROWS_AT_ONCE), slice(lo, lo + ROWS_AT_ONCE + 1)
         held = of.held[some]
         v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro[some]))
         omega += own.gyro_bias_radps

@@ -13,6 +13,7 @@ from icrtool.records.text import counted
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import ControllerErrors
+    from icrtool.motion.models import FittedModel
     from icrtool.records.run_document import RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -67,6 +68,11 @@ def duration_text(seconds: float) -> str:
 def model_text(label: str, name: str, parameters: int) -> str:
     """Return a recommended model as ``three ICRs (3 parameters, model icr)``."""
     return f"{label} ({counted(parameters, 'parameter')}, model {name})"
+
+
+def fitted_model_text(fitted: FittedModel) -> str:
+    """Return a fitted model as `model_text` does."""
+    return model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
 
 
 def controller_text(numbers: Mapping[str, Any]) -> str:

@@ -22,8 +22,8 @@ GAP = -2
 """No trial: the trial spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
-STARTS_A_CALL = 1 << 16
-"""States whose trials are cut, or driven, at a time."""
+ROWS_AT_ONCE = 1 << 16
+"""States whose trials are cut or driven, or which a path is made of, at a time: bounds memory."""
 
 STANDING = -4
 """No trial: the robot stands at the start, and another start counts for this standstill."""
@@ -165,8 +165,8 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
 def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
     """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending; a table of all would need more memory."""
     ends = np.empty((len(starts), len(horizons_m)), np.int64)
-    for lo in range(0, len(drive.distance), STARTS_A_CALL):
-        hi = min(lo + STARTS_A_CALL, len(drive.distance))
+    for lo in range(0, len(drive.distance), ROWS_AT_ONCE):
+        hi = min(lo + ROWS_AT_ONCE, len(drive.distance))
         some = slice(*np.searchsorted(starts, [lo, hi]))
         ends[some] = trial_ends(drive, horizons_m, lo, hi)[starts[some] - lo]
     return ends

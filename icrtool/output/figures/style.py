@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from struct import pack
 from typing import TYPE_CHECKING, Any, ParamSpec, cast
-from zlib import compress, crc32
 
 import matplotlib as mpl
 import numpy as np
@@ -18,7 +16,6 @@ from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats
 from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
@@ -72,10 +69,12 @@ RC: dict[str, Any] = {
 }
 
 SAVE: dict[str, dict[str, Any]] = {
+    "png": {"metadata": {"Software": "icrtool"}, "pil_kwargs": {"compress_level": 1}},
     "svg": {"metadata": {"Date": None, "Creator": "icrtool"}},
     "pdf": {"metadata": {"CreationDate": None, "Creator": "icrtool", "Producer": "icrtool"}},
 }
-"""Keywords by format: nothing that changes from run to run."""
+"""Keywords by format: nothing that changes from run to run. PNG files are packed quickly and are
+about a tenth larger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,28 +196,8 @@ def picture_bytes(figure: Figure, form: str) -> bytes:
     """Return a figure as a file of a format; the bytes depend on the figure alone."""
     memory = BytesIO()
     with style():
-        if form == "png":
-            canvas = FigureCanvasAgg(figure)
-            canvas.draw()  # type: ignore[no-untyped-call]
-            return _png_bytes(np.asarray(canvas.buffer_rgba())[..., :3], figure.dpi)  # type: ignore[no-untyped-call]
         figure.savefig(memory, format=form, **SAVE[form])
     return memory.getvalue()
-
-
-def _png_bytes(rgb: NDArray[np.uint8], dpi: float) -> bytes:
-    """Return an image (height, width, 3) as PNG; `Figure.savefig` would try five filters for each line of it."""
-    height, width, _ = rgb.shape
-    lines = np.insert(rgb.reshape(height, -1), 0, 0, axis=1)  # before each line the number of its filter: none
-    per_metre = round(dpi / 0.0254)
-    content = {
-        b"IHDR": pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0),
-        b"tEXt": b"Software\0icrtool",
-        b"pHYs": pack(">IIB", per_metre, per_metre, 1),
-        b"IDAT": compress(lines.tobytes(), 1),
-        b"IEND": b"",
-    }
-    chunks = (pack(">I", len(data)) + kind + data + pack(">I", crc32(kind + data)) for kind, data in content.items())
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:

@@ -29,7 +29,7 @@ class FleetLog(msgspec.Struct, frozen=True):
     Attributes
     ----------
     run : its directory below that of the batch
-    multiplier : None where its ICRs are not usable
+    usable : whether its ICRs are
     """
 
     log: str
@@ -38,7 +38,7 @@ class FleetLog(msgspec.Struct, frozen=True):
     robot: str
     group: str
     inputs: list[InputFile]
-    multiplier: float | None = None
+    usable: bool = True
 
 
 class _Fleet(msgspec.Struct, frozen=True):

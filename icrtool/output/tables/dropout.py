@@ -19,7 +19,7 @@ from icrtool.output.text_format import (
     distance_text,
     duration_text,
     error_text,
-    model_text,
+    fitted_model_text,
     run_title,
     unusable_lines,
 )
@@ -102,7 +102,7 @@ def headline(report: DropoutReport) -> list[str]:
     fitted, numbers = calibration.fitted, calibration.controller_numbers()
     interval = f" ({best.interval_text})" if best.interval_text else ""
     without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
-    model = model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
+    model = fitted_model_text(fitted)
     alone = controller_error_text(calibration.controller) if len(fitted.parameters) else ""
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",

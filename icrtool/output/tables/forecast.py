@@ -14,7 +14,7 @@ from icrtool.errors import RunError
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.table_file import csv_frame
 from icrtool.output.text_blocks import Block, Table, Text
-from icrtool.output.text_format import distance_text, model_text
+from icrtool.output.text_format import distance_text, fitted_model_text
 from icrtool.records.text import counted
 
 PLAN_COLUMNS = ("east_m", "north_m")
@@ -111,7 +111,7 @@ def format_forecast(
     """Return the table of a forecast, no line end."""
     total = float(forecast.distance_m[-1])
     fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
-    model = f"{model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))} from {logs}"
+    model = f"{fitted_model_text(fitted)} from {logs}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []
     for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):

@@ -11,7 +11,7 @@ from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
 from icrtool.motion.models import TERMS, FittedModel, find_model
 from icrtool.output.text_blocks import Block, Table, Text
-from icrtool.output.text_format import model_text
+from icrtool.output.text_format import fitted_model_text
 
 GEOMETRY = (
     ("y_icr_right_m", "y ICR right", "m"),
@@ -28,7 +28,7 @@ def format_result(result: CalibrationResult) -> Text:
     """Return the tables of a pooled calibration, no line end."""
     calibration, fitted = result.calibration, result.calibration.fitted
     blocks: list[Block] = [
-        f"Recommended: {model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))}: {calibration.why}",
+        f"Recommended: {fitted_model_text(fitted)}: {calibration.why}",
         "",
         *_parameter_blocks(calibration),
         "",

@@ -72,7 +72,7 @@ def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pyt
 
 def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     logs = [*rows("a", multiplier=1.5), *rows("b", "copy", group="ice", multiplier=1.5)]
-    logs += [*rows("unusable"), Row("d", "runs/d", "failed", robot="barn")]
+    logs += [*rows("unusable", usable=False), Row("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
     groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
     assert runs_of_fleet(place) == _groups((str(place),)) == groups

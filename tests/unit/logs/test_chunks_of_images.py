@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.summary import Summary
 from mcap.writer import CompressionType, IndexType, Writer
 
 from icrtool.logs.containers.open_log import open_log
@@ -84,6 +85,13 @@ def test_without_message_index_all_is_read(tmp_path: Path) -> None:
     assert (len(found), size > IMAGES * IMAGE_BYTES) == (20 * IMAGES, True)
 
 
+def summary_of(log: Path) -> Summary:
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return summary
+
+
 CHANNEL_AT, OFFSET_AT = 9, 23
 """Where the channel and the first message's offset stand in a record of a message index."""
 
@@ -93,9 +101,7 @@ def test_a_message_index_that_contradicts_its_chunk_is_not_used(tmp_path: Path, 
     """Of the small messages: a channel that the file lacks, an offset behind the chunk, a negative one."""
     log = write(tmp_path / "log.mcap", CompressionType.NONE)
     whole, content = by_library(log), bytearray(log.read_bytes())
-    with log.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = summary_of(log)
     chunk = summary.chunk_indexes[2]
     (small,) = (number for number, one in summary.channels.items() if one.topic == "/small")
     record = chunk.message_index_offsets[small]
@@ -111,10 +117,7 @@ def test_damage_is_found_as_in_any_chunk(tmp_path: Path, damage: str) -> None:
     """A wrong message index, or a damaged record header: the whole chunk is read, and its checksum decides."""
     log = write(tmp_path / "log.mcap", CompressionType.NONE)
     whole, content = by_library(log), bytearray(log.read_bytes())
-    with log.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[2]
+    chunk = summary_of(log).chunk_indexes[2]
     if damage == "index":
         at = chunk.chunk_start_offset + chunk.chunk_length
         content[at] = 99
