@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -105,7 +104,7 @@ def run_filter(
         sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
         output.heading_innovation,
     )  # fmt: skip
-    table = carry_headings(table, sensors, heading.used)
+    carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
         table=table,
@@ -177,13 +176,13 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
     )
 
 
-def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
-    """Return states with the headings (h,), where they are estimated and `used` (h,), carried on by the wheels' turn.
+def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
+    """Carry the headings (h,), where they are estimated and `used` (h,), on by the wheels' turn; changes the states.
 
     The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
     """
     if not (sensors.heading_is_estimated and used.any()):
-        return table
+        return
     headings = sensors.headings
     stamps, psi = headings.stamp_ns[used], table.heading_rad
     t, seen = ((one - table.stamp_ns[0]) / 1e9 for one in (table.stamp_ns, stamps))
@@ -193,11 +192,8 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
     off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
     std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
     clear = recent & (CLEARLY * std < table.std_heading_rad)
-    return replace(
-        table,
-        heading_rad=psi + np.where(clear, off[last], 0.0),
-        std_heading_rad=np.where(clear, std, table.std_heading_rad),
-    )
+    psi[clear] += off[last[clear]]
+    table.std_heading_rad[clear] = std[clear]
 
 
 def _outcome(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from icrtool.alignment.position.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, odometry
+from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
 from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
@@ -45,6 +46,9 @@ MOST_TIMES = 12
 TIME_CLEARANCE = 0.06
 """At most so many times are written beside the path, none closer to another than this share of the view."""
 
+Corners = tuple[Floats, Floats]
+"""Least and greatest (north, east) [m]."""
+
 _DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
 FIX_LOOKS: dict[int, dict[str, Any]] = {
     REFERENCE: _DOT,
@@ -69,7 +73,7 @@ def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     found = odometry(run)
     table, drive = run.table, run.summary["drive"]
-    lowest, highest = _extent(run, found.icr, found.no_slip)
+    lowest, highest = _extent(_corners(table), *(_corners(path) for path in _each(found)))
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
@@ -83,14 +87,12 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
-    for path, pen, name, order in (
-        (found.icr, ICR, "ICR odometry", 3),
-        (found.no_slip, NO_SLIP, "no-slip odometry", 2),
-    ):
-        if path is not None:
-            label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
-            draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
-            axes.plot(path.east_m[-1:], path.north_m[-1:], marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    looks = ((ICR, "ICR odometry", 3), (NO_SLIP, "no-slip odometry", 2))
+    for (pen, name, order), path in zip(looks, _each(found), strict=False):
+        label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
+        draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
+        ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
+        axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
@@ -101,18 +103,25 @@ def trajectory(run: Run) -> Figure:
     return figure
 
 
-def _extent(run: Run, *paths: OdometryPath | None) -> tuple[Floats, Floats]:
-    """Return the least and the greatest (north, east) to show [m]."""
-    lowest, highest = _corners(run.table)
+def _each(found: WheelPaths) -> Iterator[OdometryPath]:
+    """Yield the paths there are, one at a time: each takes as much memory as the positions."""
+    yield found.icr
+    if (path := found.no_slip) is not None:
+        yield path
+
+
+def _extent(drive: Corners, *paths: Corners) -> Corners:
+    """Return the least and the greatest (north, east) to show [m], of those of the drive and of other paths."""
+    lowest, highest = drive
     detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
-    lows, highs = zip(*(_corners(path) for path in (run.table, *paths) if path is not None), strict=True)
+    lows, highs = zip(drive, *paths, strict=True)
     return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
 
 
-def _corners(path: States | OdometryPath) -> tuple[Floats, Floats]:
+def _corners(path: States | OdometryPath) -> Corners:
     """Return the least and the greatest (north, east) of a path [m]."""
-    place = np.array([path.north_m, path.east_m])
-    return place.min(axis=1), place.max(axis=1)
+    north, east = path.north_m, path.east_m
+    return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
 def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
