@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.registry import cpu_target
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
@@ -20,6 +21,12 @@ if _BLAS not in sys.modules:
         importlib.import_module("numba.np.arraymath")
     finally:
         del sys.modules[_BLAS]
+
+
+def load_compiler() -> None:
+    """Make numba ready to load kernels, as the first call of one does; another thread may read files meanwhile."""
+    for context in (cpu_target.typing_context, cpu_target.target_context):
+        context.refresh()
 
 
 def njit(function: Kernel) -> Kernel:

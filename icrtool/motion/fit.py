@@ -19,7 +19,13 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.elimination import Parts, normal_equations
-from icrtool.kernels.robust import RobustFit, robust_least_squares, robust_weights, scale_by_kind, soft_l1_weights
+from icrtool.kernels.robust import (
+    RobustFit,
+    robust_least_squares,
+    robust_weights,
+    scale_by_kind,
+    soft_l1_weights,
+)
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
@@ -32,8 +38,6 @@ SETTLED = 0.1
 
 OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
-
-REWEIGHTS = 3
 
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
@@ -134,19 +138,20 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        Reweighted steps, as of a new fit, with residuals that follow the parameters to first order: over some metres
-        they do so nearly exactly.
+        A Newton step, then one of a new fit's reweighted steps, with residuals that follow the parameters to first
+        order: over some metres they do so nearly exactly.
         """
-        at, kept = self.solution, np.flatnonzero(clear)
-        residuals, jacobian, x, information = at.residuals[kept], at.jacobian[kept], at.x, at.information
-        mean, std = self.pool.prior(self.model)
+        at, (mean, std) = self.solution, self.pool.prior(self.model)
         pull = std**-2.0
-        for _ in range(REWEIGHTS):
-            left = residuals + jacobian @ (x - at.x)
-            weights = robust_weights(left, scale_by_kind(left), self.pool.overlap)
-            information, gradient = normal_equations(left, jacobian, weights)
-            information += np.diag(pull)
-            x = x - np.linalg.solve(information, gradient + pull * (x - mean))
+        step = self._steps(*self._derivatives(~clear))
+        jacobian = at.jacobian[clear]
+        left = at.residuals[clear] + jacobian @ step
+        information, gradient = normal_equations(
+            left, jacobian, robust_weights(left, scale_by_kind(left), self.pool.overlap)
+        )
+        information += np.diag(pull)
+        x = at.x + step
+        x = x - np.linalg.solve(information, gradient + pull * (x - mean))
         return x, self._covariance(at.information, information)
 
     def _covariance(self, whole: Floats, left: Floats) -> Floats:
