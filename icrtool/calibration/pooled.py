@@ -30,7 +30,7 @@ from icrtool.records.run import Run, drive_of
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
-GYRO_PRIOR_STD = np.array([10.0, 0.02, 0.2])
+GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
 """Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
 
 GYRO_SCALE_RANGE = 0.1
