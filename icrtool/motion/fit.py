@@ -25,6 +25,7 @@ from icrtool.kernels.robust import (
     robust_weights,
     scale_by_kind,
     soft_l1_weights,
+    student_covariance,
 )
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
@@ -38,6 +39,8 @@ SETTLED = 0.1
 
 OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
+
+REWEIGHTS = 2
 
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
@@ -138,20 +141,18 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        A Newton step, then one of a new fit's reweighted steps, with residuals that follow the parameters to first
+        A Newton step, then two of a new fit's reweighted steps, with residuals that follow the parameters to first
         order: over some metres they do so nearly exactly.
         """
         at, (mean, std) = self.solution, self.pool.prior(self.model)
-        pull = std**-2.0
-        step = self._steps(*self._derivatives(~clear))
-        jacobian = at.jacobian[clear]
-        left = at.residuals[clear] + jacobian @ step
-        information, gradient = normal_equations(
-            left, jacobian, robust_weights(left, scale_by_kind(left), self.pool.overlap)
-        )
-        information += np.diag(pull)
-        x = at.x + step
-        x = x - np.linalg.solve(information, gradient + pull * (x - mean))
+        residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
+        x, information = at.x + self._steps(*self._derivatives(~clear)), at.information
+        for _ in range(REWEIGHTS):
+            left = residuals + jacobian @ (x - at.x)
+            weights = robust_weights(left, scale_by_kind(left), self.pool.overlap)
+            information, gradient = normal_equations(left, jacobian, weights)
+            information += np.diag(pull)
+            x = x - np.linalg.solve(information, gradient + pull * (x - mean))
         return x, self._covariance(at.information, information)
 
     def _covariance(self, whole: Floats, left: Floats) -> Floats:
@@ -364,6 +365,7 @@ class Pool:
             evaluate, mean, mean, std, group=self.group, parts=Parts(self.first, own if count > 1 else 0),
             overlap=self.overlap, settled=SETTLED,
         )  # fmt: skip
+        found = found._replace(covariance=student_covariance(found, self.group, self.overlap))
         return PooledFit(
             model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found
         )  # fmt: skip
