@@ -7,27 +7,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from icrtool.alignment.align import sensors_as_sent
-from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.filter.batch_filter import model_states, run_batch
-from icrtool.kernels.filter.ekf_step import PLACES
-from icrtool.simulation.drives import Readings, Sensors, sample_times
-from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES
-from icrtool.simulation.study_runs import (
-    Chunk,
-    Progress,
-    Scenario,
-    chunks,
-    joined,
-    on_all_cores,
-    readings_log,
-    run_scenarios,
-    stack,
-    with_start,
-)
+from icrtool.simulation.study_runs import Progress, StudyRun, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
 
 STATES = ("north", "east", "heading", *ICR_NAMES)
@@ -59,16 +42,12 @@ def study_consistency(request: StudyRequest, progress: Progress | None) -> Study
     stops = tuple(np.arange(STOP_EVERY_S, request.plan.duration_s, STOP_EVERY_S))
     base = base_scenario(request, "paper")
     start = with_start(base.config, request.plan.icrs_m, MODEL_ICR_STD_M)
-    share = 1.0 / (1 + len(request.presets))
-
-    def part(number: int) -> Progress | None:
-        return (lambda done: progress((number + done) * share)) if progress is not None else None
-
-    cases = {"model": _run_model(replace(base, config=start), request, np.array(stops), part(0))}
-    for number, preset in enumerate(request.presets, start=1):
-        cases[preset] = run_scenarios(
-            [base_scenario(request, preset)], request.runs, request.seed, _measure, stops_s=stops, progress=part(number)
-        )[0]
+    scenarios = {"model": replace(base, config=start, model_icr_std_m=MODEL_ICR_STD_M)}
+    scenarios |= {preset: base_scenario(request, preset) for preset in request.presets}
+    found = run_scenarios(
+        list(scenarios.values()), request.runs, request.seed, _measure, stops_s=stops, progress=progress
+    )
+    cases = dict(zip(scenarios, found, strict=True))
     columns: dict[str, Column] = {
         "series": [name for name in cases for _ in range(request.runs)],
         "run": np.tile(np.arange(request.runs), len(cases)),
@@ -112,24 +91,14 @@ def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     return nees, ratio
 
 
-def _measure(chunk: Chunk) -> dict[str, Floats]:
-    rows = np.searchsorted(chunk.t_s, chunk.stops_s)
-    truth = np.concatenate(
-        [chunk.true_pose, np.broadcast_to(chunk.true_icrs_m[rows], (*chunk.true_pose.shape[:2], 3))], axis=2
-    )
-    return _reduced(chunk.x[:, rows] - truth, chunk.P, chunk.stops_s, chunk.gnss_nis, chunk.heading_nis)
-
-
-def _reduced(
-    error: Floats, covariance: Floats, stops_s: Floats, gnss_nis: Floats, heading_nis: Floats
-) -> dict[str, Floats]:
-    nees, ratio = errors_over_std(error, covariance)
+def _measure(run: StudyRun) -> dict[str, float | Floats]:
+    nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
     return {
-        "stops": np.tile(stops_s, (len(error), 1)),
+        "stops": run.t_s[run.stops],
         "nees": nees,
         "ratio": ratio,
-        "nis_gnss": gnss_nis,
-        "nis_heading": heading_nis,
+        "nis_gnss": run.gnss_nis,
+        "nis_heading": run.heading_nis,
     }
 
 
@@ -181,55 +150,3 @@ def _findings(levels: tuple[dict[str, Any], ...]) -> list[StudyNumber]:
             label = f"{name}: {what} within 2 sigma, least and most"
             findings.append(StudyNumber(label, (min(part), max(part)), "%", "95.4 %"))
     return findings
-
-
-def _run_model(
-    scenario: Scenario, request: StudyRequest, stops_s: Floats, progress: Progress | None
-) -> dict[str, Floats]:
-    """Run the case in which the truth obeys the filter's model."""
-    plan, sensors = request.plan, replace(request.sensors, wheels="ideal", heading_resolution_rad=0.0)
-    wheel_t = sample_times(sensors.wheel_rate_hz, plan.duration_s)
-    v_left, v_right = track_speeds(*plan_body(cast(PathPlan, plan.path), wheel_t, plan.icrs_m), plan.icrs_m)
-    blank = _readings(np.zeros((len(wheel_t), 6)), wheel_t, v_left, v_right, sensors, np.random.default_rng(0))
-    setup = set_up_filter(sensors_as_sent(readings_log(blank, sensors), scenario.config), scenario.config)
-
-    def work(runs: range) -> dict[str, Floats]:
-        return _model_chunk(runs, request, setup, sensors, (wheel_t, v_left, v_right), stops_s)
-
-    return joined(on_all_cores(work, chunks(request.runs, len(wheel_t)), progress))
-
-
-def _model_chunk(
-    runs: range, request: StudyRequest, setup: FilterSetup, sensors: Sensors, drive: tuple[Floats, Floats, Floats],
-    stops_s: Floats,
-) -> dict[str, Floats]:  # fmt: skip
-    wheel_t, v_left, v_right = drive
-    std = np.sqrt(np.array(setup.parameters.process_variance))
-    truths, readings = [], []
-    for run in runs:
-        rng = np.random.default_rng((request.seed, run))
-        icrs = np.array(request.plan.icrs_m) + rng.normal(0.0, MODEL_ICR_STD_M, 3)
-        x0 = np.array([0.0, 0.0, request.plan.start_heading_rad, *icrs])
-        noise = rng.normal(0.0, 1.0, (len(wheel_t), 6))
-        truths.append(model_states(x0, wheel_t, v_left, v_right, std, setup.parameters.rate_invariant, noise))
-        readings.append(_readings(truths[-1], wheel_t, v_left, v_right, sensors, rng))
-    stops = np.append(np.searchsorted(wheel_t, stops_s, side="right") - 1, len(wheel_t) - 1)
-    out = run_batch(stack(readings, setup, stops), setup.parameters)
-    error = out.x[:, stops - (len(wheel_t) - out.x.shape[1])] - np.array(truths)[:, stops]
-    return _reduced(error, out.P[..., PLACES], wheel_t[stops], out.gnss_nis, out.heading_nis)
-
-
-def _readings(
-    states: Floats, wheel_t: Floats, v_left: Floats, v_right: Floats, sensors: Sensors, rng: np.random.Generator
-) -> Readings:
-    """Measure states (n, 6) at the wheel stamps that fall together with a fix or a heading."""
-    fix, sample = (
-        np.arange(0, len(wheel_t), max(1, round(sensors.wheel_rate_hz / rate)))
-        for rate in (sensors.gnss_rate_hz, sensors.heading_rate_hz)
-    )
-    return Readings(
-        wheel_t, v_left, v_right, v_left, v_right,
-        wheel_t[fix], states[fix, :2] + rng.normal(0.0, sensors.gnss_std_m, (len(fix), 2)),
-        wheel_t[sample], states[sample, 2] + rng.normal(0.0, sensors.heading_std_rad, len(sample)),
-        np.zeros(len(sample)),
-    )  # fmt: skip

@@ -13,7 +13,7 @@ from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_p95, trace
-from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
+from icrtool.simulation.study_runs import Measure, Progress, Scenario, StudyRun, run_scenarios
 
 HIDDEN = frozenset({"trace", "zoom"})
 """Columns for the picture, not for the table."""
@@ -94,7 +94,7 @@ def study_convergence(request: StudyRequest, progress: Progress | None) -> Study
     columns, records, found = run_levels(
         levels,
         request,
-        lambda chunk: {**measure_times(chunk), **measure_errors(chunk), **trace(chunk, SHOWN_S)},
+        lambda run: {**measure_times(run), **measure_errors(run), "trace": trace(run, SHOWN_S)},
         progress,
     )
     findings = [
@@ -169,8 +169,8 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
     """Return ICR errors and open-loop errors by noise of the GNSS (Figs. 35-37)."""
     width = cast(float, request.config.robot.track_width_m)
 
-    def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_p95(chunk, width)}
+    def measure(run: StudyRun) -> dict[str, float | Floats]:
+        return {**measure_errors(run), **measure_times(run), **open_loop_p95(run, width)}
 
     levels = levels_of(request, request.values, lambda base, value: with_sensors(base, gnss_std_m=value))
     columns, records, found = run_levels(levels, request, measure, progress)
