@@ -473,9 +473,9 @@ def test_a_first_version_of_the_lynx_feedback_without_travel_tells_speeds(tmp_pa
     ]
     path = write_mcap(tmp_path / "lynx", {"/feedback": ("clearpath_motor_msgs/LynxMultiFeedback", messages)}, store)
     (motion,) = survey_log(path).candidates.wheels
-    assert motion.position_left is None
-    assert motion.speed_left is not None
-    assert motion.speed_left.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5]
+    assert motion.position is None
+    assert motion.speed is not None
+    assert motion.speed[0].tolist() == [0.5, 1.5, 2.5, 3.5, 4.5]
 
 
 def test_a_damaged_message_is_left_out_and_counted(tmp_path: Path) -> None:
