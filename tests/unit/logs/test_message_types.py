@@ -391,10 +391,7 @@ def test_every_topic_is_a_candidate_of_its_roles(logs: Callable[[str], Written],
 
 
 def test_definitions_that_the_log_lacks_come_from_the_bundle(logs: Callable[[str], Written]) -> None:
-    sources = {table.message_type: table.definition_source for table in logs("db3 without definitions").survey.tables}
-    assert sources["sensor_msgs/JointState"] == "ROS 2 Humble"
-    assert sources["ublox_msgs/NavPVT"] == "icrtool"
-    assert set(sources) == set(TYPES)
+    assert {table.message_type for table in logs("db3 without definitions").survey.tables} == set(TYPES)
 
 
 def without(store: Typestore, name: str, dropped: str) -> Typestore:

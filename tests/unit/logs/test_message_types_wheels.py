@@ -73,7 +73,7 @@ def write_bag(path: Path, publishers: Sequence[tuple[str, list[Any]]], name: str
 def column_table(message_type: str, topic: str = "/topic", **columns: Any) -> TopicTable:
     arrays = {path.replace("__", "."): np.asarray(values) for path, values in columns.items()}
     length = len(next(iter(arrays.values())))
-    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, {}, 0, "the log")
+    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, {}, 0)
 
 
 def read(table: TopicTable, config: Any = CONFIG) -> WheelMotion:
@@ -234,19 +234,17 @@ def test_a_pair_of_different_integers_is_unwrapped_side_by_side() -> None:
 
 def test_a_side_without_messages_is_refused_in_words() -> None:
     left, right = pair_tables([1.0, 2.0], [1.0, 2.0])
-    nothing = TopicTable(right.topic, right.message_type, np.empty(0, np.int64), {}, {}, 0, "the log")
+    nothing = TopicTable(right.topic, right.message_type, np.empty(0, np.int64), {}, {}, 0)
     assert pair_motion(left, nothing, CONFIG).problem == "/right/speed holds no message"
     never = pair_motion(left, right.rows(np.array([True, False])), CONFIG)
     assert never.problem == ""
-    gone = TopicTable(right.topic, right.message_type, right.log_time_ns + 10**12, right.columns, {}, 0, "the log")
+    gone = TopicTable(right.topic, right.message_type, right.log_time_ns + 10**12, right.columns, {}, 0)
     assert pair_motion(left, gone, CONFIG).problem == "the two sides were not recorded at the same time"
 
 
 def test_the_second_message_of_a_cycle_belongs_to_the_first() -> None:
     left, right = pair_tables([1.0, 2.0, 3.0], [10.0, 20.0, 30.0])
-    shifted = TopicTable(
-        right.topic, right.message_type, right.log_time_ns + 3_000_000, right.columns, {}, 0, "the log"
-    )
+    shifted = TopicTable(right.topic, right.message_type, right.log_time_ns + 3_000_000, right.columns, {}, 0)
     motion = pair_motion(left, shifted, CONFIG)
     assert motion.speed is not None
     assert motion.speed[1].tolist() == [10.0, 20.0, 30.0]
@@ -255,7 +253,7 @@ def test_the_second_message_of_a_cycle_belongs_to_the_first() -> None:
 def drivers(package: str) -> TopicTable:
     travel, velocity = np.array([[1.0, 2.0], [3.0, 5.0]]), np.array([[0.1, 0.2], [0.3, 0.5]])
     columns = {"drivers[*].measured_travel": travel, "drivers[*].measured_velocity": velocity}
-    return TopicTable("/feedback", f"{package}/Feedback", START_NS + np.arange(2), columns, {}, 0, "the log")
+    return TopicTable("/feedback", f"{package}/Feedback", START_NS + np.arange(2), columns, {}, 0)
 
 
 @pytest.mark.parametrize("package", ["jackal_msgs", "clearpath_platform_msgs"])
@@ -270,7 +268,7 @@ def test_driver_0_is_left_and_driver_1_is_right(package: str) -> None:
 
 def test_four_wheels_of_a_leo_are_front_and_rear_left_then_right() -> None:
     columns = {"position[*]": np.array([[1.0, 3.0, 5.0, 9.0]] * 2), "velocity[*]": np.array([[1.0, 2.0, 3.0, 4.0]] * 2)}
-    motion = read(TopicTable("/wheels", "leo_msgs/WheelStates", START_NS + np.arange(2), columns, {}, 0, "the log"))
+    motion = read(TopicTable("/wheels", "leo_msgs/WheelStates", START_NS + np.arange(2), columns, {}, 0))
     assert motion.position is not None
     assert motion.position is not None
     assert (motion.position[0][0], motion.position[1][0]) == (2.0, 7.0)
@@ -283,7 +281,7 @@ def test_a_segway_tells_metres() -> None:
         for what in ("velocity", "displacement")
     }
     for name in ("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped", "segway_interfaces/Stamped"):
-        motion = read(TopicTable("/status", name, START_NS + np.arange(2), columns, {}, 0, "the log"))
+        motion = read(TopicTable("/status", name, START_NS + np.arange(2), columns, {}, 0))
         assert motion.unit == "m"
         assert motion.position is not None
         assert motion.position[1].tolist() == [3.0, 6.0]
@@ -296,7 +294,7 @@ def feedback_with_names(message_type: str, names: str, velocity: str, travel: st
         velocity: np.array([[0.1, 0.2], [2.0, 1.0]]),
     }
     texts = {names: ["front_left_wheel_joint", "front_right_wheel_joint"]}
-    return TopicTable("/a/feedback", message_type, START_NS + np.arange(2), columns, texts, 0, "the log")
+    return TopicTable("/a/feedback", message_type, START_NS + np.arange(2), columns, texts, 0)
 
 
 @pytest.mark.parametrize(
@@ -319,7 +317,7 @@ def test_motor_drivers_are_told_apart_by_their_joint(message_type: str, names: s
 
 def twist_table(message_type: str, topic: str, prefix: str, x: Any, y: Any, turn: Any) -> TopicTable:
     columns = {f"{prefix}linear.x": np.array(x), f"{prefix}linear.y": np.array(y), f"{prefix}angular.z": np.array(turn)}
-    return TopicTable(topic, message_type, START_NS + np.arange(len(x)), columns, {}, 0, "the log")
+    return TopicTable(topic, message_type, START_NS + np.arange(len(x)), columns, {}, 0)
 
 
 @pytest.mark.parametrize(

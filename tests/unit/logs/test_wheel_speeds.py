@@ -78,7 +78,7 @@ def joints_motion(positions: Floats) -> WheelMotion:
         "velocity[*]": np.full((rows, 4), np.nan),
     }  # fmt: skip
     times = STEP_NS * np.arange(rows, dtype=np.int64)
-    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0, "test")
+    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0)
     return WHEEL_TYPES["sensor_msgs/JointState"][1](table, CONFIG)
 
 
