@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
+from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics, table_of
 from icrtool.simulation.study_measures import ICR_NAMES
 from icrtool.simulation.study_runs import Progress, StudyRun, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
@@ -48,22 +48,13 @@ def study_consistency(request: StudyRequest, progress: Progress | None) -> Study
         list(scenarios.values()), request.runs, request.seed, _measure, stops_s=stops, progress=progress
     )
     cases = dict(zip(scenarios, found, strict=True))
-    columns: dict[str, Column] = {
-        "series": [name for name in cases for _ in range(request.runs)],
-        "run": np.tile(np.arange(request.runs), len(cases)),
-    }
-    for name in ("nees", "nis_gnss", "nis_heading"):
-        columns[name] = np.concatenate([_per_run(case, name) for case in cases.values()])
-    for place, state in enumerate(STATES):
-        columns[f"end_error_over_std_{state}"] = np.concatenate(
-            [case["ratio"][:, -1, place] for case in cases.values()]
-        )
     levels = tuple(_level(name, case) for name, case in cases.items())
     curves = {"stops_s": cases["model"]["stops"][0]}
     for level, (name, case) in zip(levels, cases.items(), strict=True):
-        curves |= {f"nees {name}": case["nees"].mean(axis=0), f"coverage {name}": np.array(level["coverage_pct"])}
+        curves |= {f"nees {name}": case["all nees"].mean(axis=0), f"coverage {name}": np.array(level["coverage_pct"])}
     low, high = chi2_band(6 * request.runs, request.runs)
     curves["nees_band"] = np.array([low, high])
+    columns = table_of([{"series": name} for name in cases], found)
     return StudyResult(request, columns, levels, tuple(_findings(levels)), curves)
 
 
@@ -93,31 +84,25 @@ def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
 
 def _measure(run: StudyRun) -> dict[str, float | Floats]:
     nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
-    return {
-        "stops": run.t_s[run.stops],
-        "nees": nees,
-        "ratio": ratio,
-        "nis_gnss": run.gnss_nis,
-        "nis_heading": run.heading_nis,
+    settled = _settled(run.t_s[run.stops])
+    means = {
+        "nees": float(nees[settled].mean()),
+        "nis_gnss": float(np.nanmean(run.gnss_nis)),
+        "nis_heading": float(np.nanmean(run.heading_nis)),
     }
+    at_end = {f"end_error_over_std_{state}": float(error) for state, error in zip(STATES, ratio[-1], strict=True)}
+    whole = {"all nees": nees, "all nis_gnss": run.gnss_nis, "all nis_heading": run.heading_nis}
+    return {**means, **at_end, **whole, "ratio": ratio, "stops": run.t_s[run.stops]}
 
 
-def _per_run(case: dict[str, Floats], name: str) -> Floats:
-    if name == "nees":
-        mean: Floats = case["nees"][:, _settled(case)].mean(axis=1)
-        return mean
-    return cast(Floats, np.nanmean(case[name], axis=1))
-
-
-def _settled(case: dict[str, Floats]) -> Bools:
-    stops = case["stops"][0]
-    settled: Bools = stops >= min(SETTLED_S, stops[-1])
+def _settled(stops_s: Floats) -> Bools:
+    settled: Bools = stops_s >= min(SETTLED_S, stops_s[-1])
     return settled
 
 
 def _level(name: str, case: dict[str, Floats]) -> dict[str, Any]:
-    settled = _settled(case)
-    ratio, nees, runs = case["ratio"][:, settled], case["nees"][:, settled], len(case["nees"])
+    settled = _settled(case["stops"][0])
+    ratio, nees, runs = case["ratio"][:, settled], case["all nees"][:, settled], len(case["nees"])
     level: dict[str, Any] = {
         "series": name,
         "nees": {"mean": float(nees.mean()), "expected": 6.0, "band": chi2_band(6 * runs, runs)},
@@ -126,13 +111,13 @@ def _level(name: str, case: dict[str, Floats]) -> dict[str, Any]:
     by_stop = nees.mean(axis=0)
     level["nees"]["stops_in_band_pct"] = 100 * float(((by_stop >= low) & (by_stop <= high)).mean())
     for what, degrees in (("gnss", 2), ("heading", 1)):
-        finite = case[f"nis_{what}"][np.isfinite(case[f"nis_{what}"])]
+        finite = case[f"all nis_{what}"][np.isfinite(case[f"all nis_{what}"])]
         band = chi2_band(degrees * len(finite), len(finite))
         level[f"nis_{what}"] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
     level["states"] = list(STATES)
     level["coverage_pct"] = [100 * float((np.abs(ratio[..., place]) <= 2).mean()) for place in range(6)]
     level["rms_error_over_std"] = [float(np.sqrt((ratio[..., place] ** 2).mean())) for place in range(6)]
-    level["by_run"] = {what: statistics(_per_run(case, what)) for what in ("nees", "nis_gnss", "nis_heading")}
+    level["by_run"] = {what: statistics(case[what]) for what in ("nees", "nis_gnss", "nis_heading")}
     return level
 
 

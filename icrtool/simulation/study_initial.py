@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
-from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult
+from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, table_of
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, trace
 from icrtool.simulation.study_runs import Progress, StudyRun, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
@@ -35,26 +35,16 @@ def study_initial(request: StudyRequest, progress: Progress | None) -> StudyResu
         for name, right, left in cells
     ]
     found = run_scenarios(scenarios, request.runs, request.seed, _measure, progress=progress)
-    runs = request.runs
-    columns: dict[str, Column] = {
-        "series": [name for name, _, _ in cells for _ in range(runs)],
-        "start_y_icr_right_m": np.repeat([right for _, right, _ in cells], runs),
-        "start_y_icr_left_m": np.repeat([left for _, _, left in cells], runs),
-        "run": np.tile(np.arange(runs), len(cells)),
-    }
-    for name in found[0]:
-        if name != "trace":
-            columns[name] = np.concatenate([one[name] for one in found])
+    starts: list[dict[str, float | str]] = [
+        dict(zip(("series", "start_y_icr_right_m", "start_y_icr_left_m"), cell, strict=True)) for cell in cells
+    ]
     levels = tuple(
-        {
-            "series": name,
-            "start_y_icr_right_m": right,
-            "start_y_icr_left_m": left,
-            **{fate: float(one[fate].mean()) for fate in ("converged", "inverted", "elsewhere")},
-        }
-        for (name, right, left), one in zip(cells, found, strict=True)
+        {**start, **{fate: float(one[fate].mean()) for fate in ("converged", "inverted", "elsewhere")}}
+        for start, one in zip(starts, found, strict=True)
     )
-    return StudyResult(request, columns, levels, tuple(_findings(levels)), _curves(request, cells, found))
+    return StudyResult(
+        request, table_of(starts, found), levels, tuple(_findings(levels)), _curves(request, cells, found)
+    )
 
 
 def _measure(run: StudyRun) -> dict[str, float | Floats]:
