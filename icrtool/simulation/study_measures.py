@@ -100,11 +100,9 @@ def open_loop_p95(run: StudyRun, track_width_m: float) -> dict[str, float | Floa
     -----
     Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
     """
-    models = {"icr": run.x[-1, 3:], "no_slip": np.array([track_width_m / 2, -track_width_m / 2, 0.0])}
-    return {
-        f"blind_{name}_10m_p95_m": float(np.percentile(_open_loop_errors(run, icrs), 95))
-        for name, icrs in models.items()
-    }
+    no_slip = np.array([track_width_m / 2, -track_width_m / 2, 0.0])
+    models = {"blind_icr_10m_p95_m": run.x[-1, 3:], "blind_no_slip_10m_p95_m": no_slip}
+    return {name: float(np.percentile(_open_loop_errors(run, icrs), 95)) for name, icrs in models.items()}
 
 
 def _open_loop_errors(run: StudyRun, icrs: Floats) -> Floats:
