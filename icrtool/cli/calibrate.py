@@ -93,13 +93,15 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
     from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
-    if config.given_sections and all(is_run_directory(source) for source in sources):
+    finished = all(is_run_directory(source) for source in sources)
+    if config.given_sections and finished:
         section = min(config.given_sections)
         advice = "name the logs instead"
         raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
     with options.progress_bar("reading", quiet=quiet) as progress, ThreadPoolExecutor(1) as other:
-        # takes as long as to read a run of an hour, most of which is done outside of the interpreter
-        other.submit(_load_models)
+        if finished:
+            # takes as long as to read a run of an hour, most of which is done outside of the interpreter
+            other.submit(_load_models)
         found = []
         for i, source in enumerate(sources):
             found.append(run_of(source, config))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import cpu_target
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
@@ -25,8 +26,10 @@ if _BLAS not in sys.modules:
 
 def load_compiler() -> None:
     """Make numba ready to load kernels, as the first call of one does; another thread may read files meanwhile."""
-    for context in (cpu_target.typing_context, cpu_target.target_context):
-        context.refresh()
+    # numba takes this lock where it compiles; two threads that refresh at once fail
+    with global_compiler_lock:
+        for context in (cpu_target.typing_context, cpu_target.target_context):
+            context.refresh()
 
 
 def njit(function: Kernel) -> Kernel:
