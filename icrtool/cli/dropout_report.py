@@ -200,8 +200,20 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
             source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
             overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
+    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
+    from icrtool.fleet.fit_and_report import report_and_write
+
     directory = source if place is None else place
-    report = _analyse(run, directory, request)
+    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
+        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
+    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
+        report = report_and_write(
+            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
+            further=request.further,
+        )  # fmt: skip
+    if baseline is not None:
+        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
@@ -227,21 +239,3 @@ def _read(directory: Path) -> Run:
 
         load_kernels()
         return reading.result()
-
-
-def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
-    """Compute the report of a run and write it."""
-    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
-    from icrtool.fleet.fit_and_report import report_and_write
-
-    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
-        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
-    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        report = report_and_write(
-            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
-            further=request.further,
-        )  # fmt: skip
-    if baseline is not None:
-        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
-    return report
