@@ -66,7 +66,7 @@ class DynamicJointCollector:
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._definitions, self._source = definitions_of(channel)
+        self._definitions = definitions_of(channel)
         self._collectors: dict[int, TopicCollector] = {}
         self._tables: list[TopicTable] = []
         self._times: list[Ints] = []
@@ -102,7 +102,7 @@ class DynamicJointCollector:
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time."""
         topic, message_type = self._channel.topic, self._channel.message_type
-        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
+        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable)
         merged = merge_tables([nothing, *self._tables])[0]
         return replace(merged, set_back=time_order(np.concatenate(self._times or [nothing.log_time_ns]))[0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from icrtool.logs.streams.position_sources import (
     pose_paths,
     solved,
 )
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
 
 Convention = Literal["enu", "ned"]
 
@@ -46,8 +46,8 @@ LARGEST_DEG = 720.0
 """A heading beyond this stands for "unknown": Septentrio writes -2e10."""
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingSource:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeadingSource(Source):
     """Headings of one topic.
 
     Attributes
@@ -56,21 +56,14 @@ class HeadingSource:
     variance : (n,) [rad^2], NaN where not stated
     usable : (n,)
     convention_why : how the convention is known
-    yaw_rate_radps : (n,) counter-clockwise turn rate of a gyro in the same message, None without one
+    note : what was assumed, for the user
     """
 
-    topic: str
-    message_type: str
-    stamps: StampedRows
-    yaw_rad: Floats
-    variance: Floats
-    usable: Bools
-    convention: Convention
-    convention_why: str
-    yaw_rate_radps: Floats | None = None
-    score: float = 0.0
-    why: str = ""
-    problem: str = ""
+    yaw_rad: Floats = field(default_factory=lambda: np.empty(0))
+    variance: Floats = field(default_factory=lambda: np.empty(0))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
+    convention: Convention = "enu"
+    convention_why: str = ""
     note: str = ""
 
     @property
@@ -85,14 +78,6 @@ class HeadingSource:
 
 
 Reader = Callable[[TopicTable], HeadingSource]
-
-
-def no_heading(table: TopicTable, problem: str) -> HeadingSource:
-    """Return an empty source for a topic that cannot be read, with the reason."""
-    unknown, nothing = np.full(len(table), np.nan), np.zeros(len(table), np.bool_)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), unknown, unknown, nothing, "enu", "", problem=problem
-    )
 
 
 def _quaternion(table: TopicTable, path: str) -> Floats:
@@ -137,8 +122,8 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
         if _RAW_WORDS.search(table.topic):
             lowered -= 10.0
         return HeadingSource(
-            table.topic, table.message_type, stamp_rows(table), yaw, variance, usable, convention, why,
-            rate, lowered, what, problem, note,
+            **of_topic(table), yaw_rad=yaw, variance=variance, usable=usable, convention=convention, convention_why=why,
+            score=lowered, why=what, problem=problem, note=note,
         )  # fmt: skip
 
     return read
@@ -148,6 +133,16 @@ def _odometry(table: TopicTable) -> HeadingSource:
     read = _orientation("pose.pose.orientation", "pose.covariance", 35, 60.0, "orientation of an odometry message")
     source = read(table)
     return source if _INS_WORDS.search(table.topic) else replace(source, score=30.0)
+
+
+def _stated(
+    table: TopicTable, heading: Floats, variance: Floats, usable: Bools, score: float, what: str, convention_why: str
+) -> HeadingSource:
+    """Return headings clockwise from north (n,), with the variances (n,) that the messages state, NaN for unknown."""
+    return HeadingSource(
+        **of_topic(table), yaw_rad=heading, variance=variance, usable=usable, convention="ned",
+        convention_why=convention_why, score=score, why=what, problem="" if usable.any() else "no valid heading",
+    )  # fmt: skip
 
 
 def _azimuth(table: TopicTable) -> HeadingSource:
@@ -160,13 +155,10 @@ def _azimuth(table: TopicTable) -> HeadingSource:
     yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
     codes = table.floats("reference")
     reference = _REFERENCES.get(float(np.median(codes)), "unknown") if len(codes) else "unknown"
-    variance = table.floats("variance") * factor**2
-    usable = np.isfinite(yaw)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), yaw, np.where(variance > 0, variance, np.nan), usable,
-        "ned" if ned else "enu", "stated in the message", None, 95.0, f"azimuth, {reference} north",
-        "" if usable.any() else "no finite azimuth",
-    )  # fmt: skip
+    variance, what = table.floats("variance") * factor**2, f"azimuth, {reference} north"
+    variance = np.where(variance > 0, variance, np.nan)
+    source = _stated(table, yaw, variance, np.isfinite(yaw), 95.0, what, "stated in the message")
+    return source if ned else replace(source, convention="enu")
 
 
 def _relposned(table: TopicTable) -> HeadingSource:
@@ -186,11 +178,9 @@ def _relposned(table: TopicTable) -> HeadingSource:
         acc = np.maximum(table.floats("accN", "acc_n"), table.floats("accE", "acc_e")) * 0.01
         std = np.divide(acc, length, out=np.full(len(table), np.nan), where=length > 0)
         usable = ((flags & _RELPOS_VALID) != 0) & (length > 0)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
-        "ned", "u-blox: clockwise from north", None, 90.0, "u-blox moving base: bearing of the antenna baseline",
-        "" if usable.any() else "no valid heading",
-    )  # fmt: skip
+    what = "u-blox moving base: bearing of the antenna baseline"
+    variance = np.where(std > 0, std**2, np.nan)
+    return _stated(table, heading, variance, usable, 90.0, what, "u-blox: clockwise from north")
 
 
 def _degrees(
@@ -206,10 +196,8 @@ def _degrees(
         if status:
             usable = usable & solved(table, status, accepted)
         heading = np.radians(np.where(np.abs(degrees) <= LARGEST_DEG, degrees, np.nan))
-        return HeadingSource(
-            table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
-            "ned", "degrees clockwise from north", None, score, what, "" if usable.any() else "no valid heading",
-        )  # fmt: skip
+        variance = np.where(std > 0, std**2, np.nan)
+        return _stated(table, heading, variance, usable, score, what, "degrees clockwise from north")
 
     return read
 

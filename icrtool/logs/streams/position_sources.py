@@ -18,7 +18,7 @@ from icrtool.logs.streams.fix_class import (
     class_by_status,
     class_by_type,
 )
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
@@ -57,8 +57,8 @@ GOOD_STD_M = 0.3
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
 
 
-@dataclass(frozen=True, slots=True)
-class PositionSource:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionSource(Source):
     """Positions of one topic.
 
     Attributes
@@ -70,17 +70,11 @@ class PositionSource:
     stated_class : uint8 (n,) how the position was solved, None where no message states it
     """
 
-    topic: str
-    message_type: str
-    stamps: StampedRows
-    geodetic: Floats | None
-    metric: Floats | None
-    variance: Floats
-    usable: Bools
+    geodetic: Floats | None = None
+    metric: Floats | None = None
+    variance: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
     rejected: dict[str, int] = field(default_factory=dict)
-    score: float = 0.0
-    why: str = ""
-    problem: str = ""
     stated_class: Bytes | None = None
 
     @property
@@ -90,14 +84,6 @@ class PositionSource:
 
 
 Reader = Callable[[TopicTable], PositionSource]
-
-
-def no_position(table: TopicTable, problem: str) -> PositionSource:
-    """Return an empty source for a topic that cannot be read, with the reason."""
-    nothing = np.zeros(len(table), np.bool_)
-    return PositionSource(
-        table.topic, table.message_type, stamp_rows(table), None, None, _no_variance(table), nothing, problem=problem
-    )
 
 
 def _geodetic(
@@ -132,14 +118,10 @@ def _geodetic(
         score -= 35.0
     stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
     return PositionSource(
-        table.topic, table.message_type, stamp_rows(table),
-        np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
-        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", stated_class=stated_class,
+        **of_topic(table), geodetic=np.column_stack([latitude, longitude, filled]), variance=variance, usable=usable,
+        rejected=rejected, score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix",
+        stated_class=stated_class,
     )  # fmt: skip
-
-
-def _no_variance(table: TopicTable) -> Floats:
-    return np.full((len(table), 3), np.nan)
 
 
 def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
@@ -268,7 +250,7 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
 
     def read(table: TopicTable) -> PositionSource:
         x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
-        variance = _no_variance(table)
+        variance = np.full((len(table), 3), np.nan)
         if covariance:
             var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
             positive = (var_x > 0) & (var_y > 0)
@@ -286,8 +268,8 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
             )
         count = int(np.count_nonzero(~usable))
         return PositionSource(
-            table.topic, table.message_type, stamp_rows(table), None, np.column_stack([y, x]), variance, usable,
-            {"not finite": count} if count else {}, score=score, why=what, problem=problem,
+            **of_topic(table), metric=np.column_stack([y, x]), variance=variance, usable=usable,
+            rejected={"not finite": count} if count else {}, score=score, why=what, problem=problem,
         )  # fmt: skip
 
     return read
