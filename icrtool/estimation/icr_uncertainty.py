@@ -73,7 +73,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     rows = rows_at_steps(distance, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
-    terms = len(parameters)
+    terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     rate, sums, by = _sums(drive, dt, rows, parameters)
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
@@ -96,11 +96,11 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     return DriveWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
-        length_m=np.diff(distance[rows]),
+        length_m=np.diff(distance),
         turned_rad=turned,
         end_s=table.t_s[rows[1:]],
-        stretch=(distance[rows[:-1]] // STRETCH_M).astype(np.int64),
-        distance_m=float(distance[-1]),
+        stretch=(distance[:-1] // STRETCH_M).astype(np.int64),
+        distance_m=whole_m,
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
         heading_std_rad=float(np.median(table.std_heading_rad)),
     )

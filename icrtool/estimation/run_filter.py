@@ -102,18 +102,21 @@ def run_filter(
     heading = MeasurementOutcome(
         headings_ns, headings_s, output.heading_nis, output.heading_code, output.heading_innovation
     )
+    in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
+    start_std_m, least_icr_m = np.sqrt(np.diag(setup.P0)[3:]), setup.parameters.least_icr
+    del setup  # of a long log, a quarter of what is alive
     carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
         table=table,
-        in_gap=np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False),
+        in_gap=in_gap,
         outages_ns=_outages(table, gnss, sensors.losses_ns),
         gnss=gnss,
         heading=heading,
         covariance=output.P[PLACES],
         noise=noise,
-        start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
-        least_icr_m=setup.parameters.least_icr,
+        start_std_m=start_std_m,
+        least_icr_m=least_icr_m,
         began_with=warm_start,
         changes_s=changes_s,
     )
@@ -190,8 +193,8 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
     off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
     std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
     clear = recent & (CLEARLY * std < table.std_heading_rad)
-    psi[clear] += off[last[clear]]
-    table.std_heading_rad[clear] = std[clear]
+    np.add(psi, off[last], out=psi, where=clear)
+    np.copyto(table.std_heading_rad, std, where=clear)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

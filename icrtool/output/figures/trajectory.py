@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from icrtool.alignment.position.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
+from icrtool.estimation.odometry import OdometryPath, odometry
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
 from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
@@ -21,6 +20,7 @@ from icrtool.output.figures.style import (
     LABEL_BOX,
     NO_SLIP,
     WIDTH_IN,
+    Pen,
     add_legend,
     new_figure,
     spot,
@@ -73,7 +73,7 @@ def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     found = odometry(run)
     table, drive = run.table, run.summary["drive"]
-    lowest, highest = _extent(_corners(table), *(_corners(path) for path in _each(found)))
+    lowest, highest = _extent(_corners(table), _corners(found.icr), _corners(found.no_slip))
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
@@ -87,12 +87,8 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
-    looks = ((ICR, "ICR odometry", 3), (NO_SLIP, "no-slip odometry", 2))
-    for (pen, name, order), path in zip(looks, _each(found), strict=False):
-        label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
-        draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
-        ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
-        axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    _draw_odometry(axes, found.icr, cell, ICR, "ICR odometry", 3)
+    _draw_odometry(axes, found.no_slip, cell, NO_SLIP, "no-slip odometry", 2)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
@@ -103,30 +99,32 @@ def trajectory(run: Run) -> Figure:
     return figure
 
 
-def _each(found: WheelPaths) -> Iterator[OdometryPath]:
-    """Yield the paths there are, one at a time: each takes as much memory as the positions."""
-    yield found.icr
-    if (path := found.no_slip) is not None:
-        yield path
-
-
 def _extent(drive: Corners, *paths: Corners) -> Corners:
     """Return the least and the greatest (north, east) to show [m], of those of the drive and of other paths."""
     lowest, highest = drive
     detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
     lows, highs = zip(drive, *paths, strict=True)
-    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
+    return np.maximum(np.fmin.reduce(lows), lowest - detour), np.minimum(np.fmax.reduce(highs), highest + detour)
 
 
-def _corners(path: States | OdometryPath) -> Corners:
-    """Return the least and the greatest (north, east) of a path [m]."""
+def _corners(path: States | OdometryPath | None) -> Corners:
+    """Return the least and the greatest (north, east) of a path [m]; NaN without one."""
+    if path is None:
+        return np.full(2, np.nan), np.full(2, np.nan)
     north, east = path.north_m, path.east_m
     return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
-def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
-    low, high = _corners(path)
-    return " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+def _draw_odometry(axes: Axes, path: OdometryPath | None, cell_m: float, pen: Pen, name: str, order: int) -> None:
+    """Draw a wheels-only path and its end; the label states where it leaves the view."""
+    if path is not None:
+        low, high = _corners(path)
+        lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
+        leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+        label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
+        draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
+        ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
+        axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
