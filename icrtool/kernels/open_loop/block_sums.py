@@ -108,10 +108,12 @@ def _slope(ordered: Floats, share: float, influence: Floats) -> float:
     low, high = np.clip([share - std, share + std], 0.0, 1.0)
     if not high > low:
         return 0.0
-    return (_quantile(ordered, float(high)) - _quantile(ordered, float(low))) / float(high - low)
+    return (quantile(ordered, float(high)) - quantile(ordered, float(low))) / float(high - low)
 
 
-def _quantile(ordered: Floats, share: float) -> float:
+def quantile(ordered: Floats, share: float) -> float:
+    """Return numpy's 'linear' quantile of sorted values."""
     rank = share * (len(ordered) - 1)
     below = math.floor(rank)
-    return float(np.interp(rank - below, [0.0, 1.0], ordered[[below, min(below + 1, len(ordered) - 1)]]))
+    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
+    return float(low + (high - low) * (rank - below))

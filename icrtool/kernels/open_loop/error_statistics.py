@@ -15,6 +15,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.open_loop.block_sums import quantile
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, Summary
 
 TAIL = 0.05
@@ -51,16 +52,8 @@ def summary_of_sorted(ordered: Sequence[Floats]) -> Summary:
     table = np.full((4, len(ordered)), np.nan)
     for h, errors in enumerate(ordered):
         if len(errors):
-            table[:, h] = errors.mean(), _quantile(errors, 0.5), _quantile(errors, 1.0 - TAIL), errors[-1]
+            table[:, h] = errors.mean(), quantile(errors, 0.5), quantile(errors, 1.0 - TAIL), errors[-1]
     return Summary(np.array([len(errors) for errors in ordered], np.int64), *table)
-
-
-def _quantile(ordered: Floats, share: float) -> float:
-    """Return numpy's 'linear' quantile of sorted values."""
-    rank = share * (len(ordered) - 1)
-    below = math.floor(rank)
-    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
-    return float(low + (high - low) * (rank - below))
 
 
 @njit

@@ -185,9 +185,9 @@ class _Compiler:
         elements = any(name.startswith(f"{path}[") for name in self._wanted)
         if fixed is not None and not elements:
             self._skip(size, fixed)
+        elif fixed is not None and fixed > LONGEST_UNROLLED:
+            raise DefinitionError(path, f"an array of {fixed} numbers is not read")
         elif fixed is not None and starred not in self._wanted:
-            if fixed > LONGEST_UNROLLED:
-                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             for i in range(fixed):
                 element = f"{path}[{i}]"
                 if element in self._wanted:
@@ -195,8 +195,6 @@ class _Compiler:
                 else:
                     self._skip(size, 1)
         elif fixed is not None:
-            if fixed > LONGEST_UNROLLED:
-                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             column = self._reserve(fixed)
             self._emit(TAKE, size, fixed, column)
             self.slots[starred] = Slot(kind, column, fixed, 1, -1)
