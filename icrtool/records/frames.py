@@ -152,8 +152,7 @@ def _stamped(
     (clock,) = _chosen(frame, (("stamp_ns",), ("t_s",)), group, name)
     seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
     values = [seconds, *(_numbers(frame, column, name) for column in columns)]
-    sound: NDArray[np.bool_] = np.isfinite(values).all(axis=0)
-    return clock, seconds, sound
+    return clock, seconds, np.logical_and.reduce(np.isfinite(values))
 
 
 def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ...]]:
