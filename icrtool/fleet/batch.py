@@ -109,11 +109,8 @@ def finished(request: Request) -> Row | None:
         return None
     if row.status == "failed":
         return replace(row, log=request.row.log, group=request.row.group, tags=request.row.tags)
-    if (
-        not Path(path_of(request.directory), "run.json").is_file()
-        or not Path(path_of(request.directory), "dropout").is_dir()
-        or (request.report.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
-    ):
+    needed = ["run.json", "dropout", *([PAGE_FILE] if request.report.page else [])]
+    if not all((path_of(request.directory) / name).exists() for name in needed):
         return None
     why = "; ".join(filter(None, ["done before: same input, configuration and version", row.reason]))
     return replace(row, status="skipped", reason=why, log=request.row.log, group=request.row.group,
