@@ -6,19 +6,38 @@ No compiled kernel is here: a process that only reads or draws these records nee
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 
-if TYPE_CHECKING:
-    from icrtool.kernels.open_loop.error_statistics import Blocks
-
 SHARES = {"p50": 0.5, "p95": 0.95}
 
 MOST_BLOCKS = 16
 """More would narrow an interval by less than 2 %: the factor of Student's distribution is 2.13, without limit 1.96."""
+
+
+BLOCK_PARTS = 4
+"""Blocks begin at every quarter of their length."""
+
+
+class Blocks(NamedTuple):
+    """The path of one horizon's trials, cut for resampling; the same for every model.
+
+    Attributes
+    ----------
+    rows : where the trials stand among all starts (m,)
+    first : (s,) first trial of each segment
+    kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
+    per_segment : (s, 2) trials, and kept ones
+    """
+
+    rows: slice | Ints
+    first: Ints
+    kept: Ints
+    segments: Ints
+    per_segment: Floats
 
 
 class BlockSums(NamedTuple):
@@ -86,8 +105,6 @@ def block_sums(
     """
     if blocks is None:
         return None
-    from icrtool.kernels.open_loop.error_statistics import BLOCK_PARTS
-
     errors = errors_m[blocks.rows]
     segments = len(blocks.first)
     k = min(MOST_BLOCKS, segments // BLOCK_PARTS)
