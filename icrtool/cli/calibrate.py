@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,11 +45,8 @@ def command(
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
       icrtool calibrate icrtool-runs/* -o calibration.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import IcrToolError
     from icrtool.output.files.calibration_file import calibration_file, write_calibration
-    from icrtool.output.tables.calibration import format_calibration
-    from icrtool.output.tables.held_out import format_result
 
     config = options.load(config_file, robot, sets)
     if len(sources) > 1 and (plot is not None or x_icr is not None):
@@ -56,6 +54,10 @@ def command(
     if output is not None:
         calibration_file(output)
     runs = _runs(sources, config, quiet=quiet)
+    from icrtool.calibration.from_runs import calibrate_runs
+    from icrtool.output.tables.calibration import format_calibration
+    from icrtool.output.tables.held_out import format_result
+
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
     try:
@@ -88,11 +90,24 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
     from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
-    if config.given_sections and all(is_run_directory(source) for source in sources):
+    finished = all(is_run_directory(source) for source in sources)
+    if config.given_sections and finished:
         section = min(config.given_sections)
         advice = "name the logs instead"
         raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
-    return runs_of(sources, config, quiet=quiet)
+    with ThreadPoolExecutor(1) as other:
+        if finished:
+            # takes as long as to read a run of an hour, most of which is done outside of the interpreter
+            other.submit(_load_models)
+        return runs_of(sources, config, quiet=quiet)
+
+
+def _load_models() -> None:
+    """Import what calibrates, and the compiler of its kernels."""
+    from icrtool.calibration.from_runs import calibrate_runs  # noqa: F401
+    from icrtool.kernels.compiled import load_compiler
+
+    load_compiler()
 
 
 def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> LogCalibration:

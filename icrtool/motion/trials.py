@@ -20,6 +20,8 @@ from icrtool.motion.recording import (
     samples_a_step,
 )
 
+MOST_STARTS = 4_000
+
 
 class Trials(NamedTuple):
     """Trials of one recording.
@@ -40,13 +42,13 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     Parameters
     ----------
     all_starts : from every recorded state, as the paper; default from moving ones, as far apart as the steps of the
-        fits are long, since nearer ones are copies of one another
+        fits are long, about `MOST_STARTS` of a long drive, since nearer ones are copies of one another
     """
     drive = recording.drive
     starts = np.arange(len(drive.distance))
     if not all_starts:
-        every = samples_a_step(recording)
-        starts = np.flatnonzero(moving_states(drive))[::every]
+        moving = np.flatnonzero(moving_states(drive))
+        starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)]
     return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
 
 

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
 
+CALIBRATION_SCHEMA = "icrtool/calibration/1"
+"""Version of calibration files."""
+
 ICR_COLUMNS: tuple[IcrColumn, ...] = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), strict=True))
 

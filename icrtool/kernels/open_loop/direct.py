@@ -30,8 +30,8 @@ STANDING = -4
 
 
 @njit
-def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> None:
-    """Fill `ends` (n_horizons, n_starts) for the starts from `lo` on: two pointers a horizon, O(n).
+def find_trial_ends(drive: Drive, horizons_m: Floats, starts: Ints, ends: Ints) -> None:
+    """Fill `ends` (n_horizons, n_starts) for ascending starts: two pointers a horizon, O(n).
 
     Notes
     -----
@@ -39,10 +39,9 @@ def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> No
     """
     distance, gap = drive.distance, drive.gap
     for h in range(ends.shape[0]):
-        end = lo
-        next_gap = lo
+        end, next_gap = 0, 0
         for row in range(ends.shape[1]):
-            start = lo + row
+            start = starts[row]
             end = max(end, start)
             while end < len(distance) and distance[end] - distance[start] < horizons_m[h]:
                 end += 1
@@ -155,21 +154,15 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
     int64 (hi - lo, n_horizons), one horizon contiguous: index of the first state j with
     ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`. The same for every model.
     """
-    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
-    stop = len(drive.distance) if hi is None else hi
-    ends = np.empty((len(horizons), stop - lo), dtype=np.int64)
-    find_trial_ends(compiled_drive(drive), horizons, lo, ends)
-    return ends.T
+    return ends_from(drive, horizons_m, np.arange(lo, len(drive.distance) if hi is None else hi))
 
 
 def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
-    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending; a table of all would need more memory."""
-    ends = np.empty((len(starts), len(horizons_m)), np.int64)
-    for lo in range(0, len(drive.distance), ROWS_AT_ONCE):
-        hi = min(lo + ROWS_AT_ONCE, len(drive.distance))
-        some = slice(*np.searchsorted(starts, [lo, hi]))
-        ends[some] = trial_ends(drive, horizons_m, lo, hi)[starts[some] - lo]
-    return ends
+    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending."""
+    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
+    ends = np.empty((len(horizons), len(starts)), np.int64)
+    find_trial_ends(compiled_drive(drive), horizons, np.require(starts, np.int64, ["C", "A", "W"]), ends)
+    return ends.T
 
 
 def count_trials(ends: Ints) -> TrialCounts:

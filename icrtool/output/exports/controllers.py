@@ -10,7 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, export_warnings, factor_to_old
+from icrtool.calibration.controller_numbers import POSE_AFTER_M, export_warnings, factor_to_old
+from icrtool.calibration.error_growth import TWIST_OVER_M
 from icrtool.calibration.record import Calibration, ControllerErrors, ControllerNumbers
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
