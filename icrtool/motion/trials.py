@@ -68,21 +68,14 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
     drive, first = recording.drive, int(start.min())
-    near = slice(first, int(end.max()) + 1)
-    north, east, t, heading = drive.north[near], drive.east[near], recording.t_s[near], drive.heading[near]
-
-    def turn_and_place(rows: Ints | slice) -> tuple[Complexes, Complexes]:
-        turned, place = path(t[rows])
-        return np.exp(1j * (heading[rows] - turned)), place
-
     s, e = start - first, end - first
-    if len(s) > len(t):
-        turns, places = turn_and_place(slice(None))
-        turn, moved = turns[s], places[e] - places[s]
-    else:
-        turn, begin = turn_and_place(s)
-        moved = path(t[e])[1] - begin
-    errors: Floats = np.abs(turn * moved - (north[e] - north[s]) - 1j * (east[e] - east[s]))
+    used = np.zeros(int(e.max()) + 1, np.bool_)
+    used[s] = used[e] = True
+    rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
+    s, e = number[s], number[e]
+    turned, place = path(recording.t_s[rows])
+    turn, reference = np.exp(1j * (drive.heading[rows] - turned)), drive.north[rows] + 1j * drive.east[rows]
+    errors: Floats = np.abs(turn[s] * (place[e] - place[s]) - (reference[e] - reference[s]))
     return errors
 
 
