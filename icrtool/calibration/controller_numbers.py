@@ -100,7 +100,7 @@ def _fold_errors(
     """Return the errors of some windows (m,) by a model that was not fitted to them."""
     s, e = windows.start[some], windows.end[some]
     begin, finish = windows.knot_t[s], windows.knot_t[e]
-    path = predicted_path(recording, fitted, own, windows.steps.around(begin, finish))
+    path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
     (theta, place), (turned, moved) = path(begin), path(finish)
     error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
     turn = windows.turned[some]

@@ -222,7 +222,7 @@ def measure_error_sources(cut: Sequence[tuple[int, Recording, Windows]], table: 
             if not len(some) or (predicted := table.without(fold)) is None:
                 continue
             fitted, own = predicted
-            steps = windows.steps.around(begin[some], end[some])
+            steps = windows.steps.around(begin[some].min(), end[some].max())
             errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
             reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
             turn = errors.turned - windows.turned[some]

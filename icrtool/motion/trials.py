@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from
+from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from, fill_path_errors
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -72,10 +72,10 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     used = np.zeros(int(e.max()) + 1, np.bool_)
     used[s] = used[e] = True
     rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
-    s, e = number[s], number[e]
     turned, place = path(recording.t_s[rows])
     turn, reference = np.exp(1j * (drive.heading[rows] - turned)), drive.north[rows] + 1j * drive.east[rows]
-    errors: Floats = np.abs(turn[s] * (place[e] - place[s]) - (reference[e] - reference[s]))
+    errors = np.empty(len(s))
+    fill_path_errors(turn, place, reference, number[s], number[e], errors)
     return errors
 
 
