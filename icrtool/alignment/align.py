@@ -54,7 +54,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
-    heading, delays = found.heading, found.delays
+    heading = found.heading
     quality = grade_fixes(found.log, config, found.fix_steps)
     sensors = sensors_as_sent(quality.log, config)
     findings = alignment_findings(found, sensors.antenna_m)
@@ -84,8 +84,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         sections=run_sections(found, findings),
         streams=found.log.streams,
         fix_statistics=quality.statistics,
-        position_delay_s=delays.applied_gnss_s,
-        clock_std_s=delays.clock_std_s,
+        clock_std_s=found.delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
         warnings=(*quality.log.warnings, *found.warnings, *quality.warnings),
     )

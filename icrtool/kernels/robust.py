@@ -50,6 +50,11 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
     return MAD_TO_STD * float(np.median(np.abs(values - middle)))
 
 
+def soft_l1_loss(z: Floats) -> float:
+    """Return the sum of the soft-L1 loss of residuals `z` (m,) in standard deviations; see `soft_l1_weights`."""
+    return 2.0 * LOSS_SIGMAS**2 * float((np.sqrt(1.0 + (z / LOSS_SIGMAS) ** 2) - 1.0).sum())
+
+
 def soft_l1_weights(z: Floats) -> Floats:
     """Return the weights (m,) of squared residuals that make the soft-L1 loss; `z` (m,) in standard deviations.
 
@@ -332,6 +337,5 @@ def long_run_factor(series: Floats) -> Floats:
 
 def _cost(z: Floats, overlap: float, pull: Floats, away: Floats) -> float:
     """Return the loss of residuals in standard deviations, prior included; infinite where it is not a number."""
-    loss = 2.0 * LOSS_SIGMAS**2 * float((np.sqrt(1.0 + (z / LOSS_SIGMAS) ** 2) - 1.0).sum()) / overlap
-    cost = loss + float((pull * away**2).sum())
+    cost = soft_l1_loss(z) / overlap + float((pull * away**2).sum())
     return cost if np.isfinite(cost) else float("inf")

@@ -84,7 +84,7 @@ class Recording:
             some = slice(lo, lo + ROWS_AT_ONCE)
             yield wheel_motion(drive.v_left[some], drive.v_right[some], self.width_m), held[some]
 
-    def around(self, begin_s: Floats, end_s: Floats) -> Steps:
+    def around(self, begin_s: float, end_s: float) -> Steps:
         """Return single wheel samples as `Steps.around` does; of a long log, columns of all would take much memory."""
         near = rows_around(self.t_s, begin_s, end_s)
         return joined_steps(self.part(near.start, near.stop + 1), 1)
@@ -136,8 +136,8 @@ class Steps(NamedTuple):
     gyro: Floats
     into: Floats
 
-    def around(self, begin_s: Floats, end_s: Floats) -> Steps:
-        """Return the steps of the time in which trials (k,) begin and end, and of a little more for delays."""
+    def around(self, begin_s: float, end_s: float) -> Steps:
+        """Return the steps of the time between the first begin and the last end of trials, and a little for delays."""
         near = rows_around(self.t, begin_s, end_s)
         return Steps._make(column[near] for column in self)
 
@@ -158,10 +158,9 @@ class Steps(NamedTuple):
         return change
 
 
-def rows_around(t_s: Floats, begin_s: Floats, end_s: Floats) -> slice:
-    """Return the rows of times (n,) from the first begin to the last end of trials (k,), and of a little more."""
-    span = begin_s.min() - LONGEST_DELAY_S, end_s.max() + LONGEST_DELAY_S
-    first, stop = np.searchsorted(t_s, span, side="right").tolist()
+def rows_around(t_s: Floats, begin_s: float, end_s: float) -> slice:
+    """Return the rows of times (n,) from a begin to an end, and of a little more for delays."""
+    first, stop = np.searchsorted(t_s, [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S], side="right").tolist()
     return slice(max(first - 1, 0), stop)
 
 

@@ -40,10 +40,7 @@ class HeadingEvents(NamedTuple):
 
     def cut(self, count: int) -> HeadingEvents:
         """Return the first events."""
-        return HeadingEvents(
-            self.dt[:count], self.turn[:count], self.extra[:count], self.z[:count], self.h[:count], self.r[:count],
-            self.angle[:count],
-        )  # fmt: skip
+        return HeadingEvents._make(column[:count] for column in self)
 
 
 class HeadingModel(NamedTuple):

@@ -8,7 +8,7 @@ So the messages are grouped by their number of joints, and each group is decoded
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,31 +34,6 @@ _LISTS = "interface_values"
 _JOINTS = "number of joints"
 _NAMES = "joint_names[*]"
 _HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
-
-
-class Collector(Protocol):
-    """Gathers the columns of one topic while blocks go by."""
-
-    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
-        """Add the chosen messages of a block."""
-        ...
-
-    def table(self) -> TopicTable:
-        """Return what was gathered, sorted by log time."""
-        ...
-
-
-def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
-    """Return what gathers the wanted columns of a channel.
-
-    Raises
-    ------
-    DefinitionError
-        The layout of the channel's type is not known.
-    """
-    if channel.message_type == DYNAMIC_JOINT_STATE:
-        return DynamicJointCollector(channel)
-    return TopicCollector(channel, wanted)
 
 
 class DynamicJointCollector:
@@ -130,6 +105,23 @@ class DynamicJointCollector:
                 flat.append((_JOINTS, (BASE, ("uint32", 0))))
                 flat += [(f"joint {j}", (NAME, detail[0][1])) for j in range(joints)]
         return {**self._definitions, name: (constants, flat)}
+
+
+Collector = TopicCollector | DynamicJointCollector
+"""Gathers the columns of one topic while blocks go by."""
+
+
+def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
+    """Return what gathers the wanted columns of a channel.
+
+    Raises
+    ------
+    DefinitionError
+        The layout of the channel's type is not known.
+    """
+    if channel.message_type == DYNAMIC_JOINT_STATE:
+        return DynamicJointCollector(channel)
+    return TopicCollector(channel, wanted)
 
 
 def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:

@@ -11,12 +11,13 @@ import numpy as np
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
+from icrtool.logs.streams.source import HEADER
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
 from icrtool.records.samples import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
 GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
-GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *GYRO_AXES)
+GYRO_FIELDS = (*HEADER, *GYRO_AXES)
 
 FASTEST_RADPS = math.radians(1000.0)
 """No robot turns faster than this [rad/s]."""

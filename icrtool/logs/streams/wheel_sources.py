@@ -17,7 +17,7 @@ from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.position_sources import REFERENCE_WORDS
-from icrtool.logs.streams.source import Source, of_topic
+from icrtool.logs.streams.source import HEADER, Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
@@ -75,6 +75,8 @@ _Paths = tuple[str, str, str]
 
 Sides = tuple[Floats | None, Floats | None]
 Reader = Callable[[TopicTable, Config], WheelMotion]
+Entry = tuple[tuple[str, ...], Reader]
+"""The fields of a message type to take, and how to read them."""
 
 
 def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides = (None, None)) -> WheelMotion:
@@ -96,10 +98,6 @@ def _of_both(sides: Sides) -> Pair | None:
 
 def _nonzero(values: Floats) -> bool:
     return bool(np.any(values[np.isfinite(values)] != 0.0))
-
-
-def _header(*paths: str) -> tuple[str, ...]:
-    return ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *paths)
 
 
 def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
@@ -208,17 +206,17 @@ def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int
             yield rows, listed[rows], place
 
 
-def _by_name(paths: _Paths, score: float, what: str) -> Reader:
+def _by_name(paths: _Paths, score: float, what: str) -> Entry:
     def read(table: TopicTable, config: Config) -> WheelMotion:
         return replace(_joints(table, config, paths, score, what), joints=tuple(table.words(paths[0])[1]))
 
-    return read
+    return (*HEADER, *paths), read
 
 
 def _by_place(
     paths: tuple[str, str], left: list[int], right: list[int], why: str, stamp: str = "header.stamp"
-) -> Reader:
-    """Return a reader of messages whose lists of positions and of speeds have each side at fixed positions."""
+) -> Entry:
+    """Return the entry of messages whose lists of positions and of speeds have each side at fixed positions."""
     length = max(left + right) + 1
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
@@ -231,11 +229,11 @@ def _by_place(
             _side_means(speed, left, right),
         )
 
-    return read
+    return (f"{stamp}.sec", f"{stamp}.nanosec", *paths), read
 
 
-def _segway(prefix: str) -> Reader:
-    """Return a reader of the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
+def _segway(prefix: str, *header: str) -> Entry:
+    """Return the entry of the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         def sides(quantity: str) -> Sides:
@@ -246,7 +244,8 @@ def _segway(prefix: str) -> Reader:
         base = WheelMotion(**of_topic(table), unit="m", score=90.0, why=why)
         return motion_of(base, sides("displacement"), sides("velocity"))
 
-    return read
+    fields = (f"{prefix}{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
+    return (*header, *fields), read
 
 
 def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
@@ -264,65 +263,58 @@ def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score
 def _scout(table: TopicTable, _: Config) -> WheelMotion:
     """Return the body twist in scout_msgs/ScoutStatus (its motor rpm is integer, and before the gearbox)."""
     why = "the base's own speed and turn rate, converted to wheel speeds with the track width"
-    return _twist_motion(table, "linear_velocity", "lateral_velocity", "angular_velocity", 70.0, why)
+    return _twist_motion(table, *_SCOUT, 70.0, why)
 
 
-def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Reader:
-    """Return a reader of a body twist; `fused` is subtracted from the score of a topic named as fused with others."""
+def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Entry:
+    """Return the entry of a body twist; `fused` is subtracted from the score of a topic named as fused with others."""
+    paths = (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         lowered = score - (fused if _FUSED.search(table.topic) else 0.0)
         why = f"{what}, converted to wheel speeds with the track width"
-        motion = _twist_motion(table, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", lowered, why)
+        motion = _twist_motion(table, *paths, lowered, why)
         if REFERENCE_WORDS.search(table.topic) and not motion.problem:
             return replace(motion, problem="its name is that of a position reference, not of wheels")
         return motion
 
-    return read
-
-
-def _twist_paths(prefix: str) -> tuple[str, ...]:
-    return (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
+    return (*(HEADER if prefix else ()), *paths), read
 
 
 _JOINTS = ("name[*]", "position[*]", "velocity[*]")
-_DRIVERS = ("drivers[*].measured_travel", "drivers[*].measured_velocity")
 _LYNX = ("drivers[*].joint_name", "drivers[*].travel", "drivers[*].velocity")
-_PUMA = ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed")
-_FOUR = ("position[*]", "velocity[*]")
-_SEGWAY = tuple(f"{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
-
-_joint_state = _by_name(_JOINTS, 100.0, "wheel joints by name")
-_dynamic_joint_state = _by_name(_JOINTS, 95.0, "wheel joints by name")
-_lynx = _by_name(_LYNX, 90.0, "motor driver feedback by joint name")
-_puma = _by_name(_PUMA, 90.0, "motor driver feedback by device name")
+_PUMA = _by_name(
+    ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed"),
+    90.0, "motor driver feedback by device name",
+)  # fmt: skip
 # Drive.msg of jackal_msgs and of clearpath_platform_msgs: 0 is left, 1 is right.
-_two_drivers = _by_place(_DRIVERS, [0], [1], "motor driver feedback: driver 0 left, 1 right")
-_four_wheels = _by_place(
-    _FOUR, [0, 1], [2, 3], "four wheels: front left, rear left, front right, rear right", stamp="stamp"
-)
-_odometry = _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0)
+_TWO_DRIVERS = _by_place(
+    ("drivers[*].measured_travel", "drivers[*].measured_velocity"), [0], [1],
+    "motor driver feedback: driver 0 left, 1 right",
+)  # fmt: skip
+_SCOUT = ("linear_velocity", "lateral_velocity", "angular_velocity")
+_SEGWAY_BARE, _SEGWAY_STAMPED = _segway(""), _segway("segway.", *HEADER)
 
-_SEGWAY_BARE = (_SEGWAY, _segway(""))
-_SEGWAY_STAMPED = (_header(*(f"segway.{field}" for field in _SEGWAY)), _segway("segway."))
-
-WHEEL_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
-    "sensor_msgs/JointState": (_header(*_JOINTS), _joint_state),
-    DYNAMIC_JOINT_STATE: (_header(*_JOINTS), _dynamic_joint_state),
-    "jackal_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
-    "clearpath_platform_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
-    "clearpath_motor_msgs/LynxMultiFeedback": (_header(*_LYNX), _lynx),
-    "clearpath_motor_msgs/PumaMultiFeedback": (_header(*_PUMA), _puma),
-    "puma_motor_msgs/MultiFeedback": (_header(*_PUMA), _puma),
-    "leo_msgs/WheelStates": (("stamp.sec", "stamp.nanosec", *_FOUR), _four_wheels),
-    "scout_msgs/ScoutStatus": (_header("linear_velocity", "lateral_velocity", "angular_velocity"), _scout),
+WHEEL_TYPES: dict[str, Entry] = {
+    "sensor_msgs/JointState": _by_name(_JOINTS, 100.0, "wheel joints by name"),
+    DYNAMIC_JOINT_STATE: _by_name(_JOINTS, 95.0, "wheel joints by name"),
+    "jackal_msgs/Feedback": _TWO_DRIVERS,
+    "clearpath_platform_msgs/Feedback": _TWO_DRIVERS,
+    "clearpath_motor_msgs/LynxMultiFeedback": _by_name(_LYNX, 90.0, "motor driver feedback by joint name"),
+    "clearpath_motor_msgs/PumaMultiFeedback": _PUMA,
+    "puma_motor_msgs/MultiFeedback": _PUMA,
+    "leo_msgs/WheelStates": _by_place(
+        ("position[*]", "velocity[*]"), [0, 1], [2, 3],
+        "four wheels: front left, rear left, front right, rear right", "stamp",
+    ),
+    "scout_msgs/ScoutStatus": ((*HEADER, *_SCOUT), _scout),
     **dict.fromkeys(("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped"), _SEGWAY_STAMPED),
     "segway_interfaces/Stamped": _SEGWAY_STAMPED,
     **dict.fromkeys(("segway_rmp/SegwayStatus", "segway_rmp_ros2/SegwayStatus"), _SEGWAY_BARE),
     "segway_interfaces/Segwaystatus": _SEGWAY_BARE,
-    "nav_msgs/Odometry": (_header(*_twist_paths("twist.twist.")), _odometry),
-    "geometry_msgs/TwistStamped": (_header(*_twist_paths("twist.")), _twist("twist.", 50.0)),
-    "geometry_msgs/TwistWithCovarianceStamped": (_header(*_twist_paths("twist.twist.")), _twist("twist.twist.", 50.0)),
-    "geometry_msgs/Twist": (_twist_paths(""), _twist("", 40.0)),
-}
+    "nav_msgs/Odometry": _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0),
+    "geometry_msgs/TwistStamped": _twist("twist.", 50.0),
+    "geometry_msgs/TwistWithCovarianceStamped": _twist("twist.twist.", 50.0),
+    "geometry_msgs/Twist": _twist("", 40.0),
+}  # fmt: skip
 """By message type: the fields to take, and how to read them."""

@@ -69,10 +69,10 @@ def write_truth(table: TruthTable, path: Path) -> None:
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    header = ",".join(table.columns()) + "\n"
+    header = ",".join(table) + "\n"
     with path.open("xb") as file:
         file.write(header.encode())
-        rows = pa.table({name: np.ascontiguousarray(values) for name, values in table.columns().items()})
+        rows = pa.table({name: np.ascontiguousarray(values) for name, values in table.items()})
         pc.write_csv(rows, file, pc.WriteOptions(include_header=False, quoting_style="none"))
 
 
