@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icrtool.calibration.error_growth import TWIST_OVER_M
+from icrtool.calibration.error_growth import TWIST_OVER_M, nonnegative
 from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.kernels.arrays import Floats, Ints
@@ -100,7 +100,7 @@ def _fold_errors(
     """Return the errors of some windows (m,) by a model that was not fitted to them."""
     s, e = windows.start[some], windows.end[some]
     begin, finish = windows.knot_t[s], windows.knot_t[e]
-    path = predicted_path(recording, fitted, own, windows.steps.around(begin, finish))
+    path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
     (theta, place), (turned, moved) = path(begin), path(finish)
     error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
     turn = windows.turned[some]
@@ -117,11 +117,5 @@ def _variances(errors: Floats) -> tuple[float, float, float]:
 def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     """Return a, b >= 0 with miss^2 about a first^2 + b second^2, by least squares."""
     columns = np.column_stack([first**2, second**2])
-    square, product = columns.T @ columns, columns.T @ miss**2
-    both = np.linalg.lstsq(square, product, rcond=None)[0]
-    if both.min() < 0.0:
-        # at the bound one of them is zero: the one that leaves less
-        alone = np.divide(product, np.diag(square), out=np.zeros(2), where=np.diag(square) > 0.0)
-        better = int(np.argmax(alone * product))
-        both = np.where(np.arange(2) == better, np.maximum(alone, 0.0), 0.0)
-    return max(float(both[0]), SMALLEST_VARIANCE), max(float(both[1]), SMALLEST_VARIANCE)
+    both = np.maximum(nonnegative(columns.T @ columns, columns.T @ miss**2), SMALLEST_VARIANCE)
+    return float(both[0]), float(both[1])

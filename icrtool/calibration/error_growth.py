@@ -222,7 +222,7 @@ def measure_error_sources(cut: Sequence[tuple[int, Recording, Windows]], table: 
             if not len(some) or (predicted := table.without(fold)) is None:
                 continue
             fitted, own = predicted
-            steps = windows.steps.around(begin[some], end[some])
+            steps = windows.steps.around(begin[some].min(), end[some].max())
             errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
             reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
             turn = errors.turned - windows.turned[some]
@@ -270,10 +270,10 @@ def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Float
             scaled = weight * columns[rows]
             matrix += scaled.T @ scaled / np.count_nonzero(rows)
             y += scaled.T @ (weight * (squared[rows] - of_parameters[rows, 0])) / np.count_nonzero(rows)
-    return _nonnegative(matrix, y)
+    return nonnegative(matrix, y)
 
 
-def _nonnegative(matrix: Floats, y: Floats) -> Floats:
+def nonnegative(matrix: Floats, y: Floats) -> Floats:
     """Return x >= 0 that minimises x matrix x / 2 - y x, by coordinate descent; matrix is positive semidefinite."""
     x = np.zeros(len(y))
     for _ in range(DESCENTS):

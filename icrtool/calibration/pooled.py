@@ -86,16 +86,16 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
     if not np.isfinite(heading.angle_rad).all():
         return plain
-    drive = plain.drive
-    step = np.append(np.diff(heading.angle_rad), 0.0)
-    rate = np.divide(step, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
-    slope, _, later_s = _gyro_line(plain, rate)
+    t, dt = plain.t_s, plain.drive.dt_s
+
+    def rate(later_s: float) -> Floats:
+        turned = np.diff(np.interp(np.append(t, t[-1] + dt[-1]) + later_s, t, heading.angle_rad))
+        return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
+
+    slope, _, later_s = _gyro_line(plain, rate(0.0))
     if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
         return plain
-    ends = np.append(plain.t_s, plain.t_s[-1] + drive.dt_s[-1]) + later_s
-    turned = np.diff(np.interp(ends, plain.t_s, heading.angle_rad))
-    rate = np.divide(turned, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
-    return replace(plain, gyro_radps=np.sign(slope) * rate, gyro_reversed=slope < 0.0)
+    return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
 
 
 def gyro_recording_of(run: Run) -> Recording:

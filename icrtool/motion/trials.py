@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from
+from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from, fill_path_errors
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -68,21 +68,14 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
     drive, first = recording.drive, int(start.min())
-    near = slice(first, int(end.max()) + 1)
-    north, east, t, heading = drive.north[near], drive.east[near], recording.t_s[near], drive.heading[near]
-
-    def turn_and_place(rows: Ints | slice) -> tuple[Complexes, Complexes]:
-        turned, place = path(t[rows])
-        return np.exp(1j * (heading[rows] - turned)), place
-
     s, e = start - first, end - first
-    if len(s) > len(t):
-        turns, places = turn_and_place(slice(None))
-        turn, moved = turns[s], places[e] - places[s]
-    else:
-        turn, begin = turn_and_place(s)
-        moved = path(t[e])[1] - begin
-    errors: Floats = np.abs(turn * moved - (north[e] - north[s]) - 1j * (east[e] - east[s]))
+    used = np.zeros(int(e.max()) + 1, np.bool_)
+    used[s] = used[e] = True
+    rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
+    turned, place = path(recording.t_s[rows])
+    turn, reference = np.exp(1j * (drive.heading[rows] - turned)), drive.north[rows] + 1j * drive.east[rows]
+    errors = np.empty(len(s))
+    fill_path_errors(turn, place, reference, number[s], number[e], errors)
     return errors
 
 
