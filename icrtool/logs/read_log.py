@@ -273,21 +273,25 @@ def _collect(
     static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
     wanted |= static
     cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
-    for whole in container.blocks(frozenset(wanted), cut):
-        block = cut.of(whole)
-        for number in np.unique(block.channel).tolist():
-            if number not in wanted:
-                continue
-            try:
-                if number not in collectors:
-                    # A definition is compiled when its first message comes: a log may declare any number of topics.
-                    collectors[number] = collector_for(by_id[number], wanted[number])
-                if (collector := collectors[number]) is not None:
-                    collector.feed(block, block.channel == number)
-            except DefinitionError as err:
-                unread[by_id[number].topic], collectors[number] = str(err), None
-        if progress is not None:
-            progress(container.share_read())
+    with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
+        for whole in blocks:
+            block = cut.of(whole)
+            left = block.channel
+            while len(left):
+                number = int(left[0])
+                left = left[left != number]
+                if number not in wanted:
+                    continue
+                try:
+                    if number not in collectors:
+                        # A definition is compiled when its first message comes: a log may declare any number of topics.
+                        collectors[number] = collector_for(by_id[number], wanted[number])
+                    if (collector := collectors[number]) is not None:
+                        collector.feed(block, number)
+                except DefinitionError as err:
+                    unread[by_id[number].topic], collectors[number] = str(err), None
+            if progress is not None:
+                progress(container.share_read())
     tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
     silent = [by_id[number] for number in wanted if number not in collectors]
     tables += [_empty_table(channel) for channel in silent]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,12 +15,12 @@ from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space
 
-MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
+MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
 
-MOST_ROWS = 1 << 18
-"""Records that a scan finds at a time."""
+MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
+"""Messages that a scan finds at a time; a record has more bytes than this."""
 
 
 class IndexedChunk(Protocol):
@@ -35,24 +37,28 @@ class IndexedChunk(Protocol):
         ...
 
 
-class ChunkedFile(ABC):
-    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
+class Spaces(NamedTuple):
+    """Memory for a chunk as it is in the file, for its records, and for records of several chunks."""
 
-    Parameters
-    ----------
-    message : operation code of a record that is a message
-    """
+    packed: Space
+    records: Space
+    joined: Space
+
+
+class ChunkedFile(ABC):
+    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
 
     _chunks: Sequence[IndexedChunk] | None = None
 
-    def __init__(self, path: Path, message: int) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.files = [path]
         self.problems = Problems(path.name)
-        self._message = message
-        self._rows: Ints = np.empty((0, 5), np.int64)
-        self._inflation, self._space = Inflation(), Space()
+        self._inflation = Inflation()
+        # A block is used while the next one is made.
+        self._spaces, self._other_spaces = (Spaces(Space(), Space(), Space()) for _ in range(2))
         self._stream = path.open("rb")
+        self._at = 0
         self._size = path.stat().st_size
 
     @abstractmethod
@@ -69,18 +75,24 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
         """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
 
     @abstractmethod
     def _learn(self, row: Ints, data: Bytes) -> None:
-        """Remember a record that is no message; `row` is that of the scan of `data`."""
+        """Remember a record that is no message; `row` is its column in `others` of the scan of `data`."""
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
-        """Yield the messages of the wanted channels, chunk by chunk."""
-        if wanted:
-            yield from self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
-            self._free()
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+        """Yield the messages of the wanted channels, chunk by chunk; the next is made while one is used."""
+        if not wanted:
+            return
+        blocks = self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
+        with ThreadPoolExecutor(1) as pool:
+            pending = pool.submit(next, blocks, None)
+            while (block := pending.result()) is not None:
+                pending = pool.submit(next, blocks, None)
+                yield block
+        self._free()
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels."""
@@ -90,13 +102,12 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        self._rows = np.empty((0, 5), np.int64)
-        self._space.free()
-        self._inflation.free()
+        for space in (*self._spaces, *self._other_spaces):
+            space.free()
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
-        return self._stream.tell() / max(self._size, 1)
+        return self._at / max(self._size, 1)
 
     def close(self) -> None:
         """Release the file."""
@@ -107,17 +118,16 @@ class ChunkedFile(ABC):
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
-    def _read(self, at: int, length: int) -> memoryview:
-        """Return bytes of the file, as many as there are, valid until the next call."""
-        length = min(length, self._size - at)
-        if length <= 0:
-            return memoryview(b"")
-        self._stream.seek(at)
-        space = self._space.of(length).data
-        return space[: self._stream.readinto(space)]
+    def _read(self, at: int, length: int) -> Bytes:
+        """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
+        space = self._spaces.packed.of(max(min(length, self._size - at), 0))
+        self._at = at
+        found = space[: os.preadv(self._stream.fileno(), [space.data], at) if len(space) else 0]
+        found.flags.writeable = False  # as what is decompressed: the kernels are compiled once
+        return found
 
     def _chunk(
-        self, at: int, length: int, place: int, unpack: Callable[[memoryview], Bytes], *, learn: bool, cut: bool
+        self, at: int, length: int, place: int, unpack: Callable[[Bytes], Bytes], *, learn: bool, cut: bool
     ) -> Iterator[Block]:
         """Yield the messages of a chunk.
 
@@ -141,18 +151,15 @@ class ChunkedFile(ABC):
             begin = stop
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
+        self._spaces, self._other_spaces = self._other_spaces, self._spaces
         if stop < len(data) and not cut:
             self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        if not len(self._rows):
-            self._rows = np.empty((MOST_ROWS, 5), np.int64)
-        count, stop = self._scan(data, begin, self._rows)
-        rows = self._rows[:count]
-        is_message = rows[:, 0] == self._message
-        if learn:
-            for row in rows[~is_message]:
-                self._learn(row, data)
-        _, *columns = rows[is_message].T
-        return with_possible_times(Block(data, *map(np.ascontiguousarray, columns)), self.problems), stop
+        most = min((len(data) - begin) // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+        messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
+        count, other, stop = self._scan(data, begin, messages, others)
+        for row in others[:, :other].T:
+            self._learn(row, data)
+        return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop

@@ -2,41 +2,36 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, joined, ros_type_name
+from icrtool.kernels.arrays import Bools, Bytes, Ints
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
 from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, ChunkedFile
-from icrtool.logs.containers.decompress import (
-    LARGEST_CHUNK_BYTES,
-    DecompressionError,
-    Inflation,
-    unpack_messages,
-)
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, unpack_messages
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from mcap.records import Channel as McapChannel
-    from mcap.records import ChunkIndex, Schema, Statistics
+    from mcap.records import Schema, Statistics
 
-    _Parsed = Schema | McapChannel | ChunkIndex | Statistics
+    _Parsed = Schema | McapChannel | Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
-_FOOTER, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 7, 8, 11, 15
+_FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
 _HEAD_BYTES, _FOOTER_BYTES = 9, 20
 _CHECKSUM_BYTES = 4
 _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
 
 
-_INDEX_HEAD_BYTES = _HEAD_BYTES + 6
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
 
@@ -87,7 +82,7 @@ class McapFile(ChunkedFile):
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
-        super().__init__(path, MCAP_MESSAGE)
+        super().__init__(path)
         self._message_compression = message_compression
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
@@ -103,78 +98,91 @@ class McapFile(ChunkedFile):
             raise
         self.channels = [self._channel(number) for number in sorted(self._channels)]
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
         """Yield the messages of the wanted channels, chunk by chunk."""
-        blocks = super().blocks(wanted, cut)
+        blocks: Iterator[Block] = super().blocks(wanted, cut)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
     def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        small: list[Block] = []
+        flags = np.isin(np.arange(1 << 16), list(wanted))
+        group: list[_Chunk] = []
         held = 0
         for chunk in self._chunks or ():
-            if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
-                needed = self._needed(chunk, wanted)
-                part = self._read_part(chunk, needed) if needed is not None else None
-                is_small = part is not None and len(part.data) <= JOINED_BYTES
-                if part is not None and is_small:
-                    small.append(part._replace(data=part.data.copy()))
-                    held += len(part.data)
-                if small and (not is_small or held > JOINED_BYTES):
-                    yield joined(small)
-                    small, held = [], 0
-                if part is None:
-                    yield from self._read_chunk(chunk)
-                elif not is_small:
-                    yield part
-        if small:
-            yield joined(small)
+            if not cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
+                continue
+            ranges, size = self._wanted_ranges(chunk, wanted, flags)
+            if group and (ranges is None or held + size > JOINED_BYTES):
+                yield from self._read_group(group, held)
+                group, held = [], 0
+            if ranges is not None and self._take_ranges(chunk, ranges, held, size):
+                group.append(chunk)
+                held += size
+            else:
+                yield from self._read_group(group, held)
+                group, held = [], 0
+                yield from self._read_chunk(chunk)
+        yield from self._read_group(group, held)
 
-    def _needed(self, chunk: _Chunk, wanted: frozenset[int]) -> Ints | None:
-        """Return where the wanted messages of a chunk begin and end (n, 2), by its index; None where most is wanted."""
-        if chunk.channels is None or chunk.channels <= wanted or chunk.index_length > LARGEST_CHUNK_BYTES:
-            return None
-        index, at = bytes(self._read(chunk.at + chunk.length, chunk.index_length)), 0
-        offsets, flags = [], []
-        while at + _INDEX_HEAD_BYTES <= len(index):
-            opcode, length, channel = struct.unpack_from("<BQH", index, at)
-            at += _HEAD_BYTES + length
-            if opcode != _MESSAGE_INDEX or length < _INDEX_HEAD_BYTES - _HEAD_BYTES or at > len(index):
-                return None
-            count = (length - _INDEX_HEAD_BYTES + _HEAD_BYTES) // 16
-            offsets.append(np.frombuffer(index, "<i8", 2 * count, at - 16 * count)[1::2])
-            flags.append(np.full(count, channel in wanted))
-        if not offsets or not chunk.size:
-            return None
-        begin = np.concatenate(offsets)
-        order = np.argsort(begin)
-        edges = np.append(begin[order], chunk.size)
-        places = np.column_stack([edges[:-1], edges[1:]])[np.concatenate(flags)[order]]
-        sound = len(places) and edges[0] >= 0 and np.diff(edges).min() > 0
-        return places if sound and np.diff(places).sum() < SMALL_PART * chunk.size else None
+    def _wanted_ranges(self, chunk: _Chunk, wanted: frozenset[int], flags: Bools) -> tuple[Ints | None, int]:
+        """Return the ranges (2, n) of a chunk's records that hold wanted messages, and their size, by its index.
 
-    def _read_part(self, chunk: _Chunk, places: Ints) -> Block | None:
-        """Return the messages at some places of a chunk; None where all of it has to be read for them.
+        No ranges where most of it is wanted, or the index cannot be right.
+        """
+        from icrtool.logs.containers.record_table import read_message_index, wanted_ranges
+
+        if (
+            chunk.channels is None
+            or chunk.channels <= wanted
+            or max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES
+        ):
+            return None, 0
+        index = np.frombuffer(os.pread(self._stream.fileno(), chunk.index_length, chunk.at + chunk.length), np.uint8)
+        places = np.empty(len(index) // 16, np.int64)
+        count, wanted_count = read_message_index(index, flags, places)
+        places = places[:count]
+        places.sort()
+        ranges = np.empty((2, wanted_count), np.int64)
+        count, size = wanted_ranges(places, chunk.size, ranges)
+        return (ranges[:, :count].copy(), size) if 0 < size < SMALL_PART * chunk.size else (None, 0)
+
+    def _take_ranges(self, chunk: _Chunk, ranges: Ints, at: int, size: int) -> bool:
+        """Copy ranges of a chunk's records to byte `at` of the joined ones; return whether they could be read.
 
         What is compressed is read up to the last of them, of other chunks nothing else is read.
         """
-        needed = int(places.max(initial=0))
+        from icrtool.logs.containers.record_table import copy_ranges
+
+        first, needed = (0, int(ranges[1, -1])) if not chunk.stored else (int(ranges[0, 0]), int(ranges[1, -1]))
         try:
             if chunk.stored:
-                first, parts = chunk.at + chunk.length - chunk.size, []
-                gaps = np.flatnonzero(places[1:, 0] > places[:-1, 1])
-                for begin, end in zip(places[np.append(0, gaps + 1), 0], places[np.append(gaps, -1), 1], strict=True):
-                    parts.append(bytes(self._read(first + int(begin), int(end - begin))))
-                records = np.frombuffer(b"".join(parts), np.uint8)
-                needed = int(np.diff(places).sum())
+                records = self._read(chunk.at + chunk.length - chunk.size + first, needed - first)
             else:
+                # A whole frame is decompressed in one step.
+                needed = chunk.size if 2 * needed > chunk.size else needed
                 content = self._read(chunk.at, min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
-                records = _chunk_records(content, self._inflation, cut=True, needed=needed)
+                records = self._chunk_records(content, cut=True, needed=needed)
         except DecompressionError:
-            return None
+            return False
+        if len(records) < needed - first:
+            return False
+        copy_ranges(records, ranges - first, self._spaces.joined.of(max(size, JOINED_BYTES)), at)
+        return True
+
+    def _read_group(self, chunks: list[_Chunk], size: int) -> Iterator[Block]:
+        """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
+        if not chunks:
+            return
+        records = self._spaces.joined.of(size)
+        records.flags.writeable = False
         block, stop = self._scanned(records)
-        return block if stop >= needed else None
+        if stop == size:
+            yield block
+            self._spaces, self._other_spaces = self._other_spaces, self._spaces
+        else:
+            for chunk in chunks:
+                yield from self._read_chunk(chunk)
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -193,27 +201,22 @@ class McapFile(ChunkedFile):
     def _read_index(self) -> list[_Chunk] | None:
         """Return the chunks listed in the file's index; None without an index, or where it does not fit the file."""
         from mcap.records import Channel as McapChannel
-        from mcap.records import ChunkIndex, Schema, Statistics
+        from mcap.records import Schema, Statistics
 
         chunks: list[_Chunk] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
         statistics: Statistics | None = None
         for opcode, content in self._summary_records():
-            match _parse(opcode, content):
+            match _chunk_of_index(content) if opcode == _CHUNK_INDEX else _parse(opcode, content):
                 case Schema() as schema:
                     schemas[schema.id] = schema
                 case McapChannel() as channel:
                     channels[channel.id] = channel
                 case Statistics() as found:
                     statistics = found
-                case ChunkIndex() as index:
-                    held = frozenset(index.message_index_offsets) or None
-                    start, length = index.chunk_start_offset + _HEAD_BYTES, index.chunk_length - _HEAD_BYTES
-                    times = index.message_start_time, index.message_end_time
-                    size = index.uncompressed_size
-                    stored = index.compression in ("", "none") and size <= length
-                    chunks.append(_Chunk(start, length, held, index.message_index_length, *times, size, stored))
+                case _Chunk() as chunk:
+                    chunks.append(chunk)
                 case None:
                     return None
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
@@ -295,10 +298,7 @@ class McapFile(ChunkedFile):
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
-        if not 0 <= at < self._size:
-            return 0, 0
-        self._stream.seek(at)
-        head = self._stream.read(_HEAD_BYTES)
+        head = os.pread(self._stream.fileno(), _HEAD_BYTES, at) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -324,8 +324,8 @@ class McapFile(ChunkedFile):
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
-            self._stream.seek(at)
-            piece = np.frombuffer(self._stream.read(max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
+            self._at, count = at, max(PIECE_BYTES, _HEAD_BYTES + length)
+            piece = np.frombuffer(os.pread(self._stream.fileno(), count, at), np.uint8)
             block, stop = self._scanned(piece, learn=learn)
             if stop:
                 return block, stop - _HEAD_BYTES
@@ -333,21 +333,47 @@ class McapFile(ChunkedFile):
         return None, length
 
     def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        def unpack(content: memoryview) -> Bytes:
-            return _chunk_records(content, self._inflation, cut=cut)
+        def unpack(content: Bytes) -> Bytes:
+            return self._chunk_records(content, cut=cut)
 
         return self._chunk(chunk.at, chunk.length, chunk.at - _HEAD_BYTES, unpack, learn=learn, cut=cut)
 
-    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+    def _chunk_records(self, content: Bytes, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Bytes:
+        """Return the records of a chunk record's content, decompressed and checked against its checksum.
+
+        Parameters
+        ----------
+        cut : the content is cut off; what can be decompressed is not checked
+        needed : so many bytes of a content that is cut off are enough
+        """
+        if len(content) < 40:
+            raise DecompressionError("its header is cut off")
+        size = int.from_bytes(content[16:24], "little")
+        checksum = int.from_bytes(content[24:28], "little")
+        name_end = 32 + int.from_bytes(content[28:32], "little")
+        compression = bytes(content[32 : min(name_end, 32 + 64)]).decode("ascii", "replace")
+        if name_end + 8 > len(content):
+            raise DecompressionError("its header is damaged")
+        length = int.from_bytes(content[name_end : name_end + 8], "little")
+        packed = content[name_end + 8 : name_end + 8 + length]
+        if len(packed) < length and not cut:
+            raise DecompressionError("its header is damaged")
+        space = self._spaces.records
+        data = self._inflation.decompress(packed, compression, min(size, needed) if cut else size, space, partial=cut)
+        if checksum and not cut and zlib.crc32(data.data) != checksum:
+            raise DecompressionError("its checksum is wrong")
+        return data
+
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_mcap
 
-        return scan_mcap(data, begin, rows)
+        return scan_mcap(data, begin, messages, others)
 
     def _learn(self, row: Ints, data: Bytes) -> None:
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema
 
-        record = _parse(int(row[0]), bytes(data[row[3] : row[4]]))
+        record = _parse(int(row[0]), bytes(data[row[2] : row[3]]))
         if isinstance(record, Schema):
             known = self._schemas.setdefault(record.id, record) == record
         elif isinstance(record, McapChannel):
@@ -360,19 +386,33 @@ class McapFile(ChunkedFile):
             self.problems.add(f"{what} is described twice, differently; the first description was used")
 
 
+def _chunk_of_index(content: bytes) -> _Chunk | None:
+    """Return the chunk that a chunk index record describes, None where the record is damaged."""
+    try:
+        begin_ns, end_ns, start, length, map_bytes = struct.unpack_from("<QQQQI", content)
+        channels = frozenset(channel for channel, _ in struct.iter_unpack("<HQ", content[36 : 36 + map_bytes]))
+        index_length, name_bytes = struct.unpack_from("<QI", content, 36 + map_bytes)
+        name_end = 48 + map_bytes + name_bytes
+        _, size = struct.unpack_from("<QQ", content, name_end)
+    except struct.error:
+        return None
+    at, length = start + _HEAD_BYTES, length - _HEAD_BYTES
+    is_stored = content[48 + map_bytes : name_end] in (b"", b"none") and size <= length
+    return _Chunk(at, length, channels or None, index_length, begin_ns, end_ns, size, is_stored)
+
+
 def _parse(opcode: int, content: bytes) -> _Parsed | None:
-    """Return a schema, channel, chunk index or statistics record, None where it is damaged."""
+    """Return a schema, channel or statistics record, None where it is damaged."""
     from io import BytesIO
 
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.records import Channel as McapChannel
-    from mcap.records import ChunkIndex, Schema, Statistics
+    from mcap.records import Schema, Statistics
 
-    kinds: dict[int, type[Schema | McapChannel | ChunkIndex | Statistics]] = {
+    kinds: dict[int, type[Schema | McapChannel | Statistics]] = {
         MCAP_SCHEMA: Schema,
         MCAP_CHANNEL: McapChannel,
-        _CHUNK_INDEX: ChunkIndex,
         _STATISTICS: Statistics,
     }
     try:
@@ -380,32 +420,6 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):
         return None
     return record
-
-
-def _chunk_records(content: memoryview, inflation: Inflation, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Bytes:
-    """Return the records of a chunk record's content, decompressed and checked against its checksum.
-
-    Parameters
-    ----------
-    cut : the content is cut off; what can be decompressed is not checked
-    needed : so many bytes of a content that is cut off are enough
-    """
-    if len(content) < 40:
-        raise DecompressionError("its header is cut off")
-    size = int.from_bytes(content[16:24], "little")
-    checksum = int.from_bytes(content[24:28], "little")
-    name_end = 32 + int.from_bytes(content[28:32], "little")
-    compression = bytes(content[32 : min(name_end, 32 + 64)]).decode("ascii", "replace")
-    if name_end + 8 > len(content):
-        raise DecompressionError("its header is damaged")
-    length = int.from_bytes(content[name_end : name_end + 8], "little")
-    packed = content[name_end + 8 : name_end + 8 + length]
-    if len(packed) < length and not cut:
-        raise DecompressionError("its header is damaged")
-    data = inflation.decompress(packed, compression, min(size, needed) if cut else size, partial=cut)
-    if checksum and not cut and zlib.crc32(data.data) != checksum:
-        raise DecompressionError("its checksum is wrong")
-    return data
 
 
 def is_mcap(stream: BinaryIO) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import BAG_CONNECTION, BAG_MESSAGE, ChunkedFile
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, ChunkedFile
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -64,7 +64,7 @@ class Ros1Bag(ChunkedFile):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, BAG_MESSAGE)
+        super().__init__(path)
         self._connections: dict[int, Channel] = {}
         try:
             self._check_start()
@@ -164,19 +164,19 @@ class Ros1Bag(ChunkedFile):
             self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        def unpack(content: memoryview) -> Bytes:
-            size = record.number(b"size")
-            return self._inflation.decompress(content, record.text(b"compression"), size, partial=cut)
+        def unpack(content: Bytes) -> Bytes:
+            size, compression = record.number(b"size"), record.text(b"compression")
+            return self._inflation.decompress(content, compression, size, self._spaces.records, partial=cut)
 
         return self._chunk(record.at, record.length, record.at, unpack, learn=learn, cut=cut)
 
-    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_bag
 
-        return scan_bag(data, begin, rows)
+        return scan_bag(data, begin, messages, others)
 
     def _learn(self, row: Ints, data: Bytes) -> None:
-        _, number, header, start, end = row.tolist()
+        header, number, start, end = row.tolist()
         topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
         self._connect(number, topic, bytes(data[start:end]))
 
