@@ -25,7 +25,7 @@ from icrtool.logs.messages.schema import (
 )
 
 _MAX_NESTING = 8
-_MOST_REMEMBERED = 256
+_MOST_REMEMBERED = 512
 """Words and columns remembered of a message's shape; messages with more are all decoded step by step."""
 
 _STEPS_PER_BYTE, _LEAST_STEPS, MOST_STEPS = 4, 256, 1 << 24
@@ -295,7 +295,7 @@ class Decoded:
         self.shapes = np.zeros((self.layout.columns, self.rows + 1), np.uint64)
         self.times_ns, self.shape_of = np.empty((2, self.rows), np.int64)
         self.state = np.array([0, 0, 0, 0, 0, -1, 0, 0])
-        self.same, self.taken = np.empty((2, _MOST_REMEMBERED, 3), np.int64)
+        self.same, self.taken = np.empty((2, min(_MOST_REMEMBERED, 32 * self.rows), 3), np.int64)
         self.loops = np.zeros((4, _MAX_NESTING), np.int64)
 
     @property

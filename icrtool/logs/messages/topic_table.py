@@ -186,6 +186,10 @@ class TopicCollector:
         """
         first = 0
         while first < len(block.channel):
+            if self._rows.filled == self._rows.rows:
+                self._settle()
+                if self._rows.rows < _ROWS_AT_ONCE:
+                    self._new_rows(self.layout, 2 * self._rows.rows)
             more = self._capacity < self.largest_capacity
             first = self._rows.decode(block, number, first, self._capacity if more else ANY_LENGTH)
             if self._rows.known_shapes > self._learned:
@@ -194,10 +198,6 @@ class TopicCollector:
                 self._capacity = min(self._rows.longest, self.largest_capacity)
                 self._settle()
                 self._compile()
-            elif self._rows.filled == self._rows.rows:
-                self._settle()
-                if self._rows.rows < _ROWS_AT_ONCE:
-                    self._new_rows(self.layout, 2 * self._rows.rows)
 
     def _learn_texts(self, data: Bytes) -> None:
         """Learn the texts of new shapes, which are in `data`."""
