@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from icrtool.errors import DataError, DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.split_files import file_sha256, log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -105,7 +104,7 @@ def survey_log(
     try:
         with ThreadPoolExecutor(1) as pool:
             try:
-                hashes = [pool.submit(_fingerprint, file, ended) for file in container.files]
+                hashes = [pool.submit(file_sha256, file, ended) for file in container.files]
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
@@ -300,15 +299,6 @@ def _collect(
 
 def _empty_table(channel: Channel) -> TopicTable:
     return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0, "")
-
-
-def _fingerprint(file: Path, ended: Event) -> str:
-    """Return the SHA-256 of a file, or of its beginning once `ended` is set."""
-    digest, piece = hashlib.sha256(), bytearray(1 << 20)
-    with file.open("rb", buffering=0) as stream:
-        while not ended.is_set() and (count := stream.readinto(piece)):
-            digest.update(memoryview(piece)[:count])
-    return digest.hexdigest()
 
 
 def _input_of(file: Path, pending: Future[str]) -> InputFile:

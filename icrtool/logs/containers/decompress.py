@@ -35,10 +35,11 @@ class Space:
     def __init__(self) -> None:
         self._bytes: Bytes = np.empty(0, np.uint8)
 
-    def of(self, size: int) -> Bytes:
-        """Return `size` bytes (size,), the same ones as before as far as they reach."""
+    def of(self, size: int, kept: int = 0) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before as far as they reach; the first `kept` ones stay."""
         if len(self._bytes) < size:
-            self._bytes = np.empty(size, np.uint8)
+            before, self._bytes = self._bytes, np.empty(max(size, 2 * kept), np.uint8)
+            self._bytes[:kept] = before[:kept]
         return self._bytes[:size]
 
     def free(self) -> None:

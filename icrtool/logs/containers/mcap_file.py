@@ -31,7 +31,6 @@ _HEAD_BYTES, _FOOTER_BYTES = 9, 20
 _CHECKSUM_BYTES = 4
 _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
 
-
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
 
@@ -40,7 +39,6 @@ SMALL_PART = 0.5
 
 Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
 """
-
 
 JOINED_BYTES = 1 << 20
 """Such parts are handed on together once they have so many bytes: each block has a cost of its own."""
@@ -112,49 +110,41 @@ class McapFile(ChunkedFile):
         for chunk in self._chunks or ():
             if not cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
                 continue
-            ranges, size = self._wanted_ranges(chunk, wanted, flags)
-            if group and (ranges is None or held + size > JOINED_BYTES):
-                yield from self._read_group(group, held)
-                group, held = [], 0
-            if ranges is not None and self._take_ranges(chunk, ranges, held, size):
+            is_small = chunk.channels is not None and not chunk.channels <= wanted
+            if added := self._join_wanted(chunk, flags, held) if is_small else 0:
                 group.append(chunk)
-                held += size
-            else:
+                held += added
+            if not added or held > JOINED_BYTES:
                 yield from self._read_group(group, held)
                 group, held = [], 0
+            if not added:
                 yield from self._read_chunk(chunk)
         yield from self._read_group(group, held)
 
-    def _wanted_ranges(self, chunk: _Chunk, wanted: frozenset[int], flags: Bools) -> tuple[Ints | None, int]:
-        """Return the ranges (2, n) of a chunk's records that hold wanted messages, and their size, by its index.
+    def _join_wanted(self, chunk: _Chunk, flags: Bools, held: int) -> int:
+        """Add a chunk's wanted records, by its index, to the joined ones; return how many bytes they have.
 
-        No ranges where most of it is wanted, or the index cannot be right.
+        They are not added where most of the chunk is wanted, or the index cannot be right. What is compressed is read
+        up to the last of them, of other chunks nothing else is read.
+
+        Parameters
+        ----------
+        flags : (65536,) whether a channel is wanted
+        held : bytes of the joined records
         """
-        from icrtool.logs.containers.record_table import read_message_index, wanted_ranges
+        from icrtool.logs.containers.record_table import copy_ranges, read_message_index, wanted_ranges
 
-        if (
-            chunk.channels is None
-            or chunk.channels <= wanted
-            or max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES
-        ):
-            return None, 0
+        if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
+            return 0
         index = np.frombuffer(os.pread(self._stream.fileno(), chunk.index_length, chunk.at + chunk.length), np.uint8)
         places = np.empty(len(index) // 16, np.int64)
         count, wanted_count = read_message_index(index, flags, places)
-        places = places[:count]
-        places.sort()
+        places[:count].sort()
         ranges = np.empty((2, wanted_count), np.int64)
-        count, size = wanted_ranges(places, chunk.size, ranges)
-        return (ranges[:, :count].copy(), size) if 0 < size < SMALL_PART * chunk.size else (None, 0)
-
-    def _take_ranges(self, chunk: _Chunk, ranges: Ints, at: int, size: int) -> bool:
-        """Copy ranges of a chunk's records to byte `at` of the joined ones; return whether they could be read.
-
-        What is compressed is read up to the last of them, of other chunks nothing else is read.
-        """
-        from icrtool.logs.containers.record_table import copy_ranges
-
-        first, needed = (0, int(ranges[1, -1])) if not chunk.stored else (int(ranges[0, 0]), int(ranges[1, -1]))
+        count, size = wanted_ranges(places[:count], chunk.size, ranges)
+        if not 0 < size < SMALL_PART * chunk.size:
+            return 0
+        first, needed = int(ranges[0, 0]) if chunk.stored else 0, int(ranges[1, count - 1])
         try:
             if chunk.stored:
                 records = self._read(chunk.at + chunk.length - chunk.size + first, needed - first)
@@ -164,20 +154,18 @@ class McapFile(ChunkedFile):
                 content = self._read(chunk.at, min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
                 records = self._chunk_records(content, cut=True, needed=needed)
         except DecompressionError:
-            return False
+            return 0
         if len(records) < needed - first:
-            return False
-        copy_ranges(records, ranges - first, self._spaces.joined.of(max(size, JOINED_BYTES)), at)
-        return True
+            return 0
+        copy_ranges(records, first, ranges, count, self._spaces.joined.of(held + size, held), held)
+        return size
 
     def _read_group(self, chunks: list[_Chunk], size: int) -> Iterator[Block]:
         """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
-        if not chunks:
-            return
         records = self._spaces.joined.of(size)
         records.flags.writeable = False
         block, stop = self._scanned(records)
-        if stop == size:
+        if chunks and stop == size:
             yield block
             self._spaces, self._other_spaces = self._other_spaces, self._spaces
         else:

@@ -173,9 +173,9 @@ def wanted_ranges(places: Ints, size: int, ranges: Ints) -> tuple[int, int]:
 
 
 @njit
-def copy_ranges(source: Bytes, ranges: Ints, target: Bytes, at: int) -> None:
-    """Copy ranges (2, n) of the source to the target, one behind the other from `at` on."""
-    for k in range(ranges.shape[1]):
-        begin, end = ranges[0, k], ranges[1, k]
+def copy_ranges(source: Bytes, first: int, ranges: Ints, count: int, target: Bytes, at: int) -> None:
+    """Copy some ranges to the target, one behind the other from `at` on; `first` is the place of the source's begin."""
+    for k in range(count):
+        begin, end = ranges[0, k] - first, ranges[1, k] - first
         target[at : at + end - begin] = source[begin:end]
         at += end - begin

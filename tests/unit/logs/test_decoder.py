@@ -165,7 +165,7 @@ def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
         found, readable = decode_messages(layout, data, start, end)
         # Only the message is there: a read before or behind it is a read outside.
         plain, only = Decoded(layout, 1), data[start[0] : end[0]]
-        block = [Guarded(only), *map(Guarded, (np.zeros(1, np.int64), np.zeros(1, np.int64), start - start, end - start))]
+        block = map(Guarded, (only, np.zeros(1, np.int64), np.zeros(1, np.int64), start - start, end - start))
         kept = [plain.table, plain.times_ns, plain.shape_of, plain.shapes, plain.state, plain.same, plain.taken]
         with np.errstate(over="ignore"):
             python(*block, 0, 0, layout.program, cdr, 1 << 62, *map(Guarded, kept), plain.loops)

@@ -18,7 +18,13 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
 from icrtool.estimation.fit import fit
 from icrtool.logs.containers.channel import Block, Channel, Cut
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space, unpack_messages
+from icrtool.logs.containers.decompress import (
+    LARGEST_CHUNK_BYTES,
+    DecompressionError,
+    Inflation,
+    Space,
+    unpack_messages,
+)
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.cut import moment
 from icrtool.logs.messages.decoder import decode_messages
