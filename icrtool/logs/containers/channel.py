@@ -153,7 +153,8 @@ class Problems(list[str]):
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
     """Return a block without the messages whose log time is negative or beyond `LAST_TIME_NS`."""
-    possible = (block.log_time_ns >= 0) & (block.log_time_ns < LATEST_NS)
+    # Negative ones are above all others as unsigned numbers.
+    possible = block.log_time_ns.view(np.uint64) < LATEST_NS
     if possible.all():
         return block
     problems.add("messages with an impossible log time left out")

@@ -162,10 +162,12 @@ class McapFile(ChunkedFile):
 
     def _read_group(self, chunks: list[_Chunk], size: int) -> Iterator[Block]:
         """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
+        if not chunks:
+            return
         records = self._spaces.joined.of(size)
         records.flags.writeable = False
         block, stop = self._scanned(records)
-        if chunks and stop == size:
+        if stop == size:
             yield block
             self._spaces, self._other_spaces = self._other_spaces, self._spaces
         else:

@@ -290,9 +290,9 @@ class Decoded:
     loops: Ints = field(init=False)
 
     def __post_init__(self) -> None:
-        # Memory of columns that are not used is not touched: numpy asks the system for pages of zeros.
-        self.table = np.zeros((self.layout.columns, self.rows), np.uint64)
-        self.shapes = np.zeros((self.layout.columns, self.rows + 1), np.uint64)
+        # Memory of columns that are not used is not touched.
+        self.table = np.empty((self.layout.columns, self.rows), np.uint64)
+        self.shapes = np.empty((self.layout.columns, self.rows + 1), np.uint64)
         self.times_ns, self.shape_of = np.empty((2, self.rows), np.int64)
         self.state = np.array([0, 0, 0, 0, 0, -1, 0, 0])
         self.same, self.taken = np.empty((2, min(_MOST_REMEMBERED, 32 * self.rows), 3), np.int64)

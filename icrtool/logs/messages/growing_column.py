@@ -56,6 +56,6 @@ class GrowingColumn:
 def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
     """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
     bits = rows.view(np.int64)
-    if len(rows) == 0 or (rows.strides[0] and (np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]))):
+    if len(rows) == 0 or (rows.strides[0] and ((bits[-1] != bits[0]).any() or (bits != bits[0]).any())):
         return None
     return rows[:1].copy()

@@ -24,7 +24,7 @@ _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
 _FIRST_ROWS, _FIRST_NUMBERS = 32, 2048
-"""Of a topic's first table, at most; the next ones have twice as many rows: a log may hold thousands of topics."""
+"""Of a topic's first table, at most; the next ones have eight times as many rows: a log may hold thousands of topics."""
 
 MOST_TEXTS = 1 << 16
 """Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
@@ -189,7 +189,7 @@ class TopicCollector:
             if self._rows.filled == self._rows.rows:
                 self._settle()
                 if self._rows.rows < _ROWS_AT_ONCE:
-                    self._new_rows(self.layout, 2 * self._rows.rows)
+                    self._new_rows(self.layout, 8 * self._rows.rows)
             more = self._capacity < self.largest_capacity
             first = self._rows.decode(block, number, first, self._capacity if more else ANY_LENGTH)
             if self._rows.known_shapes > self._learned:

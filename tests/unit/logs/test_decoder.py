@@ -172,10 +172,10 @@ def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
         assert plain.filled == readable.sum()
         assert found.filled == readable.sum()
         if readable[0]:
-            np.testing.assert_array_equal(plain.table, found.table)
-            for path in layout.slots:
-                counts = (layout.counts(one.used_shapes()[0], path) for one in (plain, found))
-                np.testing.assert_array_equal(*counts)
+            for path, slot in layout.slots.items():
+                np.testing.assert_array_equal(*(layout.counts(one.used_shapes()[0], path) for one in (plain, found)))
+                if slot.kind != "string":
+                    np.testing.assert_array_equal(plain.numbers(path), found.numbers(path))
 
 
 def test_decoding_of_an_array_longer_than_all_messages_reads_nothing():
