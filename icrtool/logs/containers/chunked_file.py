@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,18 +22,27 @@ MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
 """Messages that a scan finds at a time; a record has more bytes than this."""
 
 
-class IndexedChunk(Protocol):
-    """First and last log time of a chunk [ns], 0 where they are not known."""
+class Chunk(NamedTuple):
+    """A chunk in a file, and its entry in the index.
 
-    @property
-    def begin_ns(self) -> int:
-        """First log time."""
-        ...
+    Attributes
+    ----------
+    at, length : where its content is in the file; of a bag only where its record begins
+    channels : those it holds, None without an entry
+    begin_ns, end_ns : first and last log time in it, 0 where they are not known
+    index_length : of the message index records that follow it
+    size : of its records, decompressed
+    stored : they are not compressed
+    """
 
-    @property
-    def end_ns(self) -> int:
-        """Last log time."""
-        ...
+    at: int
+    length: int = 0
+    channels: frozenset[int] | None = None
+    begin_ns: int = 0
+    end_ns: int = 0
+    index_length: int = 0
+    size: int = 0
+    stored: bool = False
 
 
 class Spaces(NamedTuple):
@@ -48,7 +56,7 @@ class Spaces(NamedTuple):
 class ChunkedFile(ABC):
     """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
 
-    _chunks: Sequence[IndexedChunk] | None = None
+    _chunks: Sequence[Chunk] | None = None
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -62,8 +70,8 @@ class ChunkedFile(ABC):
         self._size = path.stat().st_size
 
     @abstractmethod
-    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        """Yield the messages of the wanted channels by the index."""
+    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted channels in some chunks."""
 
     @abstractmethod
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -86,7 +94,11 @@ class ChunkedFile(ABC):
         """Yield the messages of the wanted channels, chunk by chunk; the next is made while one is used."""
         if not wanted:
             return
-        blocks = self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
+        if self._chunks is None:
+            blocks = self._read_in_order()
+        else:
+            needed = [one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted)]
+            blocks = self._indexed(needed, wanted)
         with ThreadPoolExecutor(1) as pool:
             pending = pool.submit(next, blocks, None)
             while (block := pending.result()) is not None:
@@ -118,11 +130,17 @@ class ChunkedFile(ABC):
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
+    def _bytes(self, at: int, count: int) -> bytes:
+        """Return bytes of the file, as many as there are."""
+        self._stream.seek(at)
+        return self._stream.read(count)
+
     def _read(self, at: int, length: int) -> Bytes:
         """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
         space = self._spaces.packed.of(max(min(length, self._size - at), 0))
-        self._at = at
-        found = space[: os.preadv(self._stream.fileno(), [space.data], at) if len(space) else 0]
+        self._at = min(at, self._size)
+        self._stream.seek(self._at)
+        found = space[: self._stream.readinto(space.data)]
         found.flags.writeable = False  # as what is decompressed: the kernels are compiled once
         return found
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, ChunkedFile
+from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, unpack_messages
 from icrtool.records.text import LogText
 
@@ -44,28 +43,6 @@ JOINED_BYTES = 1 << 20
 """Such parts are handed on together once they have so many bytes: each block has a cost of its own."""
 
 
-class _Chunk(NamedTuple):
-    """Where a chunk record's content is in the file: offset and length; and its entry in the index.
-
-    Attributes
-    ----------
-    channels : those it holds, None without an entry
-    index_length : length of the message index records that follow it
-    begin_ns, end_ns : first and last log time in it, 0 without an entry
-    size : of its records, decompressed
-    stored : they are not compressed
-    """
-
-    at: int
-    length: int
-    channels: frozenset[int] | None = None
-    index_length: int = 0
-    begin_ns: int = 0
-    end_ns: int = 0
-    size: int = 0
-    stored: bool = False
-
-
 class McapFile(ChunkedFile):
     """One MCAP file.
 
@@ -88,7 +65,7 @@ class McapFile(ChunkedFile):
         try:
             if self._stream.read(len(MAGIC)) != MAGIC:
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
-            self._chunks: list[_Chunk] | None = self._read_index()
+            self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
                 self._learn_all()
         except BaseException:
@@ -103,13 +80,11 @@ class McapFile(ChunkedFile):
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
-    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
         flags = np.isin(np.arange(1 << 16), list(wanted))
-        group: list[_Chunk] = []
+        group: list[Chunk] = []
         held = 0
-        for chunk in self._chunks or ():
-            if not cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted):
-                continue
+        for chunk in chunks:
             is_small = chunk.channels is not None and not chunk.channels <= wanted
             if added := self._join_wanted(chunk, flags, held) if is_small else 0:
                 group.append(chunk)
@@ -121,7 +96,7 @@ class McapFile(ChunkedFile):
                 yield from self._read_chunk(chunk)
         yield from self._read_group(group, held)
 
-    def _join_wanted(self, chunk: _Chunk, flags: Bools, held: int) -> int:
+    def _join_wanted(self, chunk: Chunk, flags: Bools, held: int) -> int:
         """Add a chunk's wanted records, by its index, to the joined ones; return how many bytes they have.
 
         They are not added where most of the chunk is wanted, or the index cannot be right. What is compressed is read
@@ -136,7 +111,7 @@ class McapFile(ChunkedFile):
 
         if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
             return 0
-        index = np.frombuffer(os.pread(self._stream.fileno(), chunk.index_length, chunk.at + chunk.length), np.uint8)
+        index = np.frombuffer(self._bytes(chunk.at + chunk.length, chunk.index_length), np.uint8)
         places = np.empty(len(index) // 16, np.int64)
         count, wanted_count = read_message_index(index, flags, places)
         places[:count].sort()
@@ -160,7 +135,7 @@ class McapFile(ChunkedFile):
         copy_ranges(records, first, ranges, count, self._spaces.joined.of(held + size, held), held)
         return size
 
-    def _read_group(self, chunks: list[_Chunk], size: int) -> Iterator[Block]:
+    def _read_group(self, chunks: list[Chunk], size: int) -> Iterator[Block]:
         """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
         if not chunks:
             return
@@ -188,12 +163,12 @@ class McapFile(ChunkedFile):
             count=self._counts.get(number) if self._chunks is not None else None,
         )
 
-    def _read_index(self) -> list[_Chunk] | None:
+    def _read_index(self) -> list[Chunk] | None:
         """Return the chunks listed in the file's index; None without an index, or where it does not fit the file."""
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema, Statistics
 
-        chunks: list[_Chunk] = []
+        chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
         statistics: Statistics | None = None
@@ -205,7 +180,7 @@ class McapFile(ChunkedFile):
                     channels[channel.id] = channel
                 case Statistics() as found:
                     statistics = found
-                case _Chunk() as chunk:
+                case Chunk() as chunk:
                     chunks.append(chunk)
                 case None:
                     return None
@@ -223,15 +198,13 @@ class McapFile(ChunkedFile):
     def _summary_records(self) -> Iterator[tuple[int, bytes]]:
         """Yield opcode and content of the records of the summary that reading needs; none where it is damaged."""
         end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
-        self._stream.seek(max(end, 0))
-        footer = self._stream.read(_HEAD_BYTES + _FOOTER_BYTES)
+        footer = self._bytes(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
         if footer[:1] != bytes([_FOOTER]) or self._stream.read() != MAGIC or not 0 < start <= end:
             return
         if end - start > LARGEST_CHUNK_BYTES:
             return
-        self._stream.seek(start)
-        summary = self._stream.read(end - start)
+        summary = self._bytes(start, end - start)
         checksum = int.from_bytes(footer[-_CHECKSUM_BYTES:], "little")
         if checksum and zlib.crc32(footer[:-_CHECKSUM_BYTES], zlib.crc32(summary)) != checksum:
             return
@@ -243,7 +216,7 @@ class McapFile(ChunkedFile):
                 yield opcode, summary[at : at + length]
             at += length
 
-    def _found_in_file(self, chunks: list[_Chunk]) -> list[_Chunk] | None:
+    def _found_in_file(self, chunks: list[Chunk]) -> list[Chunk] | None:
         """Return the chunks of the index that are at their stated offsets; None where the index must not be used.
 
         It must not be used where messages are outside chunks, or where it does not fit a complete file: reading the
@@ -262,7 +235,7 @@ class McapFile(ChunkedFile):
                 self.problems.add(f"no chunk at byte {at}, where the index lists one")
         return standing or None
 
-    def _reaches_end(self, chunks: dict[int, _Chunk] | None) -> bool:
+    def _reaches_end(self, chunks: dict[int, Chunk] | None) -> bool:
         """Return whether the records follow one another to the end of the data.
 
         Parameters
@@ -288,7 +261,7 @@ class McapFile(ChunkedFile):
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
-        head = os.pread(self._stream.fileno(), _HEAD_BYTES, at) if 0 <= at < self._size else b""
+        head = self._bytes(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -299,7 +272,7 @@ class McapFile(ChunkedFile):
             if opcode in (_FOOTER, _DATA_END):
                 return
             if opcode == _CHUNK:
-                chunk = _Chunk(at + _HEAD_BYTES, min(length, left))
+                chunk = Chunk(at + _HEAD_BYTES, min(length, left))
                 yield from self._read_chunk(chunk, learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
@@ -314,15 +287,15 @@ class McapFile(ChunkedFile):
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
-            self._at, count = at, max(PIECE_BYTES, _HEAD_BYTES + length)
-            piece = np.frombuffer(os.pread(self._stream.fileno(), count, at), np.uint8)
+            self._at = at
+            piece = np.frombuffer(self._bytes(at, max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
             block, stop = self._scanned(piece, learn=learn)
             if stop:
                 return block, stop - _HEAD_BYTES
         self.problems.add(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _read_chunk(self, chunk: _Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+    def _read_chunk(self, chunk: Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         def unpack(content: Bytes) -> Bytes:
             return self._chunk_records(content, cut=cut)
 
@@ -376,7 +349,7 @@ class McapFile(ChunkedFile):
             self.problems.add(f"{what} is described twice, differently; the first description was used")
 
 
-def _chunk_of_index(content: bytes) -> _Chunk | None:
+def _chunk_of_index(content: bytes) -> Chunk | None:
     """Return the chunk that a chunk index record describes, None where the record is damaged."""
     try:
         begin_ns, end_ns, start, length, map_bytes = struct.unpack_from("<QQQQI", content)
@@ -388,7 +361,7 @@ def _chunk_of_index(content: bytes) -> _Chunk | None:
         return None
     at, length = start + _HEAD_BYTES, length - _HEAD_BYTES
     is_stored = content[48 + map_bytes : name_end] in (b"", b"none") and size <= length
-    return _Chunk(at, length, channels or None, index_length, begin_ns, end_ns, size, is_stored)
+    return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, is_stored)
 
 
 def _parse(opcode: int, content: bytes) -> _Parsed | None:

@@ -24,7 +24,7 @@ _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
 _FIRST_ROWS, _FIRST_NUMBERS = 32, 2048
-"""Of a topic's first table, at most; the next ones have eight times as many rows: a log may hold thousands of topics."""
+"""Of a topic's first table, at most; the next ones have eight times as many: a log may hold thousands of topics."""
 
 MOST_TEXTS = 1 << 16
 """Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
