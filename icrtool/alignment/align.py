@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.corrections import AlignedStreams, align_streams
-from icrtool.alignment.findings import alignment_findings, start_icrs, window_summary
-from icrtool.alignment.position.gnss_quality import GnssQuality, grade_fixes
+from icrtool.alignment.corrections import align_streams
+from icrtool.alignment.findings import alignment_findings, run_sections, start_icrs
+from icrtool.alignment.position.gnss_quality import grade_fixes
 from icrtool.alignment.position.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
@@ -43,53 +42,24 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
-    aligned = _align_once(log, config)
-    notes: tuple[str, ...] = ()
-    # preset paper takes its wheels as they are
-    if config.filter.preset == "field":
-        aligned = _with_events(log, config, aligned)
-        filled, note = bridged(aligned.sensors.wheels, config.filter.wheel_gap_s)
-        aligned = aligned._replace(sensors=replace(aligned.sensors, wheels=filled))
-        notes = (f"{log.name}: {note}",) if note else ()
-    found, quality, sensors = aligned
-    wheels, heading, delays = found.wheels, found.heading, found.delays
-    return Measurements(
-        sensors=sensors,
-        findings=alignment_findings(found, sensors.antenna_m),
-        sections={
-            "wheels": wheels.summary() | window_summary(found.fit),
-            "heading": heading.summary() | delays.heading_summary(),
-            "gnss": delays.gnss.summary(),
-        },
-        streams=found.log.streams,
-        fix_statistics=quality.statistics,
-        position_delay_s=delays.applied_gnss_s,
-        clock_std_s=delays.clock_std_s,
-        antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-        warnings=(
-            *(warning for part in (quality.log, found, quality) for warning in part.warnings),
-            *notes,
-        ),
-    )
+    found = _align_once(log, config)
+    if config.filter.preset == "paper":
+        # it takes its wheels as they are
+        return found
+    found = _with_events(log, config, found)
+    filled, note = bridged(found.sensors.wheels, config.filter.wheel_gap_s)
+    notes = (f"{log.name}: {note}",) if note else ()
+    return replace(found, sensors=replace(found.sensors, wheels=filled), warnings=(*found.warnings, *notes))
 
 
-class _Aligned(NamedTuple):
-    """Streams that fit together, their fixes graded, and both as the filter takes them."""
-
-    found: AlignedStreams
-    quality: GnssQuality
-    sensors: SensorData
-
-
-def _align_once(log: RobotLog, config: Config) -> _Aligned:
+def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
     heading = found.heading
     quality = grade_fixes(found.log, config, found.fix_steps)
     sensors = sensors_as_sent(quality.log, config)
-    return _Aligned(
-        found,
-        quality,
-        replace(
+    findings = alignment_findings(found, sensors.antenna_m)
+    return Measurements(
+        sensors=replace(
             sensors,
             fixes=replace(
                 sensors.fixes,
@@ -110,22 +80,29 @@ def _align_once(log: RobotLog, config: Config) -> _Aligned:
             losses_ns=quality.losses_ns,
             icr_start=start_icrs(found.geometry, sensors.antenna_m, config),
         ),
+        findings=findings,
+        sections=run_sections(found, findings),
+        streams=found.log.streams,
+        fix_statistics=quality.statistics,
+        clock_std_s=found.delays.clock_std_s,
+        antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
+        warnings=(*quality.log.warnings, *found.warnings, *quality.warnings),
     )
 
 
-def _with_events(log: RobotLog, config: Config, aligned: _Aligned) -> _Aligned:
+def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurements:
     """Return the streams with the slip events found in them, aligned a second time without those, where there are any.
 
     A log with too little besides them keeps its first alignment.
     """
     width = 2 * half_width_m(config.robot.track_width_m)
-    events = find_slip_events(aligned.sensors, width)
+    events = find_slip_events(found.sensors, width)
     if events:
         spans = tuple((event.begin_ns, event.end_ns) for event in events)
         with suppress(DataError):
-            aligned = _align_once(replace(log, slipping_ns=spans), config)
-            events = find_slip_events(aligned.sensors, width)
-    return aligned._replace(sensors=replace(aligned.sensors, events=events))
+            found = _align_once(replace(log, slipping_ns=spans), config)
+            events = find_slip_events(found.sensors, width)
+    return replace(found, sensors=replace(found.sensors, events=events))
 
 
 def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:

@@ -26,7 +26,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveArrays, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.robust import LOSS_SIGMAS, RobustFit, mad_std, robust_least_squares
+from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, soft_l1_loss
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
@@ -198,11 +198,7 @@ def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
 def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
     """Return twice the negative log-likelihood of either handedness, both in the noise of the better one."""
     scale = max(min(mad_std(one.residuals, 0.0) for one in shown.values()), least)
-    return {
-        hand: float((2.0 * LOSS_SIGMAS**2 * (np.sqrt(1.0 + (one.residuals / scale / LOSS_SIGMAS) ** 2) - 1.0)).sum())
-        / OVERLAP
-        for hand, one in shown.items()
-    }
+    return {hand: soft_l1_loss(one.residuals / scale) / OVERLAP for hand, one in shown.items()}
 
 
 def _linear(design: Floats, target: Floats, group: Ints, prior_std: float) -> RobustFit:

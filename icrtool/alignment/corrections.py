@@ -93,25 +93,6 @@ class AlignedStreams(NamedTuple):
         return measure_steps(self.drive.fix_t, self.drive.fix, expected)
 
 
-class _NamedStreams(NamedTuple):
-    """A log whose sides and senses are named.
-
-    Attributes
-    ----------
-    log : with the chosen convention; as sent in preset ``paper``
-    drive : with the chosen convention in any preset; windows : of it
-    notes : what to report; sound : no side is dead or a copy of the other
-    """
-
-    log: RobotLog
-    derived: DerivedHeading | None
-    decision: Decision
-    drive: DriveArrays
-    windows: DriveWindows
-    notes: list[str]
-    sound: bool
-
-
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     """Estimate what relates wheels, heading and positions, and correct what is significant.
 
@@ -152,8 +133,16 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     return AlignedStreams(delays.apply(scaled(log, *wheels.applied)), wheels, heading, delays, drive, fit, derived)
 
 
-def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStreams:
-    """Find the heading of a log without one, then which side is which, and in which sense streams turn."""
+def _name_streams(
+    log: RobotLog, config: Config, width_m: float
+) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveArrays, DriveWindows, list[str], bool]:
+    """Find the heading of a log without one, then which side is which, and in which sense streams turn.
+
+    Returns
+    -------
+    log with the chosen convention, as sent in preset ``paper``; its heading where it was estimated; the convention;
+    the drive with it in any preset, and windows of that; what to report; whether no side is dead or a copy of the other
+    """
     corrects, derived, senses = config.filter.preset == "field", None, AS_NAMED
     log = scaled(log, *configured_scales(config))
     if not len(log.heading.stamp_ns) and corrects:
@@ -186,7 +175,7 @@ def _name_streams(log: RobotLog, config: Config, width_m: float) -> _NamedStream
         free_hand = decide_conventions(drive, windows, metric=False)
         if free_hand.convention.heading < 0:
             notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
-    return _NamedStreams(named if corrects else log, derived, decision, drive, windows, notes, not faults)
+    return named if corrects else log, derived, decision, drive, windows, notes, not faults
 
 
 def _senses_without_heading(log: RobotLog) -> Convention:

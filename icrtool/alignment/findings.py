@@ -9,7 +9,7 @@ import numpy as np
 from icrtool.alignment.corrections import AlignedStreams
 from icrtool.alignment.estimator import AlignmentFit, Geometry
 from icrtool.config import Config
-from icrtool.records.measurements import Finding, IcrStart
+from icrtool.records.measurements import Finding, IcrStart, Scalar
 from icrtool.records.run import half_width_m
 
 LEAST_START_STD, INFLATION = 0.15, 3.0
@@ -70,7 +70,18 @@ def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> di
     }
 
 
-def window_summary(fit: AlignmentFit | None) -> dict[str, float | int | None]:
+def run_sections(found: AlignedStreams, findings: dict[str, Finding]) -> dict[str, dict[str, Scalar]]:
+    """Return further numbers for run.json, by section."""
+    lag, of_position = findings["heading_delay_s"], findings["position_delay_s"]
+    return {
+        "wheels": found.wheels.summary() | _window_summary(found.fit),
+        "heading": found.heading.summary()
+        | {"delay_s": lag.value, "delay_std_s": lag.std, "applied_delay_s": lag.applied},
+        "gnss": {"delay_s": of_position.value, "delay_std_s": of_position.std},
+    }
+
+
+def _window_summary(fit: AlignmentFit | None) -> dict[str, float | int | None]:
     """Return how many windows wheels and positions were compared in, of how many stretches, and their scatter [m]."""
     if fit is None:
         return {"windows": 0, "stretches": 0, "residual_m": None}

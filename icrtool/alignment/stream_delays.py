@@ -23,11 +23,6 @@ class Delay(NamedTuple):
     value_s: float
     std_s: float
 
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json."""
-        known = math.isfinite(self.value_s)
-        return {"delay_s": self.value_s if known else None, "delay_std_s": self.std_s if known else None}
-
     @property
     def is_significant(self) -> bool:
         """Whether it is known well, and is not zero."""
@@ -85,10 +80,6 @@ class StreamDelays:
             if delay_s != 0.0
         }
         return replace(log, **moved) if moved else log
-
-    def heading_summary(self) -> dict[str, Any]:
-        """Return the heading's numbers for run.json."""
-        return self.heading.summary() | {"applied_delay_s": self.applied_heading_s}
 
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from icrtool.calibration.error_growth import TWIST_OVER_M, nonnegative
 from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import Calibration, ControllerErrors
-from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import CONTROLLER, TERMS, FittedModel
-from icrtool.motion.recording import LogConstants, Recording, Windows, cut_windows
+from icrtool.motion.recording import LogConstants, Recording, Windows
 from icrtool.motion.trials import predicted_path
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 POSE_AFTER_M = CHOICE_HORIZON_M
-TWIST_OVER_M = 1.0
 SMALLEST_VARIANCE = 1e-6
 FEWEST_WINDOWS = 10
 
@@ -59,14 +58,18 @@ def factor_to_old(calibration: Calibration) -> float | None:
     return calibration.controller_numbers().multiplier * calibration.width_m / float(old_width_m)
 
 
-def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> ControllerErrors | None:
+def controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ControllerErrors | None:
     """Return the errors of what a controller can express, fitted without each fold, in that fold.
+
+    Parameters
+    ----------
+    cut : of `icrtool.calibration.error_growth.cut_error_windows`
 
     Returns
     -------
     None where too few windows were left out.
     """
-    far, near = (_window_errors(recordings, length, table) for length in (POSE_AFTER_M, TWIST_OVER_M))
+    far, near = (_window_errors(cut, length, table) for length in (POSE_AFTER_M, TWIST_OVER_M))
     if min(len(far), len(near)) < FEWEST_WINDOWS or POSE_AFTER_M not in table.horizons_m:
         return None
     h = table.horizons_m.index(POSE_AFTER_M)
@@ -80,17 +83,14 @@ def controller_errors(recordings: Sequence[Recording], table: HeldOut) -> Contro
     )
 
 
-def _window_errors(recordings: Sequence[Recording], length_m: float, table: HeldOut) -> Floats:
+def _window_errors(cut: Sequence[tuple[int, Recording, Windows]], length_m: float, table: HeldOut) -> Floats:
     """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
     rows = [np.empty((0, 6))]
-    for i, recording in enumerate(recordings):
-        try:
-            windows = cut_windows(recording, (length_m,))
-        except DataError:
-            continue
-        for fold, some in left_out(table.folds, i, windows.start_m, windows.end_m):
+    for i, recording, windows in cut:
+        these = np.flatnonzero(windows.length_m == length_m)
+        for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
             if (found := table.expressed(fold)) is not None:
-                rows.append(_fold_errors(recording, windows, some, *found))
+                rows.append(_fold_errors(recording, windows, these[some], *found))
     return np.concatenate(rows)
 
 
@@ -100,7 +100,7 @@ def _fold_errors(
     """Return the errors of some windows (m,) by a model that was not fitted to them."""
     s, e = windows.start[some], windows.end[some]
     begin, finish = windows.knot_t[s], windows.knot_t[e]
-    path = predicted_path(recording, fitted, own, windows.steps.around(begin, finish))
+    path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
     (theta, place), (turned, moved) = path(begin), path(finish)
     error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
     turn = windows.turned[some]
@@ -117,11 +117,5 @@ def _variances(errors: Floats) -> tuple[float, float, float]:
 def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     """Return a, b >= 0 with miss^2 about a first^2 + b second^2, by least squares."""
     columns = np.column_stack([first**2, second**2])
-    square, product = columns.T @ columns, columns.T @ miss**2
-    both = np.linalg.lstsq(square, product, rcond=None)[0]
-    if both.min() < 0.0:
-        # at the bound one of them is zero: the one that leaves less
-        alone = np.divide(product, np.diag(square), out=np.zeros(2), where=np.diag(square) > 0.0)
-        better = int(np.argmax(alone * product))
-        both = np.where(np.arange(2) == better, np.maximum(alone, 0.0), 0.0)
-    return max(float(both[0]), SMALLEST_VARIANCE), max(float(both[1]), SMALLEST_VARIANCE)
+    both = np.maximum(nonnegative(columns.T @ columns, columns.T @ miss**2), SMALLEST_VARIANCE)
+    return float(both[0]), float(both[1])

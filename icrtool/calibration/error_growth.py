@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -21,8 +22,11 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, cut_windows, totals_of
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, Windows, cut_windows, totals_of
 from icrtool.records.dropout import CHOICE_HORIZON_M
+
+TWIST_OVER_M = 1.0
+"""Errors of velocities are those of their means over windows of this length."""
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
@@ -33,7 +37,7 @@ SCALED_FROM_M = 5.0
 
 FEWEST_WINDOWS = 20
 
-ANGLES = 48
+ANGLES, BISECTIONS = 24, 26
 DESCENTS = 400
 
 NORMAL_STRETCHES = 10
@@ -160,7 +164,7 @@ def radius(spread: Spread, share: float) -> Floats:
     """Return the radius (w,) [m] that holds a share of the errors, normal with the moments (w, 1); bisection."""
     across = _directions(spread)
     low, high = np.zeros(len(across)), 6.0 * np.sqrt(across.max(axis=1))
-    for _ in range(40):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         with np.errstate(divide="ignore", invalid="ignore"):
             inside = 1.0 - np.nan_to_num(np.exp(-(middle[:, None] ** 2) / (2.0 * across))).mean(axis=1)
@@ -174,16 +178,29 @@ def mean_error(spread: Spread) -> Floats:
 
 
 def _directions(spread: Spread) -> Floats:
-    """Return the squared length (w, `ANGLES`) of the unit circle's image by the square root of a covariance."""
+    """Return the squared length (w, `ANGLES`) of a quarter of the unit circle by the square root of a covariance."""
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     large, small = middle + apart, np.maximum(middle - apart, 0.0)
-    angle = np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
+    angle = np.pi / 2 * (np.arange(ANGLES) + 0.5) / ANGLES
     return np.asarray(large[:, None] * np.cos(angle) ** 2 + small[:, None] * np.sin(angle) ** 2)
 
 
-def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> ErrorSources | None:
+def cut_error_windows(recordings: Sequence[Recording]) -> list[tuple[int, Recording, Windows]]:
+    """Return windows of `LENGTHS_M` and `TWIST_OVER_M`, with number and recording; short recordings have none."""
+    pooled, found = totals_of(*recordings), []
+    for i, recording in enumerate(recordings):
+        with suppress(DataError):
+            found.append((i, recording, cut_windows(recording, (TWIST_OVER_M, *LENGTHS_M), pooled)))
+    return found
+
+
+def measure_error_sources(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ErrorSources | None:
     """Return the sources of error of a held-out table's recommended model, from windows of what it was not fitted to.
+
+    Parameters
+    ----------
+    cut : of `cut_error_windows`
 
     Returns
     -------
@@ -197,19 +214,15 @@ def measure_error_sources(recordings: Sequence[Recording], table: HeldOut) -> Er
     """
     stretches: Counter[float] = Counter()
     found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    pooled = totals_of(*recordings)
-    for i, recording in enumerate(recordings):
-        try:
-            windows = cut_windows(recording, LENGTHS_M, pooled)
-        except DataError:
-            continue
+    for i, recording, windows in cut:
         begin, end = windows.knot_t[windows.start], windows.knot_t[windows.end]
         tested = np.zeros(len(begin), np.bool_)
-        for fold, some in left_out(table.folds, i, windows.start_m, windows.end_m):
-            if (predicted := table.without(fold)) is None:
+        for fold, of_fold in left_out(table.folds, i, windows.start_m, windows.end_m):
+            some = of_fold[windows.length_m[of_fold] >= LENGTHS_M[0]]
+            if not len(some) or (predicted := table.without(fold)) is None:
                 continue
             fitted, own = predicted
-            steps = windows.steps.around(begin[some], end[some])
+            steps = windows.steps.around(begin[some].min(), end[some].max())
             errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
             reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
             turn = errors.turned - windows.turned[some]
@@ -257,10 +270,10 @@ def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Float
             scaled = weight * columns[rows]
             matrix += scaled.T @ scaled / np.count_nonzero(rows)
             y += scaled.T @ (weight * (squared[rows] - of_parameters[rows, 0])) / np.count_nonzero(rows)
-    return _nonnegative(matrix, y)
+    return nonnegative(matrix, y)
 
 
-def _nonnegative(matrix: Floats, y: Floats) -> Floats:
+def nonnegative(matrix: Floats, y: Floats) -> Floats:
     """Return x >= 0 that minimises x matrix x / 2 - y x, by coordinate descent; matrix is positive semidefinite."""
     x = np.zeros(len(y))
     for _ in range(DESCENTS):

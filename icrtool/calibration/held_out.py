@@ -170,14 +170,16 @@ def errors_without(
     steps : the wheel samples, joined or single
     """
     distance = recording.drive.distance
-    errors: Floats = np.full(trials.ends.shape, np.nan)
-    row, column = np.nonzero(trials.ends >= 0)
+    errors: Floats = np.full(trials.ends.T.shape, np.nan).T
+    # a horizon after the other, as the ends lie in memory
+    column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
     t = recording.t_s
     for fold, some in left_out(folds, i, distance[start], distance[end]):
         if (found := without(fold)) is not None:
-            path = predicted_path(recording, *found, steps.around(t[start[some]], t[end[some]]))
-            errors[row[some], column[some]] = trial_errors(recording, start[some], end[some], path)
+            s, e = start[some], end[some]
+            path = predicted_path(recording, *found, steps.around(t[s.min()], t[e.max()]))
+            errors[row[some], column[some]] = trial_errors(recording, s, e, path)
     return errors
 
 

@@ -16,9 +16,7 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records.measurements import RESPONSE_S
-from icrtool.records.run import Run
-
-CALIBRATION_SCHEMA = "icrtool/calibration/1"
+from icrtool.records.run import CALIBRATION_SCHEMA, Run
 
 Verdict = Literal["shown", "weak", "not shown", "not separable", "given"]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
-from icrtool.calibration.error_growth import measure_error_sources
+from icrtool.calibration.error_growth import cut_error_windows, measure_error_sources
 from icrtool.calibration.held_out import HeldOut, errors_without, hold_out
 from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
 from icrtool.errors import ConfigError
@@ -30,7 +30,7 @@ from icrtool.records.run import Run, drive_of
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
 
-GYRO_PRIOR_STD = np.array([10.0, 0.02, 0.2])
+GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
 """Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
 
 GYRO_SCALE_RANGE = 0.1
@@ -86,16 +86,16 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
     if not np.isfinite(heading.angle_rad).all():
         return plain
-    drive = plain.drive
-    step = np.append(np.diff(heading.angle_rad), 0.0)
-    rate = np.divide(step, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
-    slope, _, later_s = _gyro_line(plain, rate)
+    t, dt = plain.t_s, plain.drive.dt_s
+
+    def rate(later_s: float) -> Floats:
+        turned = np.diff(np.interp(np.append(t, t[-1] + dt[-1]) + later_s, t, heading.angle_rad))
+        return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
+
+    slope, _, later_s = _gyro_line(plain, rate(0.0))
     if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
         return plain
-    ends = np.append(plain.t_s, plain.t_s[-1] + drive.dt_s[-1]) + later_s
-    turned = np.diff(np.interp(ends, plain.t_s, heading.angle_rad))
-    rate = np.divide(turned, drive.dt_s, out=np.zeros(len(step)), where=drive.dt_s > 0.0)
-    return replace(plain, gyro_radps=np.sign(slope) * rate, gyro_reversed=slope < 0.0)
+    return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
 
 
 def gyro_recording_of(run: Run) -> Recording:
@@ -178,6 +178,7 @@ def calibration_from(
         )
         for i, one in enumerate(recordings)
     )
+    cut = cut_error_windows(recordings)
     scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
     return Calibration(
         robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
@@ -188,9 +189,9 @@ def calibration_from(
         why=wheels.why,
         logs=logs,
         held_out=tuple(scores),
-        controller=controller_errors(recordings, wheels),
-        sources=measure_error_sources(recordings, wheels),
-        gyro_sources=None if gyro is None else measure_error_sources(recordings, gyro),
+        controller=controller_errors(cut, wheels),
+        sources=measure_error_sources(cut, wheels),
+        gyro_sources=None if gyro is None else measure_error_sources(cut, gyro),
         warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,

@@ -17,11 +17,9 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import CONTROLLER, FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
-from icrtool.records.run import WarmStart
+from icrtool.records.run import CALIBRATION_SCHEMA, WarmStart
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
-
-CALIBRATION_SCHEMA = "icrtool/calibration/1"
 
 
 class HeldOutScore(NamedTuple):

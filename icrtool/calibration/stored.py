@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 
 from icrtool.calibration.record import (
-    CALIBRATION_SCHEMA,
     Calibration,
     CalibrationLog,
     ControllerErrors,
@@ -18,6 +17,7 @@ from icrtool.calibration.record import (
     HeldOutScore,
 )
 from icrtool.motion.models import FittedModel, TypicalDrive, find_model
+from icrtool.records.run import CALIBRATION_SCHEMA
 from icrtool.records.text import escaped
 
 WIDEST_M = 20.0

@@ -96,7 +96,7 @@ def run_all(
     rows: list[Row] = []
     with (
         executor_of(requests, jobs, scheduler) as executor,
-        view.live(),
+        closing(view),
         closing(run_batch(requests, executor, batch, view.stage)) as coming,
     ):
         for row in coming:
@@ -182,14 +182,6 @@ class View:
         self._counts: Counter[str] = Counter()
         self._stages: dict[str, str] = {}
 
-    @contextmanager
-    def live(self) -> Iterator[None]:
-        """Remove the line about what runs at the end."""
-        try:
-            yield
-        finally:
-            self._clear()
-
     def stage(self, log: str, stage: str) -> None:
         """Show the stage of a log."""
         self._stages[log] = stage
@@ -199,7 +191,7 @@ class View:
         """Show the result of a log."""
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
-        self._clear()
+        self.close()
         if row.status == "failed":
             if self._reports:
                 click.echo(f"{signal_word('Error:', 'red')} {escaped(row.log)}: {escaped(row.reason)}", err=True)
@@ -228,7 +220,8 @@ class View:
         width = shutil.get_terminal_size().columns - 1
         click.echo(f"\r\x1b[2K{'  '.join(parts)[:width]}", err=True, nl=False)
 
-    def _clear(self) -> None:
+    def close(self) -> None:
+        """Remove the line about what runs."""
         if self._live:
             click.echo("\r\x1b[2K", err=True, nl=False)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import run_of
+from icrtool.cli.fit import runs_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
 @click.option("--x-icr", metavar="METRES", type=float,
               help="Forward position of the ICRs, where known: it gives that of the antenna. One log.")  # fmt: skip
-@click.option("--plot", metavar="FILE", type=options.FILE,
+@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE,
               help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
 @json_option
 @options.configuration
@@ -44,21 +45,19 @@ def command(
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
       icrtool calibrate icrtool-runs/* -o calibration.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.errors import IcrToolError
     from icrtool.output.files.calibration_file import calibration_file, write_calibration
-    from icrtool.output.files.picture_file import check_picture
-    from icrtool.output.tables.calibration import format_calibration
-    from icrtool.output.tables.held_out import format_result
 
     config = options.load(config_file, robot, sets)
     if len(sources) > 1 and (plot is not None or x_icr is not None):
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
         calibration_file(output)
-    if plot is not None:
-        check_picture(plot)
     runs = _runs(sources, config, quiet=quiet)
+    from icrtool.calibration.from_runs import calibrate_runs
+    from icrtool.output.tables.calibration import format_calibration
+    from icrtool.output.tables.held_out import format_result
+
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
     try:
@@ -91,17 +90,24 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
     from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
-    if config.given_sections and all(is_run_directory(source) for source in sources):
+    finished = all(is_run_directory(source) for source in sources)
+    if config.given_sections and finished:
         section = min(config.given_sections)
         advice = "name the logs instead"
         raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
-    with options.progress_bar("reading", quiet=quiet) as progress:
-        found = []
-        for i, source in enumerate(sources):
-            found.append(run_of(source, config))
-            if progress is not None:
-                progress((i + 1) / len(sources))
-    return found
+    with ThreadPoolExecutor(1) as other:
+        if finished:
+            # takes as long as to read a run of an hour, most of which is done outside of the interpreter
+            other.submit(_load_models)
+        return runs_of(sources, config, quiet=quiet)
+
+
+def _load_models() -> None:
+    """Import what calibrates, and the compiler of its kernels."""
+    from icrtool.calibration.from_runs import calibrate_runs  # noqa: F401
+    from icrtool.kernels.compiled import load_compiler
+
+    load_compiler()
 
 
 def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> LogCalibration:

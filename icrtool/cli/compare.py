@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import run_of
+from icrtool.cli.fit import runs_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
@@ -19,17 +19,11 @@ if TYPE_CHECKING:
 
 @click.command("compare")
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
-@click.option(
-    "--csv",
-    "csv_file",
-    metavar="FILE",
-    type=options.FILE,
-    help="Write the transfer matrix: the errors of each calibration in each group.",
-)
-@click.option(
-    "-o", "--output", metavar="FILE", type=options.FILE, help="Write the comparison as JSON, for icrtool report."
-)
-@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw the comparison: png, svg, pdf.")
+@click.option("--csv", "csv_file", metavar="FILE", type=options.NEW_FILE,
+              help="Write the transfer matrix: the errors of each calibration in each group.")  # fmt: skip
+@click.option("-o", "--output", metavar="FILE", type=options.NEW_FILE,
+              help="Write the comparison as JSON, for icrtool report.")  # fmt: skip
+@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the comparison: png, svg, pdf.")
 @json_option
 @options.configuration
 @options.verbosity
@@ -48,27 +42,18 @@ def command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
-    from icrtool.output.files.atomic_file import check_place, write_file
+    from icrtool.output.files.atomic_file import write_file
     from icrtool.output.files.json_file import json_bytes
-    from icrtool.output.files.picture_file import check_picture, save_picture
+    from icrtool.output.files.picture_file import save_picture
     from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
     places = _groups(sources)
-    for file in (csv_file, output):
-        if file is not None:
-            check_place(file)
-    if plot is not None:
-        check_picture(plot)
     found = [(name, one) for name, paths in places.items() for path in paths for one in _expand(path)]
     groups: dict[str, list[Run]] = {}
-    with options.progress_bar("reading", quiet=quiet) as progress:
-        for number, (name, path) in enumerate(found, start=1):
-            if verbose:
-                click.echo(str(path), err=True)
-            groups.setdefault(name, []).append(run_of(path, config))
-            if progress is not None:
-                progress(number / len(found))
+    runs = runs_of([path for _, path in found], config, quiet=quiet, verbose=verbose)
+    for (name, _), run in zip(found, runs, strict=True):
+        groups.setdefault(name, []).append(run)
     transfer = compare_groups(groups)
     document = transfer_document(transfer)
     for file, content in ((csv_file, transfer_csv(transfer)), (output, json_bytes(document))):

@@ -11,7 +11,7 @@ from icrtool.cli import options
 
 @click.command("config")
 @options.configuration
-@click.option("-o", "--output", metavar="FILE", type=options.FILE, help="File to write; default: standard output.")
+@click.option("-o", "--output", metavar="FILE", type=options.NEW_FILE, help="File to write; default: standard output.")
 def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], output: Path | None) -> None:
     """Print all configuration keys as a TOML file: meaning, type and bounds, and value.
 
@@ -29,7 +29,6 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.files.atomic_file import check_place, write_file
+    from icrtool.output.files.atomic_file import write_file
 
-    check_place(output)
     write_file(output, text)

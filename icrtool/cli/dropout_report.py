@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
+from icrtool.cli.drive_options import numbers
 from icrtool.cli.fit import RUNS, fit_log, logs_of, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
@@ -39,7 +39,6 @@ class Request:
     config : that of the options; logs are fitted with it
     asked, baseline : of `icrtool.cli.options.report`
     further : further arguments of `icrtool.dropout_report`
-    horizons_m, outage_s : empty: those of the run's configuration
     prints : results on standard output
     """
 
@@ -47,8 +46,6 @@ class Request:
     asked: ReportOptions
     baseline: Baseline | None
     further: dict[str, Any]
-    horizons_m: tuple[float, ...]
-    outage_s: tuple[float, ...]
     trials: bool
     overwrite: bool
     quiet: bool
@@ -56,10 +53,19 @@ class Request:
     verbose: bool
 
 
+def distances(text: str) -> tuple[float, ...]:
+    """Read the distances [m] of ``--horizons``."""
+    found = numbers(text, "M,M,...")
+    if min(found) <= 0:
+        raise click.BadParameter(f"{text!r} has a distance that is not above zero")
+    return found
+
+
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @options.place
-@click.option("--horizons", metavar="M,M,...", help="Distances without GNSS [m], in place of the configured ones.")
+@click.option("--horizons", metavar="M,M,...", type=distances,
+              help="Distances without GNSS [m], in place of the configured ones.")  # fmt: skip
 @click.option("--calibration", "calibrations", metavar="CAL.json", type=options.FILE, multiple=True,
               help="Also predict with a calibration that icrtool calibrate wrote; repeatable.")  # fmt: skip
 @click.option("--outage", "outages", metavar="SECONDS", type=options.POSITIVE, multiple=True,
@@ -79,9 +85,10 @@ class Request:
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool, horizons: str | None,
-    calibrations: tuple[Path, ...], outages: tuple[float, ...], outages_at: tuple[float, ...],
-    reference: Literal["filter", "smoothed"], without_events: bool, starts: Literal["moving", "all"], trials: bool,
+    sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
+    horizons: tuple[float, ...] | None, calibrations: tuple[Path, ...], outages: tuple[float, ...],
+    outages_at: tuple[float, ...], reference: Literal["filter", "smoothed"], without_events: bool,
+    starts: Literal["moving", "all"], trials: bool,
     seed: int | None, asked: ReportOptions, baseline: Path | None, junit: Path | None, markdown: Path | None,
     as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -98,20 +105,21 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    lengths = parse_horizons(horizons) if horizons is not None else ()
-    config = options.load(config_file, robot, sets)
     from icrtool.output.files.calibration_file import open_calibration
 
+    config = options.load(config_file, robot, sets)
+    dropout, given = config.dropout, config.given
     further = {
+        "horizons_m": horizons or (dropout.horizons_m if "dropout.horizons_m" in given else None),
+        "outage_s": outages or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None),
         "calibrations": tuple(open_calibration(file) for file in calibrations), "outage_at_s": outages_at,
         "starts": starts, "without_events": without_events, "reference": reference,
     } | ({"seed": seed} if seed is not None else {})  # fmt: skip
     request = Request(
         config=config, asked=asked, baseline=options.baseline_of(baseline, asked.gates), further=further,
-        horizons_m=lengths, outage_s=outages, trials=trials, overwrite=overwrite, quiet=quiet,
-        prints=not (quiet or as_json), verbose=verbose,
+        trials=trials, overwrite=overwrite, quiet=quiet, prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
-    sources, places = plan_sources(sources, (output, into), config, quiet=quiet)
+    sources, places = plan_sources(sources, output, into, config, quiet=quiet)
     outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request)]
     if as_json:
         print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
@@ -128,42 +136,28 @@ def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
     return {"source": escaped(source), "status": "done", "report": report_document(outcome)}
 
 
-def parse_horizons(text: str) -> tuple[float, ...]:
-    """Return the distances [m] of ``--horizons``."""
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    try:
-        lengths = tuple(float(part) for part in parts)
-    except ValueError as err:
-        raise click.BadParameter(f"{text!r} is not a list of distances", param_hint="--horizons") from err
-    if not lengths or not all(math.isfinite(length) and length > 0 for length in lengths):
-        raise click.BadParameter(f"{text!r} is not a list of distances", param_hint="--horizons")
-    return lengths
-
-
 def plan_sources(
-    sources: tuple[Path, ...],
-    places: tuple[Path | None, Path | None],
-    config: Config,
-    *,
-    quiet: bool,
+    sources: tuple[Path, ...], output: Path | None, into: Path | None, config: Config, *, quiet: bool
 ) -> tuple[tuple[Path, ...], dict[Path, Path]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
-    Everything that can be refused without reading a log is refused here.
-
-    Parameters
-    ----------
-    places : -o and --into
+    Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
+    its place.
     """
+    from icrtool.errors import ConfigError
     from icrtool.output.run_directory import RUN_FILE
     from icrtool.output.stored_run import newest_run
 
-    sources = sources or (newest_run(RUNS),)
-    sources = logs_of(sources, quiet=quiet)
+    sources = logs_of(sources or (newest_run(RUNS),), quiet=quiet)
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
-    output, into = places
-    check_configuration(config, runs_only=not logs, output=output or into)
-    return sources, dict(zip(logs, run_directories(logs, output, into), strict=True)) if logs else {}
+    if logs:
+        return sources, dict(zip(logs, run_directories(logs, output, into), strict=True))
+    if given := sorted(config.given_sections - {"dropout"}):
+        advice = "fit the log again with it, or name the log in place of its run"
+        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+    if output or into:
+        raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
+    return sources, {}
 
 
 def report_all(sources: tuple[Path, ...], places: dict[Path, Path], request: Request) -> Iterator[tuple[Path, Outcome]]:
@@ -190,22 +184,9 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
     if markdown is not None:
         write_markdown(markdown, outcomes)
     failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
-    missed = any(not outcome.passed for _, outcome in outcomes if not isinstance(outcome, IcrToolError))
     verdicts = [one for _, outcome in outcomes if not isinstance(outcome, IcrToolError) for one in outcome.verdicts]
     options.check_compared(verdicts)
-    options.leave(failed, len(outcomes), "runs and logs", gate_failed=missed)
-
-
-def check_configuration(config: Config, *, runs_only: bool, output: Path | None) -> None:
-    """Refuse options that would change nothing: a finished run keeps its configuration and its place."""
-    from icrtool.errors import ConfigError
-
-    given = sorted(config.given_sections - {"dropout"})
-    advice = "fit the log again with it, or name the log in place of its run"
-    if runs_only and given:
-        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
-    if runs_only and output is not None:
-        raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
+    options.leave(failed, len(outcomes), "runs and logs", gate_failed=not all(one.passed for one in verdicts))
 
 
 def _report_one(source: Path, place: Path | None, request: Request) -> DropoutReport:
@@ -219,8 +200,20 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
             source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
             overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
+    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
+    from icrtool.fleet.fit_and_report import report_and_write
+
     directory = source if place is None else place
-    report = _analyse(run, directory, request)
+    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
+        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
+    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
+        report = report_and_write(
+            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
+            further=request.further,
+        )  # fmt: skip
+    if baseline is not None:
+        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
@@ -231,13 +224,6 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
         for verdict in report.verdicts:
             if not verdict.passed:
                 click.echo(verdict.line(), err=True)
-    if request.verbose:
-        from icrtool.dropout_analysis.trials import BOOTSTRAP_RESAMPLES
-        from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
-
-        blocks = "moving blocks as long as the horizon"
-        click.echo(f"intervals: {BOOTSTRAP_RESAMPLES} resamples of {blocks}, seed {report.seed}", err=True)
-        click.echo(f"errors: equal to direct integration, {TOLERANCE_M:g} m left out at most", err=True)
     return report
 
 
@@ -253,24 +239,3 @@ def _read(directory: Path) -> Run:
 
         load_kernels()
         return reading.result()
-
-
-def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
-    """Compute the report of a run and write it."""
-    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
-    from icrtool.fleet.fit_and_report import report_and_write
-
-    dropout, given = request.config.dropout, request.config.given
-    horizons = request.horizons_m or (dropout.horizons_m if "dropout.horizons_m" in given else None)
-    outages = request.outage_s or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None)
-    if request.further["outage_at_s"] and not forced_lengths_s(run, outages):
-        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
-    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        report = report_and_write(
-            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
-            further={**request.further, "horizons_m": horizons, "outage_s": outages},
-        )  # fmt: skip
-    if baseline is not None:
-        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
-    return report

@@ -99,14 +99,10 @@ def _leave(text: str, output: Path | None) -> None:
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
-    from icrtool.errors import OutputError
     from icrtool.output.exports.paths import paths_of
     from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory
 
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as err:
-        raise OutputError(directory, "cannot be made", err.strerror or str(err)) from err
+    directory.mkdir(parents=True, exist_ok=True)
     for path in paths_of(run):
         file = directory / f"{path.name}{SUFFIXES[target]}"
         _leave(format_trajectory(path, target), file)
@@ -135,7 +131,7 @@ def _run(source: Path | None) -> Run:
 
     if source is not None and source.is_file():
         raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")
-    run = open_run(source if source is not None else newest_run(RUNS))
+    run = open_run(source or newest_run(RUNS))
     if not run.usable:
         options.warn([f"{run.name}: its ICRs are not usable: {run.summary['unusable_because']}"], quiet=False)
     return run
@@ -162,7 +158,7 @@ def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibra
     from icrtool.calibration.from_runs import calibrate
     from icrtool.errors import DataError
 
-    run = open_run(source if source is not None else newest_run(RUNS))
+    run = open_run(source or newest_run(RUNS))
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.summary['unusable_because']}"
         raise DataError(run.name, why, f"drive again, with turns to both sides; {ALL_THE_SAME}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -78,7 +79,7 @@ def command(
             from icrtool.output.tables.run import format_run
 
             show(format_run(run))
-            click.echo(f"\nwritten to {place}{_beside(warm_start, smooth=smooth)}")
+            click.echo(f"\nwritten to {place}")
     if as_json:
         print_json("fit", {"logs": documents})
     options.leave(failed, len(logs), "logs")
@@ -128,13 +129,6 @@ def _other_robot(source: Path | None, start: WarmStart | None, config: Config) -
     return (f"{source}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?",)
 
 
-def _beside(warm_start: Path | None, *, smooth: bool) -> str:
-    """Return a text about further options that had an effect."""
-    done = [f"started from {warm_start}"] if warm_start is not None else []
-    done += ["with the smoother's states"] if smooth else []
-    return f" ({', '.join(done)})" if done else ""
-
-
 def _warm_start(source: Path) -> WarmStart:
     """Return the ICRs that a run ended with, or those of a calibration file."""
     if source.is_file():
@@ -175,8 +169,20 @@ def fit_log(
     return run
 
 
-def run_of(path: Path, config: Config) -> Run:
-    """Read a run, or fit a log without a recommendation; nothing is written."""
+def runs_of(paths: Sequence[Path], config: Config, *, quiet: bool, verbose: bool = False) -> list[Run]:
+    """Read runs, and fit logs without a recommendation; nothing is written."""
+    found = []
+    with options.progress_bar("reading", quiet=quiet) as progress:
+        for path in paths:
+            if verbose:
+                click.echo(str(path), err=True)
+            found.append(_run_of(path, config))
+            if progress is not None:
+                progress(len(found) / len(paths))
+    return found
+
+
+def _run_of(path: Path, config: Config) -> Run:
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(path):

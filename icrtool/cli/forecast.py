@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 @click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.FILE,
               help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
 @options.budgets
-@click.option("-o", "--output", metavar="FILE.csv", type=options.FILE, help="Write a row for each metre.")
-@click.option("--plot", metavar="FILE", type=options.FILE, help="Draw the errors: png, svg, pdf.")
+@click.option("-o", "--output", metavar="FILE.csv", type=options.NEW_FILE, help="Write a row for each metre.")
+@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the errors: png, svg, pdf.")
 @json_option
 @options.quiet
 def command(
@@ -42,15 +43,11 @@ def command(
       icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.files.atomic_file import check_place, write_file
+    from icrtool.output.files.atomic_file import write_file
     from icrtool.output.files.calibration_file import open_calibration
-    from icrtool.output.files.picture_file import check_picture, save_picture
+    from icrtool.output.files.picture_file import save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
-    if output is not None:
-        check_place(output)
-    if plot is not None:
-        check_picture(plot)
     calibration = open_calibration(calibration_file)
     forecast, gyro = _forecasts(calibration, path)
     if output is not None:
@@ -70,19 +67,18 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
     """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
     from icrtool.calibration.forecast import forecast_drive, forecast_plan
     from icrtool.output.run_directory import is_run_directory
-    from icrtool.output.tables.forecast import read_plan
 
     with_gyro = calibration.gyro_sources is not None
-    if not is_run_directory(path):
-        plan = read_plan(path)
-        return forecast_plan(calibration, *plan), forecast_plan(
-            calibration, *plan, with_gyro=True
-        ) if with_gyro else None
-    from icrtool.calibration.pooled import gyro_recording_of
-    from icrtool.output.stored_run import open_run
+    if is_run_directory(path):
+        from icrtool.calibration.pooled import gyro_recording_of
+        from icrtool.output.stored_run import open_run
 
-    recording = gyro_recording_of(open_run(path))
-    with_gyro = with_gyro and recording.gyro_radps is not None
-    return forecast_drive(calibration, recording), (
-        forecast_drive(calibration, recording, with_gyro=True) if with_gyro else None
-    )
+        recording = gyro_recording_of(open_run(path))
+        with_gyro = with_gyro and recording.gyro_radps is not None
+        forecast = partial(forecast_drive, calibration, recording)
+    else:
+        from icrtool.output.files.csv_file import read_numbers
+
+        plan = read_numbers(path, ("east_m", "north_m"), ("speed_mps",))
+        forecast = partial(forecast_plan, calibration, plan["east_m"], plan["north_m"], plan.get("speed_mps"))
+    return forecast(), forecast(with_gyro=True) if with_gyro else None

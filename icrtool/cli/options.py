@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import click
 
 from icrtool.cli.stages import Stages, signal_word
-from icrtool.records.text import LONGEST_NAME, escaped, shortened
+from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -26,14 +27,34 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
-NAMES_SHOWN = 5
-
 # Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
 LOG = click.Path(path_type=Path, readable=False)
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
 FILE = click.Path(path_type=Path)
+
+
+class _NewFile(click.Path):
+    """A file that the command writes: a place that cannot be written is refused before any work is done."""
+
+    def __init__(self, *, picture: bool = False) -> None:
+        super().__init__(path_type=Path)
+        self._picture = picture
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> Path:  # fmt: skip
+        """Return the path."""
+        from icrtool.output.files.atomic_file import check_place
+        from icrtool.output.files.picture_file import check_picture
+
+        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]  # as path_type asks
+        (check_picture if self._picture else check_place)(path)
+        return path
+
+
+NEW_FILE, NEW_PICTURE = _NewFile(), _NewFile(picture=True)
 
 
 def configuration(command: Command) -> Command:
@@ -122,11 +143,7 @@ def report(command: Command) -> Command:
         page: bool, junit: Path | None, markdown: Path | None, **others: object,
     ) -> object:  # fmt: skip
         from icrtool.fleet.fit_and_report import ReportOptions
-        from icrtool.output.files.atomic_file import check_place
 
-        for file in (junit, markdown):
-            if file is not None:
-                check_place(file)
         asked = ReportOptions(plots, gates, budgets, ladder, strict, page)
         return command(asked=asked, junit=junit, markdown=markdown, **others)
 
@@ -143,8 +160,8 @@ def report(command: Command) -> Command:
                      "confidence interval of the difference."),
         click.option("--ladder/--no-ladder", default=True, show_default=True,
                      help="Compare all models, with a gyro too, on distance that they were not fitted to."),
-        click.option("--junit", metavar="FILE", type=FILE, help="Write the verdicts on the limits as JUnit XML."),
-        click.option("--markdown", metavar="FILE", type=FILE, help="Write a summary for a pull request."),
+        click.option("--junit", metavar="FILE", type=NEW_FILE, help="Write the verdicts on the limits as JUnit XML."),
+        click.option("--markdown", metavar="FILE", type=NEW_FILE, help="Write a summary for a pull request."),
         plots,
         click.option("--page/--no-page", default=True, show_default=True,
                      help="Also write report.html: pictures, tables and an interactive map in one file."),
@@ -213,17 +230,12 @@ def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
             click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
 
-def error_line(err: IcrToolError | str, source: Path | str) -> str:
-    """Return the line about an error, which names the log or run that it occurred in."""
+def report_error(err: IcrToolError, source: Path | str) -> None:
+    """Print the line about an error, which names the log or run that it occurred in, on standard error."""
     name = shortened(escaped(str(source)), LONGEST_NAME)
     named = any(part in str(err) for part in (name, escaped(Path(source).name), escaped(Path(source).stem)))
     word = signal_word("Error:", "red")
-    return f"{word} {err}" if named else f"{word} {name}: {err}"
-
-
-def report_error(err: IcrToolError, source: Path | str) -> None:
-    """Print the line about an error on standard error."""
-    click.echo(error_line(err, source), err=True)
+    click.echo(f"{word} {err}" if named else f"{word} {name}: {err}", err=True)
 
 
 def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = False) -> None:
@@ -238,11 +250,8 @@ def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = F
     """
     if failed and of > 1:
         names = [shortened(escaped(str(source)), LONGEST_NAME) for source in failed]
-        listed = ", ".join(names[:NAMES_SHOWN]) + (
-            f" and {len(names) - NAMES_SHOWN} more" if names[NAMES_SHOWN:] else ""
-        )
         word = signal_word("Error:", "red")
-        click.echo(f"{word} {len(failed)} of {of} {what} could not be used: {listed}", err=True)
+        click.echo(f"{word} {len(failed)} of {of} {what} could not be used: {listed(names)}", err=True)
     if gate_failed or failed:
         raise SystemExit(3 if gate_failed else 1)
 

@@ -33,23 +33,18 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import ConfigError
     from icrtool.output.files.atomic_file import check_place
+    from icrtool.output.run_directory import PAGE_FILE
     from icrtool.output.stored_run import newest_run
 
     sources = sources or (newest_run(RUNS),)
     if output is not None and len(sources) > 1:
         raise ConfigError("-o", "names one file for several pages", "leave it out: each page goes to its own directory")
     for source in sources:
-        place = output if output is not None else _default_place(source)
+        place = output or (source / PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
         check_place(place)
         _write(source, place, coordinates=not no_coordinates)
         if not quiet:
             click.echo(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
-
-
-def _default_place(source: Path) -> Path:
-    from icrtool.output.run_directory import PAGE_FILE
-
-    return source / PAGE_FILE if source.is_dir() else source.with_suffix(".html")
 
 
 def _write(source: Path, place: Path, *, coordinates: bool) -> None:

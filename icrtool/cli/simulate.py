@@ -186,7 +186,7 @@ def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str,
 def _summary(config: Config, plan: DrivePlan, truth: TruthTable, given: dict[str, Any]) -> str:
     import numpy as np
 
-    distance_m = float(np.hypot(np.diff(truth.north_m), np.diff(truth.east_m)).sum())
+    distance_m = float(np.hypot(np.diff(truth["north_m"]), np.diff(truth["east_m"])).sum())
     what = "track speeds as given" if given["speeds"] is not None else f"{given['kind']} path"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",

@@ -140,16 +140,15 @@ def _calibration_rows(
             stem = f"{stem}-{number}" if one.name else stem
         name = "calibration" if len(calibrations) == 1 else f"calibration:{stem}"
         label = "calibration" if len(calibrations) == 1 else stem
-        if recording is not None:
-            models.append(ConstantModel(name, label, predictor(one, recording)))
-            seen = one.fitted_to(recording.sha256)
-            kept = one.summary() | {"models": {}, "held_out": []}
-            used.append(UsedCalibration(name, label, one.recommended, len(one.logs), seen, one.created, False, kept))
-            if one.gyro is not None and recording.gyro_radps is not None:
-                name, label = f"{name}_gyro", f"{label} + gyro"
-                models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=True)))
-                model = one.gyro.model.name
-                used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, True, kept))
+        if recording is None:
+            continue
+        kept, seen = one.summary() | {"models": {}, "held_out": []}, one.fitted_to(recording.sha256)
+        rows = [(name, label, one.recommended, False)]
+        if one.gyro is not None and recording.gyro_radps is not None:
+            rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model.name, True))
+        for name, label, model, with_gyro in rows:
+            models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=with_gyro)))
+            used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, with_gyro, kept))
     return tuple(used), models
 
 

@@ -15,10 +15,9 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.open_loop.block_sums import block_sums
+from icrtool.kernels.open_loop.block_sums import Blocks, block_sums
 from icrtool.kernels.open_loop.direct import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.error_statistics import (
-    Blocks,
     bootstrap_intervals,
     cut_blocks,
     error_summary,

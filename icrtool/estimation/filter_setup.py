@@ -14,7 +14,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
-from icrtool.records.events import SlipEvent
+from icrtool.records.events import SlipEvent, intervals_in
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
 from icrtool.records.run import WarmStart, half_width_m
 
@@ -84,19 +84,14 @@ class FilterSetup:
 
     Attributes
     ----------
-    epoch_ns : stamp of time 0 in `data`
     t0 : time of the start [s]; x0 (6,), P0 (6, 6) : state and covariance there
-    gnss_index : (m,) rows of the fixes that `data` holds; heading_index likewise
     """
 
     data: FilterInputs
     parameters: FilterParameters
-    epoch_ns: int
     t0: float
     x0: Floats
     P0: Floats
-    gnss_index: Ints | slice
-    heading_index: Ints | slice
 
 
 def check_start(config: Config) -> None:
@@ -146,17 +141,17 @@ def set_up_filter(
     """
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     epoch = int(wheels.stamp_ns[0])
-    gnss_index, heading_index = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
+    fix, sample = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
     data = FilterInputs(
         wheel_t=_seconds(wheels.stamp_ns, epoch),
         v_left=wheels.v_left_mps,
         v_right=wheels.v_right_mps,
-        gnss_t=_seconds(fixes.stamp_ns[gnss_index], epoch),
-        gnss_z=np.column_stack([fixes.north_m, fixes.east_m])[gnss_index],
-        gnss_r=np.column_stack([fixes.var_north_m2, fixes.var_east_m2])[gnss_index],
-        heading_t=_seconds(headings.stamp_ns[heading_index], epoch),
-        heading_z=headings.heading_rad[heading_index],
-        heading_r=headings.var_rad2[heading_index],
+        gnss_t=_seconds(fixes.stamp_ns[fix], epoch),
+        gnss_z=np.column_stack([fixes.north_m, fixes.east_m])[fix],
+        gnss_r=np.column_stack([fixes.var_north_m2, fixes.var_east_m2])[fix],
+        heading_t=_seconds(headings.stamp_ns[sample], epoch),
+        heading_z=headings.heading_rad[sample],
+        heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
         slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
     )
@@ -180,7 +175,7 @@ def set_up_filter(
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
-    return FilterSetup(data, parameters, epoch, t0, x0, P0, gnss_index, heading_index)
+    return FilterSetup(data, parameters, t0, x0, P0)
 
 
 def chi2_gate(probability: float, degrees: int) -> float:
@@ -209,15 +204,9 @@ def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[
 
     None in an outage that is made: what a run does there must not know what only the fixes showed.
     """
-    slipping = np.zeros(len(stamps_ns), np.bool_)
-    ends = np.append(stamps_ns[1:], stamps_ns[-1])
     margin = round(EVENT_MARGIN_S * 1e9)
-    for event in events:
-        first, last = np.searchsorted(ends, event.begin_ns - margin), np.searchsorted(stamps_ns, event.end_ns + margin)
-        slipping[first:last] = True
-    for begin, end in outages_ns:
-        slipping[(ends > begin) & (stamps_ns < end)] = False
-    return slipping
+    slipping = intervals_in(stamps_ns, ((event.begin_ns - margin, event.end_ns + margin) for event in events))
+    return slipping & ~intervals_in(stamps_ns, outages_ns)
 
 
 def _start_time(name: str, data: FilterInputs) -> float:

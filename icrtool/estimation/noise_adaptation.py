@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,19 +34,12 @@ MOST_SAMPLES = 60_000
 """Wheel samples the search looks at: ten minutes at 100 Hz."""
 
 
-class AdaptedRun(NamedTuple):
-    """A filter run, and the process noise that it was made with."""
-
-    sensors: SensorData
-    setup: FilterSetup
-    output: FilterOutput
-    noise: ProcessNoise
-
-
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
-) -> AdaptedRun:
+) -> tuple[FilterSetup, FilterOutput, ProcessNoise]:
     """Run the filter; where fixes or headings contradict the wheels, with the process noise that they show.
+
+    Returns set-up and output of the run, and the process noise that it was made with.
 
     The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
     ``field`` only; what is configured is not searched for.
@@ -60,7 +52,7 @@ def run_adaptively(
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)
     if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
-        return AdaptedRun(sensors, setup, output, noise)
+        return setup, output, noise
     del setup, output  # of a long log, as large as all that the next run makes
     part = _busiest_part(sensors)
     best = find_noise(
@@ -69,7 +61,7 @@ def run_adaptively(
         positions=settings.process_position_mps == "auto",
         headings=settings.process_heading_degps is None,
     )
-    return AdaptedRun(sensors, *run(sensors, best), best)
+    return *run(sensors, best), best
 
 
 def _busiest_part(sensors: SensorData) -> SensorData:

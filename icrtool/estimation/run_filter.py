@@ -21,7 +21,7 @@ from icrtool.estimation.filter_setup import (
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter.ekf_step import PLACES
-from icrtool.kernels.filter.filter_records import Codes, FilterOutput
+from icrtool.kernels.filter.filter_records import FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.samples import WheelSamples
@@ -91,20 +91,18 @@ def run_filter(
     check_start(config)
     _check_motion(sensors)
     changes_s = tuple(sorted(set(changes_s)))
-    adapted = run_adaptively(sensors, config, warm_start, changes_s)
-    sensors, setup, output = adapted.sensors, adapted.setup, adapted.output
+    setup, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
     table = _states(sensors.wheels, output)
     if table.fault:
         advice = "check warm start and configuration, or cut the log there (--from, --to)"
         raise DataError(sensors.name, f"the filter failed: {table.fault}", advice)
-    gnss = _outcome(
-        sensors.fixes.stamp_ns, setup.gnss_index, table, output.gnss_nis, output.gnss_code,
-        np.hypot(*output.gnss_residual.T),
-    )  # fmt: skip
-    heading = _outcome(
-        sensors.headings.stamp_ns, setup.heading_index, table, output.heading_nis, output.heading_code,
-        output.heading_innovation,
-    )  # fmt: skip
+    fixes_ns, headings_ns = sensors.fixes.stamp_ns, sensors.headings.stamp_ns
+    fixes_s, headings_s = ((one - table.stamp_ns[0]) / 1e9 for one in (fixes_ns, headings_ns))
+    residual_m = np.hypot(*output.gnss_residual.T)
+    gnss = MeasurementOutcome(fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m)
+    heading = MeasurementOutcome(
+        headings_ns, headings_s, output.heading_nis, output.heading_code, output.heading_innovation
+    )
     table = carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
@@ -114,7 +112,7 @@ def run_filter(
         gnss=gnss,
         heading=heading,
         covariance=output.P[PLACES],
-        noise=adapted.noise,
+        noise=noise,
         start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
         least_icr_m=setup.parameters.least_icr,
         began_with=warm_start,
@@ -198,22 +196,6 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
         heading_rad=psi + np.where(clear, off[last], 0.0),
         std_heading_rad=np.where(clear, std, table.std_heading_rad),
     )
-
-
-def _outcome(
-    stamps: Ints, index: Ints | slice, table: States, nis: Floats, code: Codes, difference: Floats
-) -> MeasurementOutcome:
-    """Return the kernel's outcomes in the rows of the stream: it was given some of the measurements."""
-    t_s = (stamps - table.stamp_ns[0]) / 1e9
-    if isinstance(index, slice):
-        return MeasurementOutcome(stamps, t_s, nis, code, difference)
-    all_nis, all_code, all_difference = (
-        np.full(len(stamps), np.nan),
-        np.zeros(len(stamps), np.uint8),
-        np.full(len(stamps), np.nan),
-    )
-    all_nis[index], all_code[index], all_difference[index] = nis, code, difference
-    return MeasurementOutcome(stamps, t_s, all_nis, all_code, all_difference)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

@@ -65,19 +65,15 @@ def rejected_share(outcome: MeasurementOutcome) -> float:
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
     """Return what was done about wheels that contradict the position reference."""
-    found = []
-    configured = configured_noise(config)
+    configured, found = configured_noise(config), []
     if noise.position_mps != configured.position_mps:
-        found.append(
-            f"{name}: the wheels contradict the position reference (slip, clock offsets, repeated samples, fixes "
-            "worse than they state): "
-            f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
-        )
+        causes = "slip, clock offsets, repeated samples, fixes worse than they state"
+        raised = f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
+        found.append(f"{name}: the wheels contradict the position reference ({causes}): {raised}")
     if noise.heading_degps != configured.heading_degps:
-        found.append(
-            f"{name}: the wheels contradict the heading (repeated samples, clock offsets, slip): "
-            f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
-        )
+        causes = "repeated samples, clock offsets, slip"
+        raised = f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
+        found.append(f"{name}: the wheels contradict the heading ({causes}): {raised}")
     return found
 
 

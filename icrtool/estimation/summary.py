@@ -140,7 +140,7 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
         "preset": config.filter.preset,
         "process_position_mps": filtered.noise.position_mps,
         "process_heading_degps": filtered.noise.heading_degps,
-        "reference_delay_s": measurements.position_delay_s,
+        "reference_delay_s": measurements.findings["position_delay_s"].applied,
         "heading_correlation_s": sensors.heading_correlation_s,
         "heading_from_position": sensors.heading_from_position,
         "heading_is_estimated": sensors.heading_is_estimated,

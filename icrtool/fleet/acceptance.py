@@ -30,25 +30,12 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
     counts = Counter(row.status for row in rows)
-    shown = [(row, one) for row in rows for one in row.verdicts]
-    failed_gates = [one for _, one in shown if not one.passed]
     lines = [f"## {len(rows)} logs", ""]
     lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
-    if shown:
-        met = (
-            f"**Acceptance limits not met: {len(failed_gates)}.**" if failed_gates else "All acceptance limits are met."
-        )
-        lines += [met, ""]
-        shown.sort(key=lambda pair: pair[1].passed)
-        limits = []
-        for row, one in shown:
-            interval = f"{one.margin_low_m:+.3f} to {one.margin_high_m:+.3f} m" if one.margin_low_m is not None and (
-                one.margin_high_m is not None) else "-"  # fmt: skip
-            verdict = "not checked" if one.not_checked else "pass" if one.passed else "**FAIL**"
-            numbers = [_metres(one.value_m), _metres(one.baseline_m), _metres(one.bound_m), _metres(one.margin_m)]
-            limits.append([escaped_markdown(row.log), escaped_markdown(one.gate.text), *numbers, interval, verdict])
-        head = ("log", "acceptance limit", "number", "baseline", "bound", "margin", "95 % interval", "verdict")
-        lines += [*markdown_table(head, limits, (0, 1, 7)), ""]
+    if verdicts := sorted((one for row in rows for one in row.verdicts), key=lambda one: one.passed):
+        missed = sum(not one.passed for one in verdicts)
+        lines += [f"**Acceptance limits not met: {missed}.**" if missed else "All acceptance limits are met.", ""]
+        lines += [*(f"- {escaped_markdown(one.line())}" for one in verdicts), ""]
     errors = []
     for row in rows:
         if row.status == "failed":

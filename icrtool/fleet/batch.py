@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from functools import partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 
@@ -109,11 +110,8 @@ def finished(request: Request) -> Row | None:
         return None
     if row.status == "failed":
         return replace(row, log=request.row.log, group=request.row.group, tags=request.row.tags)
-    if (
-        not Path(path_of(request.directory), "run.json").is_file()
-        or not Path(path_of(request.directory), "dropout").is_dir()
-        or (request.report.page and not Path(path_of(request.directory), PAGE_FILE).is_file())
-    ):
+    needed = ["run.json", "dropout", *([PAGE_FILE] if request.report.page else [])]
+    if not all((path_of(request.directory) / name).exists() for name in needed):
         return None
     why = "; ".join(filter(None, ["done before: same input, configuration and version", row.reason]))
     return replace(row, status="skipped", reason=why, log=request.row.log, group=request.row.group,
@@ -171,8 +169,7 @@ def _all_of(
     pending: dict[Future[Row], Request] = {}
     try:
         for request in requests:
-            stage = _stage(watch, request.row.log) if isinstance(executor, ThreadPoolExecutor) and watch else None
-            extra = (stage,) if stage is not None else ()
+            extra = (partial(watch, request.row.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
             pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
         for future in as_completed(pending):
             yield pending[future], future.result()
@@ -181,10 +178,6 @@ def _all_of(
             future.cancel()
         close_all()
         raise
-
-
-def _stage(watch: Watch, log: str) -> Callable[[str], None]:
-    return lambda stage: watch(log, stage)
 
 
 def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:

@@ -97,17 +97,16 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
 def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:
     """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed."""
     from icrtool.output.figure_catalogue import FIGURES, figures_of
-    from icrtool.output.figures.fleet import FleetNumbers, IcrPoint
+    from icrtool.output.figures.fleet import FleetNumbers
     from icrtool.output.files.picture_file import save_picture
 
-    points: list[IcrPoint] = []
+    points: list[dict[str, Any]] = []
     errors: dict[str, list[float]] = {}
     reasons: Counter[str] = Counter()
     for row in sorted(rows, key=lambda row: row.start_utc):
-        right, left = row.icr.get("y_icr_right_m"), row.icr.get("y_icr_left_m")
-        std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
-        if right is not None and left is not None and row.start_utc:
-            points.append(IcrPoint(row.robot, row.start_utc, right, left, *std))
+        shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
+        if shown and row.start_utc:
+            points.append(msgspec.to_builtins(row))
         if (error := row.errors.get(SHOWN_ERROR)) is not None:
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, []).append(error)

@@ -37,13 +37,8 @@ class About:
 
     def updated(self, other: About) -> About:
         """Return it with what another one states in its place."""
-        return replace(
-            self,
-            robot=other.robot or self.robot,
-            config=other.config or self.config,
-            group=other.group or self.group,
-            tags=tuple(dict.fromkeys((*self.tags, *other.tags))),
-        )
+        stated = {key: value for key in ("robot", "config", "group") if (value := getattr(other, key))}
+        return replace(self, **stated, tags=tuple(dict.fromkeys((*self.tags, *other.tags))))
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True):

@@ -12,7 +12,8 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.kinematics import body_velocity
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
+from icrtool.kernels.kinematics import body_velocity, euler_step
 
 SMALLEST_TURN_RAD = 1e-4
 """Below this sin(a)/a is taken from its series, which is then exact to the last bit."""
@@ -85,3 +86,30 @@ def follow(command: Floats, t: Floats, lag_s: float) -> Floats:
     for k in range(len(command) - 1):
         speed[k + 1] = command[k] + (speed[k] - command[k]) * math.exp(-(t[k + 1] - t[k]) / lag_s)
     return speed
+
+
+@njit
+def model_states(
+    x0: Floats, wheel_t: Floats, v_left: Floats, v_right: Floats, std: Floats, rate_invariant: bool, noise: Floats
+) -> Floats:
+    """Return states (n, 6) that obey the filter's own model: Eq. 14 with its process noise.
+
+    Parameters
+    ----------
+    x0 : (6,) at wheel_t[0]
+    wheel_t : (n,) [s]; v_left, v_right : (n,) [m/s], held over [k, k+1)
+    std : (6,) square roots of the diagonal of Q (Eq. 30)
+    rate_invariant : as in `FilterParameters`
+    noise : (n, 6) standard normal
+    """
+    states = np.empty((len(wheel_t), 6))
+    states[0] = x0
+    for k in range(len(wheel_t) - 1):
+        N, E, psi, y_r, y_l, x_v = states[k]
+        dt = wheel_t[k + 1] - wheel_t[k]
+        N, E, psi = euler_step(N, E, psi, dt, v_left[k], v_right[k], y_r, y_l, x_v)
+        scale = math.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
+        moved = (N, E, psi, y_r, y_l, x_v)
+        for i in range(6):
+            states[k + 1, i] = moved[i] + scale * std[i] * noise[k, i]
+    return states

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import cpu_target
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
@@ -20,6 +22,14 @@ if _BLAS not in sys.modules:
         importlib.import_module("numba.np.arraymath")
     finally:
         del sys.modules[_BLAS]
+
+
+def load_compiler() -> None:
+    """Make numba ready to load kernels, as the first call of one does; another thread may read files meanwhile."""
+    # numba takes this lock where it compiles; two threads that refresh at once fail
+    with global_compiler_lock:
+        for context in (cpu_target.typing_context, cpu_target.target_context):
+            context.refresh()
 
 
 def njit(function: Kernel) -> Kernel:

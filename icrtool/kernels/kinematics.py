@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit
@@ -82,30 +81,8 @@ def euler_step(
     return north, east, heading + dt * omega
 
 
-class StepJacobian(NamedTuple):
-    """Entries of G = F - I that are not zero, for one step of the filter; and the step itself.
-
-    Attributes
-    ----------
-    n_psi, n_r, n_l, n_x : derivatives of the northward step by psi [m/rad], y_r, y_l, x_v
-    e_psi, e_r, e_l, e_x : of the eastward step
-    p_r, p_l : of the turn, by y_r and y_l [rad/m]
-    turn : the turn [rad]; the step itself is e_psi to the north and -n_psi to the east [m]
-    length : length of the step [m]
-    """
-
-    n_psi: float
-    n_r: float
-    n_l: float
-    n_x: float
-    e_psi: float
-    e_r: float
-    e_l: float
-    e_x: float
-    p_r: float
-    p_l: float
-    turn: float
-    length: float
+StepJacobian = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""What `step_jacobian` returns."""
 
 
 @njit
@@ -118,6 +95,12 @@ def step_jacobian(
     ----------
     step_heading : the part of the step's turn after which its displacement is turned into the world
     guard : `GUARDED`, `UNGUARDED` or `PRINTED`
+
+    Returns
+    -------
+    The entries of G = F - I that are not zero, and the step itself: derivatives of the northward step by psi [m/rad],
+    y_r, y_l and x_v; the same four of the eastward step; those of the turn by y_r and y_l [rad/m]; the turn [rad] and
+    the length of the step [m]. The step is the fifth to the north and minus the first to the east.
 
     Notes
     -----
@@ -133,7 +116,7 @@ def step_jacobian(
     n_psi, e_psi = dt * (-v_x * s - v_y * c), dt * (v_x * c - v_y * s)
     # The ICRs move the position through the body velocity, and through the heading that turns it into the world.
     a_r, a_l = ahead * w_r, ahead * w_l
-    return StepJacobian(
+    return (
         n_psi, dt * (vx_r * c + w_r * x_v * s) + n_psi * a_r, dt * (vx_l * c + w_l * x_v * s) + n_psi * a_l,
         dt * omega * s,
         e_psi, dt * (vx_r * s - w_r * x_v * c) + e_psi * a_r, dt * (vx_l * s - w_l * x_v * c) + e_psi * a_l,

@@ -298,7 +298,7 @@ def _collect(
 
 
 def _empty_table(channel: Channel) -> TopicTable:
-    return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0, "")
+    return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0)
 
 
 def _input_of(file: Path, pending: Future[str]) -> InputFile:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from icrtool.logs.read_log import Survey
-from icrtool.logs.streams.heading_sources import HeadingSource
-from icrtool.logs.streams.position_sources import PositionSource
-from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.records.samples import rate_and_jitter
 from icrtool.records.tables import RobotLog
 
@@ -31,10 +27,6 @@ def survey_document(survey: Survey) -> dict[str, Any]:
                 "not_read_because": survey.candidates.unread.get(channel.topic),
             }
         )
-    found = survey.candidates
-    roles: dict[str, Sequence[WheelMotion | PositionSource | HeadingSource]] = {
-        "wheels": found.wheels, "gnss": found.gnss, "heading": found.heading,
-    }  # fmt: skip
     return {
         "inputs": [asdict(file) for file in survey.inputs],
         "topics": topics,
@@ -48,7 +40,7 @@ def survey_document(survey: Survey) -> dict[str, Any]:
                 }
                 for one in sources
             ]
-            for role, sources in roles.items()
+            for role, sources in survey.candidates.by_role().items()
         },
     }
 

@@ -19,7 +19,14 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.elimination import Parts, normal_equations
-from icrtool.kernels.robust import RobustFit, robust_least_squares, robust_weights, scale_by_kind, soft_l1_weights
+from icrtool.kernels.robust import (
+    RobustFit,
+    robust_least_squares,
+    robust_weights,
+    scale_by_kind,
+    soft_l1_weights,
+    student_covariance,
+)
 from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
@@ -33,7 +40,7 @@ SETTLED = 0.1
 OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
 
-REWEIGHTS = 3
+REWEIGHTS = 2
 
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
@@ -134,13 +141,12 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        Reweighted steps, as of a new fit, with residuals that follow the parameters to first order: over some metres
-        they do so nearly exactly.
+        A Newton step, then two of a new fit's reweighted steps, with residuals that follow the parameters to first
+        order: over some metres they do so nearly exactly.
         """
-        at, kept = self.solution, np.flatnonzero(clear)
-        residuals, jacobian, x, information = at.residuals[kept], at.jacobian[kept], at.x, at.information
-        mean, std = self.pool.prior(self.model)
-        pull = std**-2.0
+        at, (mean, std) = self.solution, self.pool.prior(self.model)
+        residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
+        x, information = at.x + self._steps(*self._derivatives(~clear)), at.information
         for _ in range(REWEIGHTS):
             left = residuals + jacobian @ (x - at.x)
             weights = robust_weights(left, scale_by_kind(left), self.pool.overlap)
@@ -359,6 +365,7 @@ class Pool:
             evaluate, mean, mean, std, group=self.group, parts=Parts(self.first, own if count > 1 else 0),
             overlap=self.overlap, settled=SETTLED,
         )  # fmt: skip
+        found = found._replace(covariance=student_covariance(found, self.group, self.overlap))
         return PooledFit(
             model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found
         )  # fmt: skip

@@ -123,9 +123,9 @@ class Steps(NamedTuple):
     gyro: Floats
     into: Floats
 
-    def around(self, begin_s: Floats, end_s: Floats) -> Steps:
-        """Return the steps of the time in which trials (k,) begin and end, and of a little more for delays."""
-        span = begin_s.min() - LONGEST_DELAY_S, end_s.max() + LONGEST_DELAY_S
+    def around(self, begin_s: float, end_s: float) -> Steps:
+        """Return the steps of the time between the first begin and the last end of trials, and a little for delays."""
+        span = begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S
         first, stop = np.searchsorted(self.t, span, side="right").tolist()
         return Steps._make(column[max(first - 1, 0) : stop] for column in self)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from
+from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from, fill_path_errors
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -19,6 +19,8 @@ from icrtool.motion.recording import (
     moving_states,
     samples_a_step,
 )
+
+MOST_STARTS = 4_000
 
 
 class Trials(NamedTuple):
@@ -40,13 +42,13 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     Parameters
     ----------
     all_starts : from every recorded state, as the paper; default from moving ones, as far apart as the steps of the
-        fits are long, since nearer ones are copies of one another
+        fits are long, about `MOST_STARTS` of a long drive, since nearer ones are copies of one another
     """
     drive = recording.drive
     starts = np.arange(len(drive.distance))
     if not all_starts:
-        every = samples_a_step(recording)
-        starts = np.flatnonzero(moving_states(drive))[::every]
+        moving = np.flatnonzero(moving_states(drive))
+        starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)]
     return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
 
 
@@ -66,21 +68,14 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
     drive, first = recording.drive, int(start.min())
-    near = slice(first, int(end.max()) + 1)
-    north, east, t, heading = drive.north[near], drive.east[near], recording.t_s[near], drive.heading[near]
-
-    def turn_and_place(rows: Ints | slice) -> tuple[Complexes, Complexes]:
-        turned, place = path(t[rows])
-        return np.exp(1j * (heading[rows] - turned)), place
-
     s, e = start - first, end - first
-    if len(s) > len(t):
-        turns, places = turn_and_place(slice(None))
-        turn, moved = turns[s], places[e] - places[s]
-    else:
-        turn, begin = turn_and_place(s)
-        moved = path(t[e])[1] - begin
-    errors: Floats = np.abs(turn * moved - (north[e] - north[s]) - 1j * (east[e] - east[s]))
+    used = np.zeros(int(e.max()) + 1, np.bool_)
+    used[s] = used[e] = True
+    rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
+    turned, place = path(recording.t_s[rows])
+    turn, reference = np.exp(1j * (drive.heading[rows] - turned)), drive.north[rows] + 1j * drive.east[rows]
+    errors = np.empty(len(s))
+    fill_path_errors(turn, place, reference, number[s], number[e], errors)
     return errors
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +14,6 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic_directory import atomic_directory
@@ -22,8 +21,14 @@ from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.trials_file import trials_file
 from icrtool.output.tables.dropout import no_trial, why_no_trial
-from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
+from icrtool.output.tables.model_comparison import (
+    COMPARISON_COLUMNS,
+    comparison_document,
+    comparison_rows,
+    error_columns,
+)
 from icrtool.records.dropout import ExampleTrial, ModelResult
+from icrtool.records.plain_data import rows_of
 
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
@@ -41,8 +46,6 @@ KNOWS = {
 """What the ICRs of a model were learned from."""
 
 ERROR_COLUMNS = ("icr", "no_slip")
-
-Cell = str | int | float | None
 
 
 def write_report(
@@ -90,7 +93,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
         A file cannot be written.
     """
     summary = report.summary_columns()
-    (directory / "summary.csv").write_bytes(csv_bytes(summary, _rows(summary.values())))
+    (directory / "summary.csv").write_bytes(csv_bytes(summary, zip(*summary.values(), strict=True)))
     (directory / "histogram.csv").write_bytes(csv_bytes(HISTOGRAM_COLUMNS, _histogram_rows(report)))
     (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, _worst_rows(report.worst)))
     if report.comparison is not None:
@@ -123,10 +126,12 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         },
         "models": [_model_document(result, report) for result in report.results],
         "trials": _count_documents(report),
-        "reference_error": _reference_documents(report),
+        "reference_error": _reference_rows(report),
         "by_learning": _learned_document(report),
         "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
-        "recommended": _recommended_document(report),
+        # Without when it was made: the same run, the same file.
+        "recommended": report.calibration
+        and {key: value for key, value in report.calibration.summary().items() if key != "created"},
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
         "ladder": comparison_document(report.comparison)
@@ -157,42 +162,25 @@ WORST_COLUMNS = (
 )  # fmt: skip
 
 
-def _recommended_document(report: DropoutReport) -> dict[str, Any] | None:
-    """Return the calibration that the run itself recommends, without when it was made: the same run, the same file."""
-    if report.calibration is None:
-        return None
-    return {key: value for key, value in report.calibration.summary().items() if key != "created"}
-
-
 def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any]:
     """Return one model's rows of summary.csv, under its name."""
-    columns = {name: _cells(column) for name, column in report.summary_columns().items()}
-    mine = [row for row, name in enumerate(columns["model"]) if name == result.name]
-    shared = [name for name in columns if name != "model"]
-    rows = [{name: columns[name][row] for name in shared} for row in mine]
+    rows = [row for row in rows_of(report.summary_columns()) if row.pop("model") == result.name]
     used = next((one for one in report.calibrations if one.name == result.name), None)
     knows = used.fitted_text if used is not None else KNOWS.get(result.name)
     blocks = [
-        {"horizon_m": float(horizon), **_sums_document(sums)}
+        {"horizon_m": horizon, **sums._asdict(), "errors_m": [float(f"{error:.6g}") for error in sums.errors_m]}
         for horizon, sums in zip(report.horizons_m, result.block_sums, strict=False)
         if sums is not None
     ]
     return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows, "blocks": blocks}
 
 
-def _sums_document(sums: BlockSums) -> dict[str, Any]:
-    """Return block sums with the digits that matter."""
-    return sums._asdict() | {"errors_m": [float(f"{error:.6g}") for error in sums.errors_m]}
-
-
 def _baseline_document(report: DropoutReport) -> dict[str, Any] | None:
-    one = report.baseline
+    one, run = report.baseline, report.run_summary
     if one is None:
         return None
-    same = one.is_of(report.run_summary)
-    changes = list(one.changes(report.run_summary))
-    return {"path": one.path, "log": one.log, "tool_version": one.tool_version, "same_recording": same,
-            "changes": changes}  # fmt: skip
+    return {"path": one.path, "log": one.log, "tool_version": one.tool_version, "same_recording": one.is_of(run),
+            "changes": one.changes(run)}  # fmt: skip
 
 
 def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
@@ -200,9 +188,9 @@ def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
     reasons = no_trial(report)
     return [
         {
-            "horizon_m": float(horizon),
-            "trials": int(report.counts.trials[h]),
-            "no_trial": {one.key: int(one.starts[h]) for one in reasons},
+            "horizon_m": horizon,
+            "trials": report.counts.trials[h],
+            "no_trial": {one.key: one.starts[h] for one in reasons},
             "why_none": why_no_trial(report, h),
         }
         for h, horizon in enumerate(report.horizons_m)
@@ -214,16 +202,16 @@ def _event_document(report: DropoutReport) -> dict[str, Any] | None:
     cost = report.event_cost
     if cost is None:
         return None
-    return {"events": cost.events, "with_events": _summary_documents(report, cost.with_events)}
+    with_events = {name: _summary_rows(report, summary) for name, summary in cost.with_events.items()}
+    return {"events": cost.events, "with_events": with_events}
 
 
-def _reference_documents(report: DropoutReport) -> list[dict[str, Any]]:
+def _reference_rows(report: DropoutReport) -> list[dict[str, Any]]:
     """Return the reference's own error at each horizon: what a perfect model would show."""
-    found = report.reference_error
-    if found is None:
+    own = report.reference_error
+    if own is None:
         return []
-    names = ("horizon_m", "std_m", "expected_m", "p95_m")
-    return [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *found))]
+    return rows_of({"horizon_m": report.horizons_m, "std_m": own[0], "expected_m": own[1], "p95_m": own[2]})
 
 
 def _learned_document(report: DropoutReport) -> dict[str, Any] | None:
@@ -231,17 +219,14 @@ def _learned_document(report: DropoutReport) -> dict[str, Any] | None:
     split = report.by_learning
     if split is None:
         return None
-    parts = _summary_documents(report, {"before": split.before, "after": split.after})
-    return {"model": "icr", "learned_s": split.learned_s, "learned_at_distance_m": split.distance_m, **parts}
-
-
-def _summary_documents(report: DropoutReport, summaries: Mapping[str, Summary]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each summary, one a horizon."""
-    names = ("horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m")
     return {
-        name: [dict(zip(names, row, strict=True)) for row in _rows((report.horizons_m, *summary))]
-        for name, summary in summaries.items()
-    }
+        "model": "icr", "learned_s": split.learned_s, "learned_at_distance_m": split.distance_m,
+        "before": _summary_rows(report, split.before), "after": _summary_rows(report, split.after),
+    }  # fmt: skip
+
+
+def _summary_rows(report: DropoutReport, summary: Summary) -> list[dict[str, Any]]:
+    return rows_of({"horizon_m": report.horizons_m, **error_columns(summary)})
 
 
 def _trial_document(trial: ExampleTrial) -> dict[str, Any]:
@@ -252,25 +237,15 @@ def _trial_document(trial: ExampleTrial) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _histogram_rows(report: DropoutReport) -> Iterator[Sequence[Cell]]:
+def _histogram_rows(report: DropoutReport) -> Iterator[tuple[Any, ...]]:
     for result in report.results:
         for horizon, bins in zip(report.horizons_m, result.histograms, strict=True):
-            for left, right, percent in _rows(bins):
-                yield result.name, float(horizon), left, right, percent
+            for row in zip(*bins, strict=True):
+                yield result.name, horizon, *row
 
 
-def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[Sequence[Cell]]:
+def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[tuple[Any, ...]]:
     for rank, trial in enumerate(worst, start=1):
-        document = {"rank": rank, **_trial_document(trial)}
+        document = _trial_document(trial)
         errors = document.pop("errors_m")
-        yield *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)
-
-
-def _rows(columns: Iterable[Sequence[str] | np.ndarray[Any, Any]]) -> Iterator[Sequence[Any]]:
-    return zip(*(_cells(column) for column in columns), strict=True)
-
-
-def _cells(column: Sequence[str] | np.ndarray[Any, Any]) -> list[Any]:
-    """Return a column as plain values, None for what is not a number."""
-    values = column.tolist() if isinstance(column, np.ndarray) else list(column)
-    return [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]
+        yield rank, *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)

@@ -37,10 +37,6 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
 
-LATER_NAMES = (RUN_FILE, CHECKSUM_FILE, *STATES_FILES, *SMOOTHED_FILES, MEASUREMENTS_FILE, EVENTS_FILE, PAGE_FILE,
-               "plots", "dropout")  # fmt: skip
-"""What a run directory may hold that is icrtool's, though the list of its files does not name it."""
-
 
 def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = False) -> None:
     """Refuse a place where a run directory cannot be put, before any work is done for it.
@@ -57,7 +53,7 @@ def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = 
     """
     check_directory(directory, is_run_directory, kind="run directory")
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
-        other = log_of_run(directory) or "data frames"
+        other = next((one.get("path") for one in _inputs_of(directory)), "data frames")
         advice = "name another place, or replace it with --overwrite"
         raise OutputError(directory, f"holds the run of another recording ({other})", advice)
 
@@ -66,9 +62,7 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
     files = [file for file in files_of_log(log) if file.is_file()]
     inputs = _inputs_of(directory)
-    # A run of an older version does not list the places; its paths may be relative to another directory.
-    places = made_from(directory) or {path for one in inputs if Path(path := str(one.get("path"))).is_absolute()}
-    if any(os.path.realpath(file) in places for file in files):
+    if any(os.path.realpath(file) in made_from(directory) for file in files):
         return True
     return bool(inputs) and all(
         any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)
@@ -108,7 +102,7 @@ def write_run(
     sources = [os.path.realpath(file["path"]) for file in run.summary["inputs"]]
     with (
         atomic_directory(
-            directory, is_run_directory, kind="run directory", names=LATER_NAMES, made_from=sources, note=note
+            directory, is_run_directory, kind="run directory", names=(PAGE_FILE,), made_from=sources, note=note
         ) as partial,
         ThreadPoolExecutor(1) as pool,
     ):
@@ -127,12 +121,6 @@ def write_run(
         sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE)}
         sums[states_name] = states_sum.result()
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
-
-
-def log_of_run(directory: Path) -> str | None:
-    """Return the path of the log that the run in a directory was made from; None without one."""
-    inputs = _inputs_of(directory)
-    return str(inputs[0].get("path")) if inputs else None
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:

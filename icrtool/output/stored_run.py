@@ -11,7 +11,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from icrtool.config import Config, parse_config
+from icrtool.config import parse_config
 from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
@@ -66,7 +66,7 @@ def open_run(path: str | Path) -> Run:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
         run_document = check_run_document(document)
-        config = _config(document["config"], directory)
+        config = parse_config(document["config"])
         # Keys that somebody removed have their defaults.
         document["config"] = config.effective()
         table = _read_states(directory, STATES_FILES, sums)
@@ -92,6 +92,8 @@ def open_run(path: str | Path) -> Run:
             summary=run_document,
             directory=directory,
         )
+    except ConfigError as err:
+        raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
     except (OSError, StatesFileError, ValueError, OverflowError) as err:
         raise RunError(directory, f"cannot be read ({err})", FIT_AGAIN) from err
     # What reading took beyond the columns goes back to the system.
@@ -160,13 +162,6 @@ def check_run_document(document: dict[str, Any]) -> RunDocument:
     if document["usable"] != (document["unusable_because"] is None):
         raise ValueError("usable and unusable_because contradict each other - at `$`")
     return cast("RunDocument", document)
-
-
-def _config(document: Mapping[str, Any], directory: Path) -> Config:
-    try:
-        return parse_config(document)
-    except ConfigError as err:
-        raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
 
 
 def _read_document(directory: Path) -> dict[str, Any]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from icrtool.output.text_blocks import Line
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.run import ICR_WORDS
+from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import counted
 
 if TYPE_CHECKING:
@@ -38,6 +41,28 @@ def unusable_lines(summary: RunDocument) -> list[Line]:
 def position_word(summary: RunDocument) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
     return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
+
+
+def role_word(summary: RunDocument, role: Role) -> str:
+    """Return what a stream is called: a position reference that was metric already is no GNSS."""
+    return ROLE_WORDS[role] if summary["gnss"]["datum"] is None else role
+
+
+def excitation_text(excitation: Mapping[str, Any]) -> str:
+    """Return what a drive could show of the ICRs at best, and how it turned; from the key of a run's summary."""
+    verdicts = excitation["verdict"]
+    if set(verdicts.values()) == {"shown"}:
+        shown = "enough to show all three ICRs"
+    else:
+        shown = ", ".join(f"{ICR_WORDS[column]} {verdict}" for column, verdict in verdicts.items())
+    spun = excitation["spun_right_deg"] + excitation["spun_left_deg"]
+    right, left = (f"{excitation[f'turned_{side}_deg']:,.0f}° {side}" for side in ("right", "left"))
+    return f"{shown}; turned {right}, {left}, {spun:,.0f}° of it on the spot"
+
+
+def event_kinds(events: Sequence[Mapping[str, Any]]) -> str:
+    """Return how many slip events there are of each kind, as ``2 skid, 1 spin``."""
+    return ", ".join(f"{count} {kind}" for kind, count in Counter(event["kind"] for event in events).items())
 
 
 def xml_text(text: str) -> str:

@@ -173,6 +173,10 @@ class UsedCalibration(NamedTuple):
         return "fitted to this log" if self.fitted_to_this else "not fitted to this log"
 
 
+NEAR_HORIZONS_M = 1.5
+"""Between horizons that are further apart an interpolated distance is marked as one."""
+
+
 class BudgetDistance(NamedTuple):
     """How far a model's 95th percentile stays within a budget.
 
@@ -193,6 +197,16 @@ class BudgetDistance(NamedTuple):
     between_m: tuple[float, float]
     low_m: float = math.nan
     high_m: float = math.nan
+
+    @property
+    def reach_text(self) -> str:
+        """``14.1 m`` or ``more than 20 m``."""
+        if self.beyond:
+            return f"more than {self.distance_m:g} m"
+        low, high = self.between_m
+        # The error grows faster than the distance: on a straight line between far horizons it comes out too long.
+        far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
+        return f"{self.distance_m:.1f} m{far}"
 
     @property
     def interval_text(self) -> str:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, NamedTuple
+
+import numpy as np
+
+from icrtool.kernels.arrays import Bools, Ints
 
 SlipKind = Literal["immobilised", "slip", "skid", "spin"]
 """Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
@@ -28,3 +33,12 @@ class SlipEvent(NamedTuple):
     distance_m: float
     severity: float
     confidence: float
+
+
+def intervals_in(stamps_ns: Ints, spans_ns: Iterable[tuple[int, int]]) -> Bools:
+    """Return which intervals [k, k + 1) between stamps (n,) share time with a span; the last is none."""
+    inside, ends = np.zeros(len(stamps_ns), np.bool_), np.append(stamps_ns[1:], stamps_ns[-1:])
+    for begin, end in spans_ns:
+        inside[np.searchsorted(ends, begin, side="right") : np.searchsorted(stamps_ns, end)] = True
+    inside[-1:] = False
+    return inside

@@ -151,13 +151,8 @@ def _stamped(
     """Return the column of stamps, its values [s] (rows,), and which rows have numbers in it and in `columns`."""
     (clock,) = _chosen(frame, (("stamp_ns",), ("t_s",)), group, name)
     seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
-    return (
-        clock,
-        seconds,
-        np.logical_and.reduce(
-            [np.isfinite(column) for column in (seconds, *(_numbers(frame, column, name) for column in columns))]
-        ),
-    )
+    values = [seconds, *(_numbers(frame, column, name) for column in columns)]
+    return clock, seconds, np.logical_and.reduce(np.isfinite(values))
 
 
 def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ...]]:

@@ -134,7 +134,6 @@ class Measurements:
     findings : by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
     sections : more numbers for run.json, by section (``wheels``, ``heading``, ``gnss``)
-    position_delay_s : correction of the position's clock that `sensors` holds
     clock_std_s : standard deviation of the time between position and heading after that
     antenna_is_known : its place was configured, or in the log
     warnings : sentences for the user, in the order they were found
@@ -145,7 +144,6 @@ class Measurements:
     sections: dict[str, dict[str, Scalar]]
     streams: tuple[StreamChoice, ...]
     fix_statistics: FixStatistics
-    position_delay_s: float
     clock_std_s: float
     antenna_is_known: bool
     warnings: tuple[str, ...]

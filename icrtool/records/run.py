@@ -13,6 +13,7 @@ from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.open_loop.trials import Drive
+from icrtool.records.events import intervals_in
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
 from icrtool.records.tables import States
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 RUN_SCHEMA = "icrtool/run/1"
 """Version of what the summary of a run holds."""
+
+CALIBRATION_SCHEMA = "icrtool/calibration/1"
+"""Version of calibration files."""
 
 ICR_COLUMNS: tuple[IcrColumn, ...] = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), strict=True))
@@ -131,10 +135,7 @@ class Run:
     @property
     def slipping(self) -> Bools:
         """Whether the interval after a state lies in a slip event (n,)."""
-        begin, end, inside = self.table.stamp_ns[:-1], self.table.stamp_ns[1:], np.zeros(len(self.table), np.bool_)
-        for event in self.sensors.events:
-            inside[:-1] |= (end > event.begin_ns) & (begin < event.end_ns)
-        return inside
+        return intervals_in(self.table.stamp_ns, ((event.begin_ns, event.end_ns) for event in self.sensors.events))
 
     @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:

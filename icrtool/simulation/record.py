@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
@@ -20,31 +18,8 @@ LARGEST_SBAS_STD_M = 0.6
 """NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
 
 
-@dataclass(frozen=True, slots=True)
-class TruthTable:
-    """The truth at every wheel stamp: the columns of the truth CSV, (n,) each.
-
-    Attributes
-    ----------
-    t_s : since the first wheel stamp
-    north_m, east_m : of the body origin, about `DATUM`; heading_rad : unwrapped
-    v_left_mps, v_right_mps : true track speeds at that moment
-    """
-
-    stamp_ns: Ints
-    t_s: Floats
-    north_m: Floats
-    east_m: Floats
-    heading_rad: Floats
-    y_icr_right_m: Floats
-    y_icr_left_m: Floats
-    x_icr_m: Floats
-    v_left_mps: Floats
-    v_right_mps: Floats
-
-    def columns(self) -> dict[str, Floats | Ints]:
-        """Return the columns by name, in the order of the file."""
-        return {column.name: getattr(self, column.name) for column in fields(self)}
+TruthTable = dict[str, Floats | Ints]
+"""The truth at every wheel stamp: the columns of the truth CSV, (n,) each."""
 
 
 def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumns, TruthTable]:
@@ -93,13 +68,12 @@ def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> Se
 
 
 def truth_table(truth: Truth, times: Floats) -> TruthTable:
-    """Return the truth at times (n,) [s]."""
-    row, pose = truth.rows(times), truth.poses(times)
-    right, left, x = truth.icrs_m[truth.which[row]].T
-    north, east, heading = pose.T
-    since = times - times[0]
-    speeds = (truth.v_left_mps[row], truth.v_right_mps[row])
-    return TruthTable(stamps(times), since, north, east, heading, right, left, x, *speeds)
+    """Return the truth at times (n,) [s]: the body origin about `DATUM`, headings unwrapped, true track speeds."""
+    row = truth.rows(times)
+    columns: TruthTable = {"stamp_ns": stamps(times), "t_s": times - times[0]}
+    columns |= zip(("north_m", "east_m", "heading_rad"), truth.poses(times).T, strict=True)
+    columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs_m[truth.which[row]].T, strict=True)
+    return columns | {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
 
 
 def stamps(times: Floats) -> Ints:

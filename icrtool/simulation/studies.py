@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
@@ -237,6 +237,19 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
         importlib.import_module(f"icrtool.simulation.{module}"), function
     )
     return study(request, progress)
+
+
+def table_of(settings: Sequence[Mapping[str, float | str]], found: Sequence[Mapping[str, Floats]]) -> dict[str, Column]:
+    """Return the columns of the CSV, a row a run: the settings of each level, and the numbers (runs,) found of it."""
+    runs = len(next(iter(found[0].values())))
+    columns: dict[str, Column] = {}
+    for name in settings[0]:
+        values = [one[name] for one in settings for _ in range(runs)]
+        is_text = any(isinstance(value, str) for value in values)
+        columns[name] = [str(value) for value in values] if is_text else np.array(values, np.float64)
+    columns["run"] = np.tile(np.arange(runs), len(settings))
+    numbers = [name for name, values in found[0].items() if values.ndim == 1]
+    return columns | {name: np.concatenate([one[name] for one in found]) for name in numbers}
 
 
 def statistics(values: Floats) -> dict[str, float]:

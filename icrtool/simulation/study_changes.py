@@ -14,7 +14,7 @@ from icrtool.simulation.drives import Icrs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, measure_times, trace
-from icrtool.simulation.study_runs import Chunk, Progress, Scenario
+from icrtool.simulation.study_runs import Progress, Scenario, StudyRun
 from icrtool.simulation.study_sweeps import levels_of, run_levels, spread
 
 CHANGE_TIMES_S = (175.0, 350.0)
@@ -51,12 +51,11 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
     times = [time for time, _ in plan.changes]
     edges = [*times, plan.duration_s]
 
-    def measure(chunk: Chunk) -> dict[str, Floats]:
-        columns = {"inverted": inverted(chunk).astype(np.float64)}
+    def measure(run: StudyRun) -> dict[str, float | Floats]:
+        numbers: dict[str, float | Floats] = {"inverted": inverted(run)}
         for number, (begin, end) in enumerate(pairwise(edges), start=1):
-            found = measure_times(chunk, begin, end)
-            columns |= {f"change{number}_{name}": values for name, values in found.items()}
-        return {**columns, **trace(chunk), "zoom": _zoom(chunk, times[0])}
+            numbers |= {f"change{number}_{name}": value for name, value in measure_times(run, begin, end).items()}
+        return {**numbers, "trace": trace(run), "zoom": _zoom(run, times[0])}
 
     columns, records, found = run_levels(levels, request, measure, progress)
     findings = []
@@ -85,12 +84,11 @@ def study_icr_change(request: StudyRequest, progress: Progress | None) -> StudyR
     return StudyResult(request, columns, records, tuple(findings), curves)
 
 
-def _zoom(chunk: Chunk, since_s: float) -> Floats:
-    """Return time since the change and the ICRs (runs, k, 4) around it."""
-    rows = np.flatnonzero((chunk.t_s >= since_s - 1.0) & (chunk.t_s <= since_s + ZOOM_S))
+def _zoom(run: StudyRun, since_s: float) -> Floats:
+    """Return time since the change and the ICRs (k, 4) around it."""
+    rows = np.flatnonzero((run.t_s >= since_s - 1.0) & (run.t_s <= since_s + ZOOM_S))
     rows = rows[:: 1 + len(rows) // ZOOM_STEPS]
-    times = np.broadcast_to((chunk.t_s[rows] - since_s)[:, None], (len(chunk.x), len(rows), 1))
-    return np.concatenate([times, chunk.x[:, rows, 3:]], axis=2)
+    return np.column_stack([run.t_s[rows] - since_s, run.x[rows, 3:]])
 
 
 def study_turn_radius(request: StudyRequest, progress: Progress | None) -> StudyResult:
@@ -110,8 +108,8 @@ def study_turn_radius(request: StudyRequest, progress: Progress | None) -> Study
     levels = levels_of(request, request.values, on_circle)
     since = levels[0].scenario.plan.changes[0][0]
 
-    def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {"inverted": inverted(chunk).astype(np.float64), **measure_times(chunk, since)}
+    def measure(run: StudyRun) -> dict[str, float | Floats]:
+        return {"inverted": inverted(run), **measure_times(run, since)}
 
     columns, records, found = run_levels(levels, request, measure, progress)
     findings = []

@@ -9,9 +9,9 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
-from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult
-from icrtool.simulation.study_measures import inverted, trace
-from icrtool.simulation.study_runs import Chunk, Progress, run_scenarios, with_start
+from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, table_of
+from icrtool.simulation.study_measures import ICR_NAMES, inverted, trace
+from icrtool.simulation.study_runs import Progress, StudyRun, run_scenarios, with_start
 from icrtool.simulation.study_sweeps import base_scenario
 
 GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": GUARDED}
@@ -35,41 +35,25 @@ def study_initial(request: StudyRequest, progress: Progress | None) -> StudyResu
         for name, right, left in cells
     ]
     found = run_scenarios(scenarios, request.runs, request.seed, _measure, progress=progress)
-    runs = request.runs
-    columns: dict[str, Column] = {
-        "series": [name for name, _, _ in cells for _ in range(runs)],
-        "start_y_icr_right_m": np.repeat([right for _, right, _ in cells], runs),
-        "start_y_icr_left_m": np.repeat([left for _, _, left in cells], runs),
-        "run": np.tile(np.arange(runs), len(cells)),
-    }
-    for name in found[0]:
-        if name != "trace":
-            columns[name] = np.concatenate([one[name] for one in found])
+    starts: list[dict[str, float | str]] = [
+        dict(zip(("series", "start_y_icr_right_m", "start_y_icr_left_m"), cell, strict=True)) for cell in cells
+    ]
     levels = tuple(
-        {
-            "series": name,
-            "start_y_icr_right_m": right,
-            "start_y_icr_left_m": left,
-            **{fate: float(one[fate].mean()) for fate in ("converged", "inverted", "elsewhere")},
-        }
-        for (name, right, left), one in zip(cells, found, strict=True)
+        {**start, **{fate: float(one[fate].mean()) for fate in ("converged", "inverted", "elsewhere")}}
+        for start, one in zip(starts, found, strict=True)
     )
-    return StudyResult(request, columns, levels, tuple(_findings(levels)), _curves(request, cells, found))
+    return StudyResult(
+        request, table_of(starts, found), levels, tuple(_findings(levels)), _curves(request, cells, found)
+    )
 
 
-def _measure(chunk: Chunk) -> dict[str, Floats]:
-    last = max(1, chunk.x.shape[1] // LAST_SHARE)
-    error = np.abs(chunk.x[:, -last:, 3:] - chunk.true_icrs_m[-last:]).mean(axis=1)
-    near, wrong = (error < CONVERGED_M).all(axis=1), inverted(chunk)
-    return {
-        "converged": near.astype(np.float64),
-        "inverted": (wrong & ~near).astype(np.float64),
-        "elsewhere": (~wrong & ~near).astype(np.float64),
-        "final_y_icr_right_m": chunk.x[:, -1, 3],
-        "final_y_icr_left_m": chunk.x[:, -1, 4],
-        "final_x_icr_m": chunk.x[:, -1, 5],
-        **trace(chunk),
-    }
+def _measure(run: StudyRun) -> dict[str, float | Floats]:
+    last = max(1, len(run.x) // LAST_SHARE)
+    error = np.abs(run.x[-last:, 3:] - run.truth[-last:, 3:]).mean(axis=0)
+    near, wrong = float((error < CONVERGED_M).all()), inverted(run)
+    final = {f"final_{name}_m": run.x[-1, 3 + place] for place, name in enumerate(ICR_NAMES)}
+    fates = {"converged": near, "inverted": wrong * (1 - near), "elsewhere": (1 - wrong) * (1 - near)}
+    return {**fates, **final, "trace": trace(run)}
 
 
 def _findings(levels: tuple[dict[str, Any], ...]) -> list[StudyNumber]:

@@ -1,4 +1,4 @@
-"""Filter many simulated runs, chunk by chunk on all cores; each chunk is reduced to the numbers a study needs."""
+"""Filter many simulated runs on all cores; each is reduced at once to the numbers that a study needs of it."""
 
 from __future__ import annotations
 
@@ -6,26 +6,34 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import cast
 
 import numpy as np
 
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
+from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.filter.batch_filter import Batch, run_batch
+from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, Icrs, Readings, Sensors, Truth, check_drive, drive_plan, sense
-from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.drives import (
+    DrivePlan,
+    Icrs,
+    Readings,
+    Sensors,
+    Truth,
+    check_drive,
+    drive_plan,
+    sample_times,
+    sense,
+)
+from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 
 Progress = Callable[[float], None]
-
-CHUNK_STATES = 160_000
-"""Recorded states of a chunk, over all its runs: some 15 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +46,8 @@ class Scenario:
     vary_path : every run of a ``curved`` path has another phase
     inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
     guard : sign guard, of `icrtool.kernels.kinematics`; other than GUARDED the filter takes the Euler steps of Eq. 14
+    model_icr_std_m : the truth obeys the filter's model, Eq. 14 with process noise drawn from Q (Eq. 30), from ICRs
+        drawn with this standard deviation on; None: constant ICRs and exact kinematics
     """
 
     plan: DrivePlan
@@ -46,40 +56,36 @@ class Scenario:
     vary_path: bool = True
     inflate: bool = False
     guard: int = GUARDED
+    model_icr_std_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
-    """The filtered runs of a part of a scenario.
+class StudyRun:
+    """A filtered run.
 
     Attributes
     ----------
     t_s : (k,) times of the recorded states, on the truth's clock
-    x : (runs, k, 6) states; std : (runs, k, 6) square roots of the diagonal of P
-    true_icrs_m : (k, 3), the same in every run
-    stops_s : (s,) times at which the whole covariance was kept; P : (runs, s, 6, 6)
-    true_pose : (runs, s, 3) there
-    truths : the true motion of every run
-    gnss_nis : (runs, m), heading_nis : (runs, h), NaN where unseen
+    x : (k, 6) states; std : (k, 6) square roots of the diagonal of P
+    truth : (k, 6) true states
+    stops : (s,) rows at which the whole covariance was kept; P : (s, 6, 6)
+    motion : the true motion; None where the truth obeys the filter's model
+    gnss_nis : (m,), heading_nis : (h,), NaN where unseen
     """
 
-    scenario: Scenario
     t_s: Floats
     x: Floats
     std: Floats
-    true_icrs_m: Floats
-    stops_s: Floats
+    truth: Floats
+    stops: Ints
     P: Floats
-    true_pose: Floats
-    truths: tuple[Truth, ...]
+    motion: Truth | None
     gnss_nis: Floats
     heading_nis: Floats
 
 
-Job = TypeVar("Job")
-Done = TypeVar("Done")
-Measure = Callable[[Chunk], dict[str, Floats]]
-"""Reduces a chunk to columns, one row a run."""
+Measure = Callable[[StudyRun], dict[str, float | Floats]]
+"""Reduces a run to numbers, or arrays as large in all runs of a scenario."""
 
 
 def with_start(config: Config, icrs_m: Icrs, std_m: float | None = None) -> Config:
@@ -100,13 +106,13 @@ def run_scenarios(
     stops_s: tuple[float, ...] = (),
     progress: Progress | None = None,
 ) -> list[dict[str, Floats]]:
-    """Simulate and filter every scenario `runs` times.
+    """Simulate and filter every scenario `runs` times, on all cores (the kernels free the GIL).
 
     Parameters
     ----------
     seed : run i of every scenario draws from the generator seeded (seed, i): scenarios differ by their setting alone,
         and a run does not depend on how many there are or on the number of cores
-    measure : what to keep of a chunk
+    measure : what to keep of a run
     stops_s : times at which the whole covariance is kept; it is kept at the end in any case
 
     Returns
@@ -115,83 +121,91 @@ def run_scenarios(
     """
     for scenario in scenarios:
         check_drive(scenario.plan, scenario.sensors)
-    jobs = [
-        (number, part)
-        for number, scenario in enumerate(scenarios)
-        for part in chunks(runs, int(scenario.plan.duration_s * scenario.sensors.wheel_rate_hz))
-    ]
+    jobs = [(scenario, run) for scenario in scenarios for run in range(runs)]
 
-    def work(job: tuple[int, range]) -> dict[str, Floats]:
-        number, part = job
-        return measure(_run_chunk(scenarios[number], part, seed, stops_s))
+    def work(job: tuple[Scenario, int]) -> dict[str, float | Floats]:
+        return measure(_filtered(*job, seed, stops_s))
 
-    parts: list[list[dict[str, Floats]]] = [[] for _ in scenarios]
-    for (number, _), found in zip(jobs, on_all_cores(work, jobs, progress), strict=True):
-        parts[number].append(found)
-    return [joined(some) for some in parts]
-
-
-def chunks(runs: int, states: int) -> list[range]:
-    """Cut runs of so many states each into chunks."""
-    size = max(1, CHUNK_STATES // max(states, 1))
-    return [range(first, min(first + size, runs)) for first in range(0, runs, size)]
-
-
-def on_all_cores(work: Callable[[Job], Done], jobs: Sequence[Job], progress: Progress | None) -> list[Done]:
-    """Do every job, in threads (the kernels free the GIL); results in the order of the jobs."""
+    done = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        done = []
-        for result in pool.map(work, jobs):
-            done.append(result)
+        for found in pool.map(work, jobs):
+            done.append(found)
             if progress is not None:
                 progress(len(done) / len(jobs))
-    return done
+    of_scenarios = (done[first : first + runs] for first in range(0, len(done), runs))
+    return [{name: np.array([one[name] for one in some]) for name in some[0]} for some in of_scenarios]
 
 
-def joined(parts: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
-    """Return the columns of all chunks, concatenated."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _run_chunk(scenario: Scenario, runs: range, seed: int, stops_s: tuple[float, ...]) -> Chunk:
-    truths, readings = zip(*(_simulate(scenario, run, seed) for run in runs), strict=True)
+def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...]) -> StudyRun:
+    simulate = _simulate if scenario.model_icr_std_m is None else _simulate_model
+    readings, truth, motion = simulate(scenario, np.random.default_rng((seed, run)))
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
-    setup = set_up_filter(
-        sensors_as_sent(readings_log(readings[0], scenario.sensors), scenario.config),
-        scenario.config,
-        changes_s=changes,
-    )
-    data = setup.data
-    stops = np.unique(np.append(np.searchsorted(data.wheel_t, stops_s, side="right") - 1, len(data.wheel_t) - 1))
-    batch = stack(readings, setup, stops[data.wheel_t[stops] >= setup.t0])
+    setup = _set_up(readings, scenario, changes)
     parameters = setup.parameters
     if scenario.guard != GUARDED:
         parameters = parameters._replace(guard=scenario.guard, step_heading=0.0)
-    out = run_batch(batch, parameters)
-    times = readings[0].wheel_t[len(data.wheel_t) - out.x.shape[1] :]
-    at_stops = readings[0].wheel_t[batch.stops]
-    return Chunk(
-        scenario=scenario,
+    first = int(np.searchsorted(setup.data.wheel_t, setup.t0))
+    times = readings.wheel_t[first:]
+    stops = np.unique(np.append(np.searchsorted(times, stops_s, side="right") - 1, len(times) - 1))
+    stops = stops[stops >= 0]
+    out = run_ekf(setup.data, setup.t0, setup.x0, setup.P0, parameters, stops.tolist())
+    return StudyRun(
         t_s=times,
         x=out.x,
         std=np.sqrt(np.maximum(out.variance, 0.0)),
-        true_icrs_m=truths[0].icrs_m[truths[0].which[truths[0].rows(times)]],
-        stops_s=at_stops,
-        P=out.P[..., PLACES],
-        true_pose=np.array([truth.poses(at_stops) for truth in truths]),
-        truths=truths,
+        truth=truth[first:],
+        stops=stops,
+        P=out.P_at_stops[:, PLACES],
+        motion=motion,
         gnss_nis=out.gnss_nis,
         heading_nis=out.heading_nis,
     )
 
 
-def _simulate(scenario: Scenario, run: int, seed: int) -> tuple[Truth, Readings]:
-    rng = np.random.default_rng((seed, run))
+def _set_up(readings: Readings, scenario: Scenario, changes_s: tuple[float, ...] = ()) -> FilterSetup:
+    sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
+    return set_up_filter(sensors, scenario.config, changes_s=changes_s)
+
+
+def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, Truth]:
+    """Return the measurements of a drive, its true states at the wheel stamps (n, 6), and its motion."""
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
     if scenario.vary_path and isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
-    truth = drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
-    return truth, sense(truth, scenario.sensors, plan.duration_s, rng)
+    motion = drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
+    readings = sense(motion, scenario.sensors, plan.duration_s, rng)
+    icrs = motion.icrs_m[motion.which[motion.rows(readings.wheel_t)]]
+    return readings, np.column_stack([motion.poses(readings.wheel_t), icrs]), motion
+
+
+def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, None]:
+    """Return the measurements of true states (n, 6) that obey the filter's model, and those."""
+    plan, sensors = scenario.plan, scenario.sensors
+    t = sample_times(sensors.wheel_rate_hz, plan.duration_s)
+    speeds = track_speeds(*plan_body(cast(PathPlan, plan.path), t, plan.icrs_m), plan.icrs_m)
+    blank = _readings(np.zeros((len(t), 6)), t, speeds, sensors, np.random.default_rng(0))
+    parameters = _set_up(blank, scenario).parameters
+    icrs = np.array(plan.icrs_m) + rng.normal(0.0, scenario.model_icr_std_m or 0.0, 3)
+    x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
+    std, noise = np.sqrt(np.array(parameters.process_variance)), rng.normal(0.0, 1.0, (len(t), 6))
+    states = model_states(x0, t, *speeds, std, parameters.rate_invariant, noise)
+    return _readings(states, t, speeds, sensors, rng), states, None
+
+
+def _readings(
+    states: Floats, wheel_t: Floats, speeds: tuple[Floats, Floats], sensors: Sensors, rng: np.random.Generator
+) -> Readings:
+    """Measure states (n, 6) at the wheel stamps that fall together with a fix or a heading."""
+    fix, sample = (
+        np.arange(0, len(wheel_t), max(1, round(sensors.wheel_rate_hz / rate)))
+        for rate in (sensors.gnss_rate_hz, sensors.heading_rate_hz)
+    )
+    return Readings(
+        wheel_t, *speeds, *speeds,
+        wheel_t[fix], states[fix, :2] + rng.normal(0.0, sensors.gnss_std_m, (len(fix), 2)),
+        wheel_t[sample], states[sample, 2] + rng.normal(0.0, sensors.heading_std_rad, len(sample)),
+        np.zeros(len(sample)),
+    )  # fmt: skip
 
 
 def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
@@ -215,29 +229,4 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
         inputs=(),
         rejected_fixes={},
         warnings=(),
-    )
-
-
-def stack(readings: Sequence[Readings], setup: FilterSetup, stops: Ints) -> Batch:
-    """Return readings of the same stamps as one batch; each run starts at its own first fix and heading."""
-    data, x0 = setup.data, np.tile(setup.x0, (len(readings), 1))
-    fix = int(np.searchsorted(data.gnss_t, setup.t0, side="right")) - 1
-    sample = int(np.searchsorted(data.heading_t, setup.t0, side="right")) - 1
-    x0[:, :2] = [one.gnss_m[fix] for one in readings]
-    x0[:, 2] = [one.heading_rad[sample] for one in readings]
-    return Batch(
-        wheel_t=data.wheel_t,
-        gnss_t=data.gnss_t,
-        heading_t=data.heading_t,
-        change_t=data.change_t,
-        gnss_r=data.gnss_r,
-        heading_r=data.heading_r,
-        v_left=np.array([one.v_left_mps for one in readings]),
-        v_right=np.array([one.v_right_mps for one in readings]),
-        gnss_z=np.array([one.gnss_m for one in readings]),
-        heading_z=np.array([one.heading_rad for one in readings]),
-        t0=setup.t0,
-        x0=x0,
-        P0=setup.P0[np.triu_indices(6)],
-        stops=stops,
     )

@@ -11,12 +11,9 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.simulation.drives import Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
-from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics
+from icrtool.simulation.studies import Column, StudyNumber, StudyRequest, StudyResult, statistics, table_of
 from icrtool.simulation.study_measures import ICR_NAMES, measure_errors, measure_times, open_loop_p95, trace
-from icrtool.simulation.study_runs import Chunk, Measure, Progress, Scenario, run_scenarios
-
-HIDDEN = frozenset({"trace", "zoom"})
-"""Columns for the picture, not for the table."""
+from icrtool.simulation.study_runs import Measure, Progress, Scenario, StudyRun, run_scenarios
 
 PATH_POINTS = 2000
 
@@ -62,21 +59,12 @@ def run_levels(
 ) -> tuple[dict[str, Column], tuple[dict[str, Any], ...], list[dict[str, Floats]]]:
     """Run every level; return the CSV's columns, the levels' statistics, and all columns by level."""
     found = run_scenarios([level.scenario for level in levels], request.runs, request.seed, measure, progress=progress)
-    values = [level.value for level in levels for _ in range(request.runs)]
-    names = any(isinstance(value, str) for value in values)
-    columns: dict[str, Column] = {
-        "series": [level.series for level in levels for _ in range(request.runs)],
-        "value": [str(value) for value in values] if names else np.array(values, np.float64),
-        "run": np.tile(np.arange(request.runs), len(levels)),
-    }
-    shown = [name for name in found[0] if name not in HIDDEN]
-    for name in shown:
-        columns[name] = np.concatenate([one[name] for one in found])
+    settings: list[dict[str, float | str]] = [{"series": level.series, "value": level.value} for level in levels]
     records = tuple(
-        {"series": level.series, "value": level.value, "metrics": {name: statistics(one[name]) for name in shown}}
-        for level, one in zip(levels, found, strict=True)
+        {**setting, "metrics": {name: statistics(values) for name, values in one.items() if values.ndim == 1}}
+        for setting, one in zip(settings, found, strict=True)
     )
-    return columns, records, found
+    return table_of(settings, found), records, found
 
 
 def spread(values: Floats) -> tuple[float, float, float]:
@@ -94,7 +82,7 @@ def study_convergence(request: StudyRequest, progress: Progress | None) -> Study
     columns, records, found = run_levels(
         levels,
         request,
-        lambda chunk: {**measure_times(chunk), **measure_errors(chunk), **trace(chunk, SHOWN_S)},
+        lambda run: {**measure_times(run), **measure_errors(run), "trace": trace(run, SHOWN_S)},
         progress,
     )
     findings = [
@@ -169,8 +157,8 @@ def study_gnss(request: StudyRequest, progress: Progress | None) -> StudyResult:
     """Return ICR errors and open-loop errors by noise of the GNSS (Figs. 35-37)."""
     width = cast(float, request.config.robot.track_width_m)
 
-    def measure(chunk: Chunk) -> dict[str, Floats]:
-        return {**measure_errors(chunk), **measure_times(chunk), **open_loop_p95(chunk, width)}
+    def measure(run: StudyRun) -> dict[str, float | Floats]:
+        return {**measure_errors(run), **measure_times(run), **open_loop_p95(run, width)}
 
     levels = levels_of(request, request.values, lambda base, value: with_sensors(base, gnss_std_m=value))
     columns, records, found = run_levels(levels, request, measure, progress)

@@ -111,12 +111,6 @@ class HeadingEstimate:
     spread: float
 
     @property
-    def has_offset(self) -> bool:
-        """Whether the offset of the first absolute heading is significant."""
-        offset = math.remainder(float(self.constants[OFFSET]), 2.0 * math.pi)
-        return abs(offset) > LEAST_OFFSET_SIGMAS * float(self.constants_std[OFFSET])
-
-    @property
     def median_std(self) -> float:
         """Median standard deviation of the smoothed heading [rad]."""
         return float(np.median(self.smoothed_std))
@@ -154,10 +148,12 @@ def estimate_heading(
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
         noises = problem.choose(grids, problem.usual() | noises)
     found = problem.solve(noises)
-    if absolute and math.isfinite(absolute[0].aligned_std) and not found.has_offset:
-        # not significant: that of a sensor mounted along the robot
-        problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
-        found = problem.solve(noises)
+    if absolute and math.isfinite(absolute[0].aligned_std):
+        offset = math.remainder(float(found.constants[OFFSET]), 2.0 * math.pi)
+        if abs(offset) <= LEAST_OFFSET_SIGMAS * float(found.constants_std[OFFSET]):
+            # not significant: that of a sensor mounted along the robot
+            problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
+            found = problem.solve(noises)
     return found
 
 

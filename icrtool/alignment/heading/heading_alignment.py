@@ -133,25 +133,17 @@ class HeadingAlignment:
         return 0.0 if self.is_estimated else self.applied_offset_rad
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json, angles in degrees, None for what is not known."""
-        degrees = {
-            "offset_deg": self.offset_rad,
-            "offset_std_deg": self.offset_std_rad,
-            "scatter_deg": self.scatter_rad,
-            "applied_offset_deg": self.applied_offset_rad,
-            "applied_std_deg": self.applied_std_rad,
-            "std_deg": self.std_rad,
-        }
-        numbers = {name: math.degrees(value) if math.isfinite(value) else None for name, value in degrees.items()}
+        """Return the numbers for run.json, angles in degrees, NaN for what is not known."""
+        angles = ("offset", "offset_std", "scatter", "applied_offset", "applied_std", "std")
         return {
             "source": self.source,
             "parts": self.parts or None,
             "windows": self.windows,
             "applied_mirror": self.applied_mirror,
-            **numbers,
+            **{f"{name}_deg": math.degrees(getattr(self, f"{name}_rad")) for name in angles},
             **self.name.summary(),
-            "agreement": self.agreement if math.isfinite(self.agreement) else None,
-            "mirrored_agreement": self.mirrored_agreement if math.isfinite(self.mirrored_agreement) else None,
+            "agreement": self.agreement,
+            "mirrored_agreement": self.mirrored_agreement,
         }
 
 

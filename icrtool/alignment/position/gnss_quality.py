@@ -45,6 +45,7 @@ NOISIER = 1.5
 """White noise from step to step that is this many times what the messages state is used instead."""
 
 SHORTEST_LOSS_S = 2.0
+NO_SPANS: Ints = np.empty((0, 2), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +99,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
         misreported=misreported,
         down_weighted=down,
         statistics=FixStatistics(_class_std(gnss, kinds), white, gnss.stamp_ns[steps.jump_row], steps.jump_m),
-        losses_ns=_losses(gnss.stamp_ns, fixed) if norm else _spans([]),
+        losses_ns=_losses(gnss.stamp_ns, fixed) if norm else NO_SPANS,
         warnings=(),
     )
     notes = _notes(quality, stated, raised, changes=changes)
@@ -163,18 +164,14 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     Others before the first and after the last fixed one make a span with the log's end.
     """
     rows = np.flatnonzero(fixed)
-    begin, end = rows[:-1], rows[1:]
-    lost = (end - begin > 1) & (stamps[end] - stamps[begin] > SHORTEST_LOSS_S * 1e9)
-    spans = [(int(stamps[i]), int(stamps[k])) for i, k in zip(begin[lost], end[lost], strict=True)]
-    if len(rows) and stamps[rows[0]] - stamps[0] > SHORTEST_LOSS_S * 1e9:
-        spans.insert(0, (int(stamps[0]), int(stamps[rows[0]])))
-    if len(rows) and rows[-1] + 1 < len(stamps) and stamps[-1] - stamps[rows[-1]] > SHORTEST_LOSS_S * 1e9:
-        spans.append((int(stamps[rows[-1]]), int(stamps[-1]) + 1))
-    return _spans(spans)
-
-
-def _spans(pairs: list[tuple[int, int]]) -> Ints:
-    return np.array(pairs, np.int64).reshape(-1, 2)
+    if not len(rows):
+        return NO_SPANS
+    edge = np.concatenate([[-1], rows, [len(stamps)]])
+    times = stamps[np.clip(edge, 0, len(stamps) - 1)]
+    lost = (np.diff(edge) > 1) & (np.diff(times) > SHORTEST_LOSS_S * 1e9)
+    # the last span includes the last fix
+    ends = times[1:] + (edge[1:] == len(stamps))
+    return np.column_stack([times[:-1][lost], ends[lost]])
 
 
 def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:

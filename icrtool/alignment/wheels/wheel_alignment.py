@@ -69,10 +69,9 @@ class WheelAlignment:
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers for run.json; ``applied_left_scale`` and its like hold the configured scale."""
-        known = math.isfinite(self.scale)
         return {
-            "scale": self.scale if known else None,
-            "scale_std": self.scale_std if known else None,
+            "scale": self.scale,
+            "scale_std": self.scale_std,
             "applied_scale": self.applied_scale,
             "applied_left_scale": self.applied[0] * self.configured[0],
             "applied_right_scale": self.applied[1] * self.configured[1],

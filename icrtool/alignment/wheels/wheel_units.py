@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,13 +35,11 @@ UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Metres by the position reference per unit of the wheels: median, its standard deviation, windows used."""
+class Scale(NamedTuple):
+    """Metres by the position reference per unit of the wheels: median, and its standard deviation."""
 
     value: float
     std: float
-    windows: int
 
 
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
@@ -157,7 +156,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
         return None
     ratio = chord[straight] / distance[straight]
     centre = float(np.median(ratio))
-    return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)), len(ratio))
+    return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)))
 
 
 def _metres_per_unit(

@@ -2,12 +2,13 @@
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
 The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
-`filter_rows` is the one event loop: the filter, the smoother's forward pass and the runs of a study call it.
+`filter_rows` is the one event loop: the filter and the smoother's forward pass call it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -236,11 +237,17 @@ def filter_rows(  # noqa: C901, PLR0912 - the order of events, in one place
     return count
 
 
-def run_ekf(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
+def run_ekf(
+    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, stops: Sequence[int] = ()
+) -> FilterOutput:
     """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
 
     Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
     from t0 on, after all updates at its stamp. At equal stamps: wheel, GNSS, heading.
+
+    Parameters
+    ----------
+    stops : rows of recorded states, ascending, at which the whole covariance is kept
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
     state, events = start_state(data, t0, x0, P0), last + len(data.gnss_t) + len(data.heading_t)
@@ -248,12 +255,16 @@ def run_ekf(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: F
     block = empty_output(data, min(size, last - first))
     # The kernel writes row by row; here each column is contiguous, so that the states need no copy of them.
     x, variance, distance = np.empty((6, last - first)).T, np.empty((6, last - first)).T, np.empty(last - first)
-    for begin, end in pairwise((*range(first, last, size), last)):
+    kept = []
+    for begin, end in pairwise(sorted({*range(first, last, size), *(first + stop + 1 for stop in stops), last})):
         count, rows = end - begin, slice(begin - first, end - first)
         out = block._replace(x=block.x[:count], variance=block.variance[:count], distance=block.distance[:count])
         filter_rows(data, begin, end, state, parameters, out, None)
         x[rows], variance[rows], distance[rows] = out.x, out.variance, out.distance
-    return block._replace(x=x, variance=variance, distance=distance, P=state.P)
+        if end - first - 1 in stops:
+            kept.append(state.P.copy())
+    at_stops = np.array(kept).reshape(-1, len(state.P))
+    return block._replace(x=x, variance=variance, distance=distance, P=state.P, P_at_stops=at_stops)
 
 
 def start_state(data: FilterInputs, t0: float, x0: Floats, P0: Floats) -> FilterState:

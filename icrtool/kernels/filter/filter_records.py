@@ -92,6 +92,7 @@ class FilterOutput(NamedTuple):
     gnss_residual : (m, 2) fix minus estimate after the update [m]
     heading_innovation : (h,) [rad]
     P : (21,) upper triangle of the covariance at the end, row by row
+    P_at_stops : (s, 21) likewise at the rows that were asked for
     """
 
     x: Floats
@@ -105,6 +106,7 @@ class FilterOutput(NamedTuple):
     heading_code: Codes
     heading_innovation: Floats
     P: Floats
+    P_at_stops: Floats = np.zeros((0, 21))
 
 
 class FilterState(NamedTuple):

@@ -40,10 +40,7 @@ class HeadingEvents(NamedTuple):
 
     def cut(self, count: int) -> HeadingEvents:
         """Return the first events."""
-        return HeadingEvents(
-            self.dt[:count], self.turn[:count], self.extra[:count], self.z[:count], self.h[:count], self.r[:count],
-            self.angle[:count],
-        )  # fmt: skip
+        return HeadingEvents._make(column[:count] for column in self)
 
 
 class HeadingModel(NamedTuple):
@@ -91,6 +88,15 @@ def heading_log_likelihood(events: HeadingEvents, model: HeadingModel) -> float:
 
 
 @njit
+def _store(x: Floats, P: Floats, states: Floats, covariances: Floats, i: int) -> None:
+    # Element by element: numba takes seconds to compile the assignment of an array to a row of a larger one.
+    for a in range(len(x)):
+        states[i, a] = x[a]
+        for b in range(len(x)):
+            covariances[i, a, b] = P[a, b]
+
+
+@njit
 def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:  # noqa: C901, PLR0912 - one event, in one place
     n, k = events.h.shape
     x, P = model.x, model.P
@@ -115,7 +121,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> 
             P[a, a] += model.q[a] * (dt if model.decay[a] == 0.0 else (1.0 - phi[a] ** 2) / (2.0 * model.decay[a]))
         P[0, 0] += events.extra[i]
         if stored:
-            out.x_predicted[i], out.P_predicted[i] = x, P
+            _store(x, P, out.x_predicted, out.P_predicted, i)
         S, y = events.r[i], events.z[i]
         for a in range(k):
             y -= events.h[i, a] * x[a]
@@ -140,7 +146,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> 
                 if not (model.fixed[a] and model.fixed[b]):
                     P[a, b] -= Ph[a] * Ph[b] / S
         if stored:
-            out.x[i], out.P[i] = x, P
+            _store(x, P, out.x, out.P, i)
     return likelihood
 
 

@@ -6,19 +6,38 @@ No compiled kernel is here: a process that only reads or draws these records nee
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 
-if TYPE_CHECKING:
-    from icrtool.kernels.open_loop.error_statistics import Blocks
-
 SHARES = {"p50": 0.5, "p95": 0.95}
 
 MOST_BLOCKS = 16
 """More would narrow an interval by less than 2 %: the factor of Student's distribution is 2.13, without limit 1.96."""
+
+
+BLOCK_PARTS = 4
+"""Blocks begin at every quarter of their length."""
+
+
+class Blocks(NamedTuple):
+    """The path of one horizon's trials, cut for resampling; the same for every model.
+
+    Attributes
+    ----------
+    rows : where the trials stand among all starts (m,)
+    first : (s,) first trial of each segment
+    kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
+    per_segment : (s, 2) trials, and kept ones
+    """
+
+    rows: slice | Ints
+    first: Ints
+    kept: Ints
+    segments: Ints
+    per_segment: Floats
 
 
 class BlockSums(NamedTuple):
@@ -86,8 +105,6 @@ def block_sums(
     """
     if blocks is None:
         return None
-    from icrtool.kernels.open_loop.error_statistics import BLOCK_PARTS
-
     errors = errors_m[blocks.rows]
     segments = len(blocks.first)
     k = min(MOST_BLOCKS, segments // BLOCK_PARTS)
@@ -108,10 +125,12 @@ def _slope(ordered: Floats, share: float, influence: Floats) -> float:
     low, high = np.clip([share - std, share + std], 0.0, 1.0)
     if not high > low:
         return 0.0
-    return (_quantile(ordered, float(high)) - _quantile(ordered, float(low))) / float(high - low)
+    return (quantile(ordered, float(high)) - quantile(ordered, float(low))) / float(high - low)
 
 
-def _quantile(ordered: Floats, share: float) -> float:
+def quantile(ordered: Floats, share: float) -> float:
+    """Return numpy's 'linear' quantile of sorted values."""
     rank = share * (len(ordered) - 1)
     below = math.floor(rank)
-    return float(np.interp(rank - below, [0.0, 1.0], ordered[[below, min(below + 1, len(ordered) - 1)]]))
+    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
+    return float(low + (high - low) * (rank - below))

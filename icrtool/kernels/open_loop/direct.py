@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import euler_step
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
@@ -30,8 +30,8 @@ STANDING = -4
 
 
 @njit
-def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> None:
-    """Fill `ends` (n_horizons, n_starts) for the starts from `lo` on: two pointers a horizon, O(n).
+def find_trial_ends(drive: Drive, horizons_m: Floats, starts: Ints, ends: Ints) -> None:
+    """Fill `ends` (n_horizons, n_starts) for ascending starts: two pointers a horizon, O(n).
 
     Notes
     -----
@@ -39,10 +39,9 @@ def find_trial_ends(drive: Drive, horizons_m: Floats, lo: int, ends: Ints) -> No
     """
     distance, gap = drive.distance, drive.gap
     for h in range(ends.shape[0]):
-        end = lo
-        next_gap = lo
+        end, next_gap = 0, 0
         for row in range(ends.shape[1]):
-            start = lo + row
+            start = starts[row]
             end = max(end, start)
             while end < len(distance) and distance[end] - distance[start] < horizons_m[h]:
                 end += 1
@@ -124,6 +123,22 @@ def integrate_path(drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: f
         )
 
 
+@njit
+def fill_path_errors(
+    turn: Complexes, place: Complexes, reference: Complexes, start: Ints, end: Ints, errors: Floats
+) -> None:
+    """Fill `errors` (m,) [m] of trials that follow one path from row `start` to row `end`, turned at its start.
+
+    Parameters
+    ----------
+    turn : (n,) e^{j heading of the reference less that of the path}; place, reference : (n,) forward + j right [m]
+    """
+    for i in range(len(start)):
+        s, e = start[i], end[i]
+        miss = turn[s] * (place[e] - place[s]) - (reference[e] - reference[s])
+        errors[i] = math.sqrt(miss.real * miss.real + miss.imag * miss.imag)
+
+
 def compiled_drive(drive: Drive) -> Drive:
     """Return `drive` with its columns in the one form the kernels are compiled for; copies only what is not in it.
 
@@ -155,21 +170,15 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
     int64 (hi - lo, n_horizons), one horizon contiguous: index of the first state j with
     ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`. The same for every model.
     """
-    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
-    stop = len(drive.distance) if hi is None else hi
-    ends = np.empty((len(horizons), stop - lo), dtype=np.int64)
-    find_trial_ends(compiled_drive(drive), horizons, lo, ends)
-    return ends.T
+    return ends_from(drive, horizons_m, np.arange(lo, len(drive.distance) if hi is None else hi))
 
 
 def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
-    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending; a table of all would need more memory."""
-    ends = np.empty((len(starts), len(horizons_m)), np.int64)
-    for lo in range(0, len(drive.distance), ROWS_AT_ONCE):
-        hi = min(lo + ROWS_AT_ONCE, len(drive.distance))
-        some = slice(*np.searchsorted(starts, [lo, hi]))
-        ends[some] = trial_ends(drive, horizons_m, lo, hi)[starts[some] - lo]
-    return ends
+    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending."""
+    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
+    ends = np.empty((len(horizons), len(starts)), np.int64)
+    find_trial_ends(compiled_drive(drive), horizons, np.require(starts, np.int64, ["C", "A", "W"]), ends)
+    return ends.T
 
 
 def count_trials(ends: Ints) -> TrialCounts:

@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, Blocks, quantile
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, Summary
 
 TAIL = 0.05
 """Share of trials above the 95th percentile."""
-BLOCK_PARTS = 4
-"""Blocks begin at every quarter of their length."""
 MIN_BLOCKS = 3
 """With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
@@ -51,16 +49,8 @@ def summary_of_sorted(ordered: Sequence[Floats]) -> Summary:
     table = np.full((4, len(ordered)), np.nan)
     for h, errors in enumerate(ordered):
         if len(errors):
-            table[:, h] = errors.mean(), _quantile(errors, 0.5), _quantile(errors, 1.0 - TAIL), errors[-1]
+            table[:, h] = errors.mean(), quantile(errors, 0.5), quantile(errors, 1.0 - TAIL), errors[-1]
     return Summary(np.array([len(errors) for errors in ordered], np.int64), *table)
-
-
-def _quantile(ordered: Floats, share: float) -> float:
-    """Return numpy's 'linear' quantile of sorted values."""
-    rank = share * (len(ordered) - 1)
-    below = math.floor(rank)
-    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
-    return float(low + (high - low) * (rank - below))
 
 
 @njit
@@ -97,24 +87,6 @@ def resample_blocks(blocks: Floats, starts: Ints, segments: Ints, ordered: Float
                 above += drawn[segments[i] + part]
         out[b, 0] = total / count
         out[b, 1] = ordered[i]
-
-
-class Blocks(NamedTuple):
-    """The path of one horizon's trials, cut for resampling; the same for every model.
-
-    Attributes
-    ----------
-    rows : where the trials stand among all starts (m,)
-    first : (s,) first trial of each segment
-    kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
-    per_segment : (s, 2) trials, and kept ones
-    """
-
-    rows: slice | Ints
-    first: Ints
-    kept: Ints
-    segments: Ints
-    per_segment: Floats
 
 
 def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:

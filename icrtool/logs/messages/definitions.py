@@ -30,8 +30,8 @@ _TIME: Definitions = {
 """Time and duration: ROS 1 has no definitions of them; in ROS 2 a definition text may leave them out."""
 
 
-def definitions_of(channel: Channel) -> tuple[Definitions, str]:
-    """Return the definitions a channel's type needs, and where they come from (for the user).
+def definitions_of(channel: Channel) -> Definitions:
+    """Return the definitions that a channel's type needs.
 
     Raises
     ------
@@ -40,15 +40,15 @@ def definitions_of(channel: Channel) -> tuple[Definitions, str]:
     """
     if channel.definition:
         types = {**_TIME, **parse_definition(channel)}
-        return (types if _is_complete(types) else {**standard_definitions(), **types}), "the log"
+        return types if _is_complete(types) else {**standard_definitions(), **types}
     name = full_name(channel.message_type)
     if channel.encoding == "ros1":
         raise DefinitionError(channel.message_type, "its connection carries no definition")
     known = bundled_definitions()
     if name in known:
-        return {**standard_definitions(), **known}, "icrtool"
+        return {**standard_definitions(), **known}
     if name in standard_definitions():
-        return standard_definitions(), "ROS 2 Humble"
+        return standard_definitions()
     raise DefinitionError(channel.message_type, "its definition is not in the log and not bundled")
 
 

@@ -8,7 +8,7 @@ So the messages are grouped by their number of joints, and each group is decoded
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,37 +36,12 @@ _NAMES = "joint_names[*]"
 _HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 
 
-class Collector(Protocol):
-    """Gathers the columns of one topic while blocks go by."""
-
-    def feed(self, block: Block, number: int) -> None:
-        """Add the messages of a block whose channel is `number`."""
-        ...
-
-    def table(self) -> TopicTable:
-        """Return what was gathered, sorted by log time."""
-        ...
-
-
-def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
-    """Return what gathers the wanted columns of a channel.
-
-    Raises
-    ------
-    DefinitionError
-        The layout of the channel's type is not known.
-    """
-    if channel.message_type == DYNAMIC_JOINT_STATE:
-        return DynamicJointCollector(channel)
-    return TopicCollector(channel, wanted)
-
-
 class DynamicJointCollector:
     """Gathers ``name[*]``, ``position[*]`` and ``velocity[*]`` of a topic of DynamicJointState messages."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._definitions, self._source = definitions_of(channel)
+        self._definitions = definitions_of(channel)
         self._collectors: dict[int, TopicCollector] = {}
         self._tables: list[TopicTable] = []
         self._times: list[Ints] = []
@@ -101,7 +76,7 @@ class DynamicJointCollector:
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time."""
         topic, message_type = self._channel.topic, self._channel.message_type
-        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable, self._source)
+        nothing = TopicTable(topic, message_type, np.empty(0, np.int64), {}, {}, self._unreadable)
         merged = merge_tables([nothing, *self._tables])[0]
         return replace(merged, set_back=time_order(np.concatenate(self._times or [nothing.log_time_ns]))[0])
 
@@ -129,6 +104,23 @@ class DynamicJointCollector:
                 flat.append((_JOINTS, (BASE, ("uint32", 0))))
                 flat += [(f"joint {j}", (NAME, detail[0][1])) for j in range(joints)]
         return {**self._definitions, name: (constants, flat)}
+
+
+Collector = TopicCollector | DynamicJointCollector
+"""Gathers the columns of one topic while blocks go by."""
+
+
+def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
+    """Return what gathers the wanted columns of a channel.
+
+    Raises
+    ------
+    DefinitionError
+        The layout of the channel's type is not known.
+    """
+    if channel.message_type == DYNAMIC_JOINT_STATE:
+        return DynamicJointCollector(channel)
+    return TopicCollector(channel, wanted)
 
 
 def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:

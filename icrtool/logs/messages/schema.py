@@ -8,7 +8,7 @@ Python object per message, also where the lengths of strings change from message
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -33,6 +33,8 @@ SIZES = {
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
 _STRING_COLUMNS = 3
+_STRIDE_LATER = -1
+"""Of a slot in a loop whose end, and with it the columns of an element, is not reached yet."""
 LONGEST_UNROLLED = 4096
 """Longest fixed array of which elements are copied: a covariance has 36."""
 
@@ -155,9 +157,9 @@ class _Compiler:
         elements = any(name.startswith(f"{path}[") for name in self._wanted)
         if fixed is not None and not elements:
             self._skip(size, fixed)
+        elif fixed is not None and fixed > LONGEST_UNROLLED:
+            raise DefinitionError(path, f"an array of {fixed} numbers is not read")
         elif fixed is not None and starred not in self._wanted:
-            if fixed > LONGEST_UNROLLED:
-                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             for i in range(fixed):
                 element = f"{path}[{i}]"
                 if element in self._wanted:
@@ -165,8 +167,6 @@ class _Compiler:
                 else:
                     self._skip(size, 1)
         elif fixed is not None:
-            if fixed > LONGEST_UNROLLED:
-                raise DefinitionError(path, f"an array of {fixed} numbers is not read")
             column = self._reserve(fixed)
             self._emit(TAKE, size, fixed, column)
             self.slots[starred] = Slot(kind, column, fixed, 1, -1)
@@ -191,30 +191,22 @@ class _Compiler:
         count_column = self._reserve(1) if takes and fixed is None else -1
         begin = len(self.rows)
         self._emit(BEGIN_LOOP, 0, -1 if fixed is None else fixed, count_column, repeat if takes else 0)
-        first = self.columns
-        stride = self._body_width(element, inner, path) if takes else 0
+        first, loop = self.columns, (repeat, _STRIDE_LATER if takes else 0, count_column)
         if element == BASE:
-            self._base(path, inner[0], (repeat, stride, count_column))
+            self._base(path, inner[0], loop)
         else:
-            self.message(inner, f"{path}.", (repeat, stride, count_column))
+            self.message(inner, f"{path}.", loop)
         self._emit(END_LOOP)
+        stride = max(self.columns - first, 1) if takes else 0
+        self.slots |= {
+            name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
+        }
         self.rows[begin][5] = stride
         self.rows[begin][6] = len(self.rows)
         if takes:
             self.columns = first + stride * repeat
             self._check_columns()
             self._last_take = len(self.rows)
-
-    def _body_width(self, element: int, inner: FieldDetail, path: str) -> int:
-        """Return the columns one element takes, by a trial run."""
-        trial = _Compiler(self._definitions, tuple(self._wanted), cdr=self._cdr, capacity=self._capacity)
-        if element == BASE:
-            trial._base(path, inner[0], (1, 1, -1))
-        else:
-            trial.fields, trial._depth = self.fields, self._depth
-            trial.message(inner, f"{path}.", (1, 1, -1))
-            self.fields = trial.fields
-        return max(trial.columns, 1)
 
     def _reserve(self, columns: int) -> int:
         first = self.columns

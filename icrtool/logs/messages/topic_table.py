@@ -64,7 +64,6 @@ class TopicTable:
         A text field holds indices into `texts`.
     texts : the distinct texts of each text field
     unreadable : messages that did not have the shape of their type
-    definition_source : where the message definition came from
     set_back : of the clock that the messages were logged with
     """
 
@@ -74,7 +73,6 @@ class TopicTable:
     columns: dict[str, NDArray[Any]]
     texts: dict[str, list[LogText]]
     unreadable: int
-    definition_source: str
     set_back: SetBack = NOT_SET_BACK
 
     def __len__(self) -> int:
@@ -145,7 +143,6 @@ class TopicCollector:
     definitions: Definitions | None = None
     largest_capacity: int = _LARGEST_CAPACITY
     _capacity: int = _FIRST_CAPACITY
-    _source: str = ""
     _rows: Decoded = field(init=False)
     _learned: int = 0
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
@@ -157,8 +154,7 @@ class TopicCollector:
         self._compile()
 
     def _compile(self) -> None:
-        definitions, self._source = definitions_of(self.channel)
-        definitions = self.definitions if self.definitions is not None else definitions
+        definitions = self.definitions if self.definitions is not None else definitions_of(self.channel)
         encoding = self.channel.encoding
         if encoding not in ("cdr", "ros1"):
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
@@ -267,7 +263,6 @@ class TopicCollector:
             columns,
             texts,
             unreadable,
-            self._source,
             back,
         )
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
+from icrtool.logs.streams.source import HEADER
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
 from icrtool.records.samples import GyroAxes, GyroSamples
 
 GYRO_TYPE = "sensor_msgs/Imu"
 GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
-GYRO_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *GYRO_AXES)
+GYRO_FIELDS = (*HEADER, *GYRO_AXES)
 
 FASTEST_RADPS = math.radians(1000.0)
 """No robot turns faster than this [rad/s]."""
@@ -46,13 +48,7 @@ def find_gyro(
     """
     home = wheels_topic.strip("/").split("/")[0]
     found = []
-    for table in tables:
-        if table.message_type != GYRO_TYPE or "angular_velocity.z" not in table.columns or len(table) < 2:
-            continue
-        rate = table.floats("angular_velocity.z")
-        sound = np.abs(rate) <= FASTEST_RADPS
-        if np.count_nonzero(~sound) > MOST_BAD * len(rate) or np.ptp(rate[sound]) == 0.0:
-            continue
+    for table, (rate,), sound in _units(tables, GYRO_AXES[2:]):
         near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(rate)
         found.append((near, table.topic, rate, sound, table))
     if not found:
@@ -69,14 +65,19 @@ def find_gyros(
 ) -> tuple[GyroAxes, ...]:
     """Return the turn rates of every inertial unit, about all three axes; parameters as of `find_gyro`."""
     found = []
-    for table in tables:
-        if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in GYRO_AXES):
-            continue
-        axes = [table.floats(axis) for axis in GYRO_AXES]
-        sound = np.logical_and.reduce([np.abs(rates) <= FASTEST_RADPS for rates in axes])
-        if np.count_nonzero(~sound) > MOST_BAD * len(sound) or not any(np.ptp(rates[sound]) for rates in axes):
-            continue
+    for table, axes, sound in _units(tables, GYRO_AXES):
         stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
         rows = usable_rows(stamps, sound)
         found.append(GyroAxes(table.topic, stamps[rows], np.array([rates[rows] for rates in axes]).T))
     return tuple(found)
+
+
+def _units(tables: Sequence[TopicTable], axes: Sequence[str]) -> Iterator[tuple[TopicTable, list[Floats], Bools]]:
+    """Yield the inertial units that measure about some axes, with the rates (n,) about each, and which are sound."""
+    for table in tables:
+        if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in axes):
+            continue
+        rates = [table.floats(axis) for axis in axes]
+        sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
+        if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
+            yield table, rates, sound

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,10 +20,9 @@ from icrtool.logs.streams.position_sources import (
     INS_SOLVED_CODES,
     SOLVED,
     SOLVED_CODES,
-    pose_paths,
     solved,
 )
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.source import HEADER, NO_ROWS, Source, of_topic
 
 Convention = Literal["enu", "ned"]
 
@@ -46,8 +45,8 @@ LARGEST_DEG = 720.0
 """A heading beyond this stands for "unknown": Septentrio writes -2e10."""
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingSource:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeadingSource(Source):
     """Headings of one topic.
 
     Attributes
@@ -56,21 +55,14 @@ class HeadingSource:
     variance : (n,) [rad^2], NaN where not stated
     usable : (n,)
     convention_why : how the convention is known
-    yaw_rate_radps : (n,) counter-clockwise turn rate of a gyro in the same message, None without one
+    note : what was assumed, for the user
     """
 
-    topic: str
-    message_type: str
-    stamps: StampedRows
-    yaw_rad: Floats
-    variance: Floats
-    usable: Bools
-    convention: Convention
-    convention_why: str
-    yaw_rate_radps: Floats | None = None
-    score: float = 0.0
-    why: str = ""
-    problem: str = ""
+    yaw_rad: Floats = field(default_factory=lambda: np.empty(0))
+    variance: Floats = field(default_factory=lambda: np.empty(0))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
+    convention: Convention = "enu"
+    convention_why: str = ""
     note: str = ""
 
     @property
@@ -85,14 +77,8 @@ class HeadingSource:
 
 
 Reader = Callable[[TopicTable], HeadingSource]
-
-
-def no_heading(table: TopicTable, problem: str) -> HeadingSource:
-    """Return an empty source for a topic that cannot be read, with the reason."""
-    unknown, nothing = np.full(len(table), np.nan), np.zeros(len(table), np.bool_)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), unknown, unknown, nothing, "enu", "", problem=problem
-    )
+Entry = tuple[tuple[str, ...], Reader]
+"""The fields of a message type to take, and how to read them."""
 
 
 def _quaternion(table: TopicTable, path: str) -> Floats:
@@ -111,15 +97,18 @@ def _constant(yaw: Floats, usable: Bools) -> bool:
     return bool(usable.any()) and float(np.ptp(yaw[usable])) == 0.0
 
 
-def _orientation(path: str, covariance: str, place: int, score: float, what: str, *, stuffed: bool = False) -> Reader:
-    """Return a reader of an orientation; `place` is the index of the yaw variance in the covariance.
+def _orientation(
+    path: str, covariance: str, place: int, score: float, what: str, *, stuffed: bool = False, rate: str = ""
+) -> Entry:
+    """Return the entry of an orientation; `place` is the index of the yaw variance in the covariance.
 
+    `rate`: field of the turn rate of a gyro in the same message.
     `stuffed`: some drivers of GNSS receivers write a compass angle into the quaternion as if it were a yaw.
     """
 
     def read(table: TopicTable) -> HeadingSource:
-        rate = table.floats("angular_velocity.z") if "angular_velocity.z" in table.columns else None
-        yaw, usable, note = nose_yaw(_quaternion(table, path), rate)
+        turning = table.floats(rate) if rate in table.columns else None
+        yaw, usable, note = nose_yaw(_quaternion(table, path), turning)
         variance = table.floats(f"{covariance}[{place}]") if covariance else np.full(len(table), np.nan)
         variance = np.where(variance > 0, variance, np.nan)
         convention, why = frame_convention(table)
@@ -137,17 +126,30 @@ def _orientation(path: str, covariance: str, place: int, score: float, what: str
         if _RAW_WORDS.search(table.topic):
             lowered -= 10.0
         return HeadingSource(
-            table.topic, table.message_type, stamp_rows(table), yaw, variance, usable, convention, why,
-            rate, lowered, what, problem, note,
+            **of_topic(table), yaw_rad=yaw, variance=variance, usable=usable, convention=convention, convention_why=why,
+            score=lowered, why=what, problem=problem, note=note,
         )  # fmt: skip
 
-    return read
+    variances = tuple(f"{covariance}[{i}]" for i in (0, place) if covariance)
+    return (*HEADER, *(f"{path}.{axis}" for axis in "xyzw"), *variances, *(name for name in (rate,) if name)), read
+
+
+_POSE = _orientation("pose.pose.orientation", "pose.covariance", 35, 60.0, "orientation of an odometry message")
 
 
 def _odometry(table: TopicTable) -> HeadingSource:
-    read = _orientation("pose.pose.orientation", "pose.covariance", 35, 60.0, "orientation of an odometry message")
-    source = read(table)
+    source = _POSE[1](table)
     return source if _INS_WORDS.search(table.topic) else replace(source, score=30.0)
+
+
+def _stated(
+    table: TopicTable, heading: Floats, variance: Floats, usable: Bools, score: float, what: str, convention_why: str
+) -> HeadingSource:
+    """Return headings clockwise from north (n,), with the variances (n,) that the messages state, NaN for unknown."""
+    return HeadingSource(
+        **of_topic(table), yaw_rad=heading, variance=variance, usable=usable, convention="ned",
+        convention_why=convention_why, score=score, why=what, problem="" if usable.any() else "no valid heading",
+    )  # fmt: skip
 
 
 def _azimuth(table: TopicTable) -> HeadingSource:
@@ -160,13 +162,10 @@ def _azimuth(table: TopicTable) -> HeadingSource:
     yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
     codes = table.floats("reference")
     reference = _REFERENCES.get(float(np.median(codes)), "unknown") if len(codes) else "unknown"
-    variance = table.floats("variance") * factor**2
-    usable = np.isfinite(yaw)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), yaw, np.where(variance > 0, variance, np.nan), usable,
-        "ned" if ned else "enu", "stated in the message", None, 95.0, f"azimuth, {reference} north",
-        "" if usable.any() else "no finite azimuth",
-    )  # fmt: skip
+    variance, what = table.floats("variance") * factor**2, f"azimuth, {reference} north"
+    variance = np.where(variance > 0, variance, np.nan)
+    source = _stated(table, yaw, variance, np.isfinite(yaw), 95.0, what, "stated in the message")
+    return source if ned else replace(source, convention="enu")
 
 
 def _relposned(table: TopicTable) -> HeadingSource:
@@ -186,18 +185,16 @@ def _relposned(table: TopicTable) -> HeadingSource:
         acc = np.maximum(table.floats("accN", "acc_n"), table.floats("accE", "acc_e")) * 0.01
         std = np.divide(acc, length, out=np.full(len(table), np.nan), where=length > 0)
         usable = ((flags & _RELPOS_VALID) != 0) & (length > 0)
-    return HeadingSource(
-        table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
-        "ned", "u-blox: clockwise from north", None, 90.0, "u-blox moving base: bearing of the antenna baseline",
-        "" if usable.any() else "no valid heading",
-    )  # fmt: skip
+    what = "u-blox moving base: bearing of the antenna baseline"
+    variance = np.where(std > 0, std**2, np.nan)
+    return _stated(table, heading, variance, usable, 90.0, what, "u-blox: clockwise from north")
 
 
 def _degrees(
     path: str, deviation: str, score: float, what: str, status: str = "",
     accepted: frozenset[str] | frozenset[int] = frozenset[int](),
-) -> Reader:  # fmt: skip
-    """Return a reader of degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
+) -> Entry:  # fmt: skip
+    """Return the entry of degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
 
     def read(table: TopicTable) -> HeadingSource:
         degrees = table.column(path).astype(np.float64)
@@ -206,17 +203,15 @@ def _degrees(
         if status:
             usable = usable & solved(table, status, accepted)
         heading = np.radians(np.where(np.abs(degrees) <= LARGEST_DEG, degrees, np.nan))
-        return HeadingSource(
-            table.topic, table.message_type, stamp_rows(table), heading, np.where(std > 0, std**2, np.nan), usable,
-            "ned", "degrees clockwise from north", None, score, what, "" if usable.any() else "no valid heading",
-        )  # fmt: skip
+        variance = np.where(std > 0, std**2, np.nan)
+        return _stated(table, heading, variance, usable, score, what, "degrees clockwise from north")
 
-    return read
+    return (*HEADER, *(name for name in (path, deviation, status) if name)), read
 
 
-def _septentrio(deviation: str, mode: str, score: float, what: str) -> Reader:
-    """Return a reader of a Septentrio attitude: ENU unless `use_ros_axis_orientation` was off; no message states it."""
-    read_degrees = _degrees("heading", deviation, score, what)
+def _septentrio(deviation: str, mode: str, score: float, what: str) -> Entry:
+    """Return the entry of a Septentrio attitude: ENU unless `use_ros_axis_orientation` was off, which none states."""
+    fields, read_degrees = _degrees("heading", deviation, score, what)
 
     def read(table: TopicTable) -> HeadingSource:
         source = read_degrees(table)
@@ -227,75 +222,45 @@ def _septentrio(deviation: str, mode: str, score: float, what: str) -> Reader:
         why = "the Septentrio driver's default, use_ros_axis_orientation"
         return replace(source, usable=usable, problem=problem, convention="enu", convention_why=why)
 
-    return read
+    return (*fields, "error", *(name for name in (mode,) if name)), read
 
 
-_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
-_ORIENTATION = tuple(f"orientation.{axis}" for axis in "xyzw")
-
-_AZIMUTH = (*_HEADER, "azimuth", "variance", "unit", "orientation", "reference")
-_DUAL = (*_HEADER, "heading", "heading_sigma", "solution_status")
-_dual_antenna = _degrees("heading", "heading_sigma", 90.0, "NovAtel dual antenna heading", "solution_status", SOLVED)
-_oem7_dual_antenna = _degrees(
-    "heading", "heading_stdev", 90.0, "NovAtel dual antenna heading", "sol_status.status", SOLVED_CODES
-)
+_AZIMUTH = ((*HEADER, "azimuth", "variance", "unit", "orientation", "reference"), _azimuth)
+_DUAL = _degrees("heading", "heading_sigma", 90.0, "NovAtel dual antenna heading", "solution_status", SOLVED)
 _INS = "NovAtel INS azimuth"
 
-HEADING_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
-    "sensor_msgs/Imu": (
-        (*_HEADER, *_ORIENTATION, "orientation_covariance[0]", "orientation_covariance[8]", "angular_velocity.z"),
-        _orientation("orientation", "orientation_covariance", 8, 100.0, "orientation of the inertial unit"),
+HEADING_TYPES: dict[str, Entry] = {
+    "sensor_msgs/Imu": _orientation(
+        "orientation", "orientation_covariance", 8, 100.0, "orientation of the inertial unit", rate="angular_velocity.z"
     ),
-    "geometry_msgs/PoseStamped": (
-        pose_paths("pose."),
-        _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
+    "geometry_msgs/PoseStamped": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
+    "geometry_msgs/PoseWithCovarianceStamped": _orientation(
+        "pose.pose.orientation", "pose.covariance", 35, 50.0, "orientation of the pose"
     ),
-    "geometry_msgs/PoseWithCovarianceStamped": (
-        pose_paths("pose.pose.", "pose.covariance"),
-        _orientation("pose.pose.orientation", "pose.covariance", 35, 50.0, "orientation of the pose"),
+    "nav_msgs/Odometry": (_POSE[0], _odometry),
+    "geometry_msgs/QuaternionStamped": _orientation(
+        "quaternion", "", 0, 80.0, "heading of the GNSS receiver (nmea_navsat_driver)", stuffed=True
     ),
-    "nav_msgs/Odometry": (pose_paths("pose.pose.", "pose.covariance"), _odometry),
-    "geometry_msgs/QuaternionStamped": (
-        (*_HEADER, *(f"quaternion.{axis}" for axis in "xyzw")),
-        _orientation("quaternion", "", 0, 80.0, "heading of the GNSS receiver (nmea_navsat_driver)", stuffed=True),
-    ),
-    "compass_msgs/Azimuth": (_AZIMUTH, _azimuth),
-    "compass_interfaces/Azimuth": (_AZIMUTH, _azimuth),
+    "compass_msgs/Azimuth": _AZIMUTH,
+    "compass_interfaces/Azimuth": _AZIMUTH,
     "ublox_msgs/NavRELPOSNED9": ((*_HEADING, "accHeading", "acc_heading", "flags"), _relposned),
     "ublox_msgs/NavRELPOSNED": (
         (*(name for pair in _BASELINE for names in pair for name in names), *_BASELINE_ACCURACY, "flags"),
         _relposned,
     ),
-    "septentrio_gnss_driver/AttEuler": (
-        (*_HEADER, "heading", "error", "mode"),
-        _septentrio("", "mode", 88.0, "Septentrio attitude"),
+    "septentrio_gnss_driver/AttEuler": _septentrio("", "mode", 88.0, "Septentrio attitude"),
+    "septentrio_gnss_driver/INSNavGeod": _septentrio("heading_std_dev", "", 89.0, "Septentrio INS attitude"),
+    "novatel_gps_msgs/NovatelDualAntennaHeading": _DUAL,
+    "novatel_gps_msgs/NovatelHeading2": _DUAL,
+    "novatel_gps_msgs/Gphdt": _degrees("heading", "", 88.0, "NovAtel true heading (HDT)"),
+    "novatel_gps_msgs/Inspva": _degrees("azimuth", "", 90.0, _INS, "status", INS_SOLVED),
+    "novatel_gps_msgs/Inspvax": _degrees("azimuth", "azimuth_std", 92.0, _INS, "ins_status", INS_SOLVED),
+    "novatel_oem7_msgs/HEADING2": _degrees(
+        "heading", "heading_stdev", 90.0, "NovAtel dual antenna heading", "sol_status.status", SOLVED_CODES
     ),
-    "septentrio_gnss_driver/INSNavGeod": (
-        (*_HEADER, "heading", "heading_std_dev", "error"),
-        _septentrio("heading_std_dev", "", 89.0, "Septentrio INS attitude"),
-    ),
-    "novatel_gps_msgs/NovatelDualAntennaHeading": (_DUAL, _dual_antenna),
-    "novatel_gps_msgs/NovatelHeading2": (_DUAL, _dual_antenna),
-    "novatel_gps_msgs/Gphdt": ((*_HEADER, "heading"), _degrees("heading", "", 88.0, "NovAtel true heading (HDT)")),
-    "novatel_gps_msgs/Inspva": (
-        (*_HEADER, "azimuth", "status"),
-        _degrees("azimuth", "", 90.0, _INS, "status", INS_SOLVED),
-    ),
-    "novatel_gps_msgs/Inspvax": (
-        (*_HEADER, "azimuth", "azimuth_std", "ins_status"),
-        _degrees("azimuth", "azimuth_std", 92.0, _INS, "ins_status", INS_SOLVED),
-    ),
-    "novatel_oem7_msgs/HEADING2": (
-        (*_HEADER, "heading", "heading_stdev", "sol_status.status"),
-        _oem7_dual_antenna,
-    ),
-    "novatel_oem7_msgs/INSPVA": (
-        (*_HEADER, "azimuth", "status.status"),
-        _degrees("azimuth", "", 90.0, _INS, "status.status", INS_SOLVED_CODES),
-    ),
-    "novatel_oem7_msgs/INSPVAX": (
-        (*_HEADER, "azimuth", "azimuth_stdev", "ins_status.status"),
-        _degrees("azimuth", "azimuth_stdev", 92.0, _INS, "ins_status.status", INS_SOLVED_CODES),
+    "novatel_oem7_msgs/INSPVA": _degrees("azimuth", "", 90.0, _INS, "status.status", INS_SOLVED_CODES),
+    "novatel_oem7_msgs/INSPVAX": _degrees(
+        "azimuth", "azimuth_stdev", 92.0, _INS, "ins_status.status", INS_SOLVED_CODES
     ),
 }
 """By message type: the fields to take, and how to read them."""

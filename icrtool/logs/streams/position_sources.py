@@ -18,7 +18,7 @@ from icrtool.logs.streams.fix_class import (
     class_by_status,
     class_by_type,
 )
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.source import HEADER, NO_ROWS, Source, of_topic
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
@@ -57,8 +57,8 @@ GOOD_STD_M = 0.3
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
 
 
-@dataclass(frozen=True, slots=True)
-class PositionSource:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionSource(Source):
     """Positions of one topic.
 
     Attributes
@@ -70,17 +70,11 @@ class PositionSource:
     stated_class : uint8 (n,) how the position was solved, None where no message states it
     """
 
-    topic: str
-    message_type: str
-    stamps: StampedRows
-    geodetic: Floats | None
-    metric: Floats | None
-    variance: Floats
-    usable: Bools
+    geodetic: Floats | None = None
+    metric: Floats | None = None
+    variance: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
     rejected: dict[str, int] = field(default_factory=dict)
-    score: float = 0.0
-    why: str = ""
-    problem: str = ""
     stated_class: Bytes | None = None
 
     @property
@@ -90,14 +84,8 @@ class PositionSource:
 
 
 Reader = Callable[[TopicTable], PositionSource]
-
-
-def no_position(table: TopicTable, problem: str) -> PositionSource:
-    """Return an empty source for a topic that cannot be read, with the reason."""
-    nothing = np.zeros(len(table), np.bool_)
-    return PositionSource(
-        table.topic, table.message_type, stamp_rows(table), None, None, _no_variance(table), nothing, problem=problem
-    )
+Entry = tuple[tuple[str, ...], Reader]
+"""The fields of a message type to take, and how to read them."""
 
 
 def _geodetic(
@@ -132,14 +120,10 @@ def _geodetic(
         score -= 35.0
     stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
     return PositionSource(
-        table.topic, table.message_type, stamp_rows(table),
-        np.column_stack([latitude, longitude, filled]), None, variance, usable, rejected,
-        score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix", stated_class=stated_class,
+        **of_topic(table), geodetic=np.column_stack([latitude, longitude, filled]), variance=variance, usable=usable,
+        rejected=rejected, score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix",
+        stated_class=stated_class,
     )  # fmt: skip
-
-
-def _no_variance(table: TopicTable) -> Floats:
-    return np.full((len(table), 3), np.nan)
 
 
 def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
@@ -218,8 +202,8 @@ def _navhpposllh(table: TopicTable) -> PositionSource:
     return _geodetic(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
 
 
-def _septentrio(mode: str, what: str, score: float) -> Reader:
-    """Return a reader of a Septentrio block: angles in rad; low bits of the mode 0: no solution."""
+def _septentrio(mode: str, what: str, score: float, *accuracies: str) -> Entry:
+    """Return the entry of a Septentrio block: angles in rad; low bits of the mode 0: no solution."""
 
     def read(table: TopicTable) -> PositionSource:
         geodetic = _place(table, "latitude", "longitude", "height")
@@ -235,7 +219,7 @@ def _septentrio(mode: str, what: str, score: float) -> Reader:
             variance = _deviations(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
         return _geodetic(table, geodetic, variance, no_fix, score, what, class_by_mode(modes))
 
-    return read
+    return (*HEADER, "latitude", "longitude", "height", mode, "error", *accuracies), read
 
 
 def solved(table: TopicTable, path: str, accepted: frozenset[str] | frozenset[int]) -> Bools:
@@ -250,8 +234,8 @@ def solved(table: TopicTable, path: str, accepted: frozenset[str] | frozenset[in
 def _novatel(
     place: tuple[str, str, str], deviations: tuple[str, str], status: str, accepted: frozenset[str] | frozenset[int],
     kind: str, what: str, score: float,
-) -> Reader:  # fmt: skip
-    """Return a reader of a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
+) -> Entry:  # fmt: skip
+    """Return the entry of a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
 
     def read(table: TopicTable) -> PositionSource:
         geodetic = _place(table, *place)
@@ -260,15 +244,15 @@ def _novatel(
         fix_class = class_by_type(table, kind)
         return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, fix_class)
 
-    return read
+    return (*HEADER, status, kind, *place, "undulation", *deviations), read
 
 
-def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> Reader:
-    """Return a reader of a pose: x is taken as east and y as north, in the topic's own frame."""
+def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> Entry:
+    """Return the entry of a pose: x is taken as east and y as north, in the topic's own frame."""
 
     def read(table: TopicTable) -> PositionSource:
         x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
-        variance = _no_variance(table)
+        variance = np.full((len(table), 3), np.nan)
         if covariance:
             var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
             positive = (var_x > 0) & (var_y > 0)
@@ -286,52 +270,23 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
             )
         count = int(np.count_nonzero(~usable))
         return PositionSource(
-            table.topic, table.message_type, stamp_rows(table), None, np.column_stack([y, x]), variance, usable,
-            {"not finite": count} if count else {}, score=score, why=what, problem=problem,
+            **of_topic(table), metric=np.column_stack([y, x]), variance=variance, usable=usable,
+            rejected={"not finite": count} if count else {}, score=score, why=what, problem=problem,
         )  # fmt: skip
 
-    return read
+    variances = tuple(f"{covariance}[{i}]" for i in (0, 1, 7) if covariance)
+    return (*HEADER, *(f"{pose}position.{axis}" for axis in "xy"), *variances), read
 
 
-def pose_paths(pose: str, covariance: str = "") -> tuple[str, ...]:
-    """Return the fields of a pose message that position and heading need."""
-    paths = [
-        "header.stamp.sec", "header.stamp.nanosec", "header.frame_id",
-        *(f"{pose}position.{axis}" for axis in "xy"), *(f"{pose}orientation.{axis}" for axis in "xyzw"),
-    ]  # fmt: skip
-    return (*paths, *(f"{covariance}[{i}]" for i in (0, 1, 7, 35) if covariance))
-
-
-_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 _COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))
-_FIX = (*_HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
-
+_FIX = (*HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
 _WORD, _NUMBER = "position_type", "pos_type.type"
-_NOVATEL = (*_HEADER, "solution_status", _WORD, "lat", "lon", "height", "undulation", "lat_sigma", "lon_sigma")
-_OEM7 = (*_HEADER, "sol_status.status", _NUMBER, "lat", "lon", "hgt", "undulation", "lat_stdev", "lon_stdev")
-_INS = (*_HEADER, "latitude", "longitude")
-_NOVATEL_INS_SIGMA = ("latitude_std", "longitude_std")
-_OEM7_INS_SIGMA = ("latitude_stdev", "longitude_stdev")
-
-_bestpos = _novatel(
-    ("lat", "lon", "height"), ("lat_sigma", "lon_sigma"), "solution_status", SOLVED, _WORD,
-    "NovAtel position", 85.0,
-)  # fmt: skip
-_oem7_bestpos = _novatel(
+_OEM7_BESTPOS = _novatel(
     ("lat", "lon", "hgt"), ("lat_stdev", "lon_stdev"), "sol_status.status", SOLVED_CODES, _NUMBER,
     "NovAtel position", 85.0,
 )  # fmt: skip
-_inspvax = _novatel(
-    ("latitude", "longitude", "altitude"), _NOVATEL_INS_SIGMA, "ins_status", INS_SOLVED, _WORD,
-    "NovAtel INS position", 84.0,
-)  # fmt: skip
-_oem7_inspvax = _novatel(
-    ("latitude", "longitude", "height"), _OEM7_INS_SIGMA, "ins_status.status", INS_SOLVED_CODES, _NUMBER,
-    "NovAtel INS position", 84.0,
-)  # fmt: skip
-_odometry = _metric("pose.pose.", "pose.covariance", 60.0, "metric position of an odometry message", odometry=True)
 
-POSITION_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
+POSITION_TYPES: dict[str, Entry] = {
     "sensor_msgs/NavSatFix": (_FIX, _navsatfix),
     "gps_common/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
     "gps_msgs/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
@@ -340,30 +295,28 @@ POSITION_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
         ("lat", "lon", "height", *LAT_HP, *LON_HP, *HEIGHT_HP, *H_ACC, "invalid_llh", "invalidLlh", "flags"),
         _navhpposllh,
     ),
-    "septentrio_gnss_driver/PVTGeodetic": (
-        (*_HEADER, "latitude", "longitude", "height", "mode", "error", "h_accuracy"),
-        _septentrio("mode", "Septentrio position", 85.0),
+    "septentrio_gnss_driver/PVTGeodetic": _septentrio("mode", "Septentrio position", 85.0, "h_accuracy"),
+    "septentrio_gnss_driver/INSNavGeod": _septentrio(
+        "gnss_mode", "Septentrio INS position", 84.0, "latitude_std_dev", "longitude_std_dev"
     ),
-    "septentrio_gnss_driver/INSNavGeod": (
-        (*_INS, "height", "gnss_mode", "error", "latitude_std_dev", "longitude_std_dev"),
-        _septentrio("gnss_mode", "Septentrio INS position", 84.0),
+    "novatel_gps_msgs/NovatelPosition": _novatel(
+        ("lat", "lon", "height"), ("lat_sigma", "lon_sigma"), "solution_status", SOLVED, _WORD,
+        "NovAtel position", 85.0,
     ),
-    "novatel_gps_msgs/NovatelPosition": (_NOVATEL, _bestpos),
-    "novatel_gps_msgs/Inspvax": (
-        (*_INS, "altitude", "undulation", "ins_status", _WORD, *_NOVATEL_INS_SIGMA),
-        _inspvax,
+    "novatel_gps_msgs/Inspvax": _novatel(
+        ("latitude", "longitude", "altitude"), ("latitude_std", "longitude_std"), "ins_status", INS_SOLVED, _WORD,
+        "NovAtel INS position", 84.0,
     ),
-    "novatel_oem7_msgs/BESTPOS": (_OEM7, _oem7_bestpos),
-    "novatel_oem7_msgs/BESTGNSSPOS": (_OEM7, _oem7_bestpos),
-    "novatel_oem7_msgs/INSPVAX": (
-        (*_INS, "height", "undulation", "ins_status.status", _NUMBER, *_OEM7_INS_SIGMA),
-        _oem7_inspvax,
+    "novatel_oem7_msgs/BESTPOS": _OEM7_BESTPOS,
+    "novatel_oem7_msgs/BESTGNSSPOS": _OEM7_BESTPOS,
+    "novatel_oem7_msgs/INSPVAX": _novatel(
+        ("latitude", "longitude", "height"), ("latitude_stdev", "longitude_stdev"), "ins_status.status",
+        INS_SOLVED_CODES, _NUMBER, "NovAtel INS position", 84.0,
     ),
-    "geometry_msgs/PoseStamped": (pose_paths("pose."), _metric("pose.", "", 70.0, "metric pose")),
-    "geometry_msgs/PoseWithCovarianceStamped": (
-        pose_paths("pose.pose.", "pose.covariance"),
-        _metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
+    "geometry_msgs/PoseStamped": _metric("pose.", "", 70.0, "metric pose"),
+    "geometry_msgs/PoseWithCovarianceStamped": _metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
+    "nav_msgs/Odometry": _metric(
+        "pose.pose.", "pose.covariance", 60.0, "metric position of an odometry message", odometry=True
     ),
-    "nav_msgs/Odometry": (pose_paths("pose.pose.", "pose.covariance"), _odometry),
-}
+}  # fmt: skip
 """By message type: the fields to take, and how to read them."""

@@ -12,16 +12,17 @@ from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logs.containers.channel import Channel, some_of
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE
-from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource, no_heading
+from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
 from icrtool.logs.streams.joint_names import check_joints
-from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource, no_position
+from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource
+from icrtool.logs.streams.source import of_topic
 from icrtool.logs.streams.wheel_names import right_twin
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_motion
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, no_motion
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
 
-Source = TypeVar("Source", WheelMotion, PositionSource, HeadingSource)
+Kind = TypeVar("Kind", WheelMotion, PositionSource, HeadingSource)
 
 NEEDS: dict[Role, str] = {
     "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist",
@@ -56,6 +57,10 @@ class Candidates:
     gnss: tuple[PositionSource, ...]
     heading: tuple[HeadingSource, ...]
     unread: dict[str, str] = field(default_factory=dict)
+
+    def by_role(self) -> dict[Role, Sequence[WheelMotion | PositionSource | HeadingSource]]:
+        """Return the sources of each role."""
+        return {"wheels": self.wheels, "gnss": self.gnss, "heading": self.heading}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +112,8 @@ def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
     """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
     topics = config.topics
-    gnss = _read_all(tables, POSITION_TYPES, topics.gnss, no_position)
-    heading = _read_all(tables, HEADING_TYPES, topics.heading, no_heading)
+    gnss = _read_all(tables, POSITION_TYPES, topics.gnss, PositionSource)
+    heading = _read_all(tables, HEADING_TYPES, topics.heading, HeadingSource)
     wheels = _wheel_candidates(tables, config)
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
 
@@ -136,10 +141,10 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
 
 def _read_all(
     tables: Sequence[TopicTable],
-    types: Mapping[str, tuple[tuple[str, ...], Callable[[TopicTable], Source]]],
+    types: Mapping[str, tuple[tuple[str, ...], Callable[[TopicTable], Kind]]],
     configured: str | None,
-    unusable: Callable[[TopicTable, str], Source],
-) -> list[Source]:
+    unread: type[Kind],
+) -> list[Kind]:
     """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
     sources = []
     for table in tables:
@@ -147,7 +152,7 @@ def _read_all(
             try:
                 sources.append(types[table.message_type][1](table))
             except DefinitionError as err:
-                sources.append(unusable(table, err.why))
+                sources.append(unread(**of_topic(table), problem=err.why))
     return sources
 
 
@@ -162,7 +167,7 @@ def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[Whee
         return lambda table: read(table, config)
 
     readers = {name: (paths, bound(read)) for name, (paths, read) in WHEEL_TYPES.items()}
-    found = _read_all(tables, readers, topics.wheels, no_motion)
+    found = _read_all(tables, readers, topics.wheels, WheelMotion)
     for name, left in by_topic.items() if topics.wheels is None else ():
         right = by_topic.get(right_twin(name, by_topic) or "")
         if right is not None and right.message_type == left.message_type:
@@ -190,14 +195,14 @@ def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: 
 
 
 def _ranked(
-    sources: Sequence[Source],
+    sources: Sequence[Kind],
     configured: str | None,
     bonus: Callable[[str], float],
     others: frozenset[str] = frozenset(),
-) -> list[Source]:
+) -> list[Kind]:
     """Return the sources sorted: usable ones first, this robot's before those of others, then by score and bonus."""
 
-    def rank(source: Source) -> tuple[bool, bool, float]:
+    def rank(source: Kind) -> tuple[bool, bool, float]:
         forced = configured is not None and source.topic == configured
         elsewhere = _namespace(source.topic) in others
         return (bool(source.problem) and not forced, elsewhere, -(source.score + bonus(source.topic)))
@@ -234,9 +239,8 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     _check_sides(topics, found, log, channels)
     wheels = _best(found.wheels, topics.wheels or _pair_name(topics))
     check_joints(wheels, found.wheels, config)
-    _check_configured("wheels", found.wheels, topics.wheels, found.unread, log, channels)
-    _check_configured("gnss", found.gnss, topics.gnss, found.unread, log, channels)
-    _check_configured("heading", found.heading, topics.heading, found.unread, log, channels)
+    for role in found.by_role():
+        _check_configured(role, found, getattr(topics, role), log, channels)
     gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
@@ -285,17 +289,13 @@ def _pair_name(topics: TopicsConfig) -> str | None:
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured pair of wheel topics that the log does not have or that cannot be used."""
-    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     for side in ("left", "right"):
         topic = getattr(topics, f"wheel_{side}")
         if topic is None:
             continue
         key, needed = f"topics.wheel_{side}", f"a side's topic is one of {', '.join(sorted(PAIR_TYPES))}"
-        if topic not in types:
-            listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, {}))}"
-            raise ConfigError(key, f"{topic} is not in {log}", listed)
-        if types[topic] not in PAIR_TYPES:
-            raise ConfigError(key, f"{topic}: {types[topic]} is not the number of one side", needed)
+        if (kind := _type_in(log, channels, key, topic)) not in PAIR_TYPES:
+            raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
         if topic in found.unread:
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
     if topics.wheel_left is not None and found.wheels and found.wheels[0].is_empty:
@@ -305,35 +305,42 @@ def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Se
 
 
 def _check_configured(
-    role: Role,
-    sources: Sequence[WheelMotion | PositionSource | HeadingSource],
-    configured: str | None,
-    unread: dict[str, str],
-    log: str,
-    channels: Sequence[Channel],
+    role: Role, found: Candidates, configured: str | None, log: str, channels: Sequence[Channel]
 ) -> None:
     """Refuse a configured topic that the log does not have or that has no usable row; other problems do not count."""
     if configured is None:
         return
-    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
-    key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
-    if configured not in types:
-        listed = f"{did_you_mean(configured, types)}it holds {', '.join(_listing(channels, unread))}"
-        raise ConfigError(key, f"{configured} is not in {log}", listed)
+    key, needed, sources = f"topics.{role}", f"it needs {NEEDS[role]}", found.by_role()[role]
+    kind = _type_in(log, channels, key, configured)
     if not sources:
-        if role == "wheels" and types[configured] in PAIR_TYPES:
+        if role == "wheels" and kind in PAIR_TYPES:
             needed = "name both sides in topics.wheel_left and topics.wheel_right"
-        raise ConfigError(key, f"{configured}: {unread.get(configured, f'{types[configured]} cannot feed it')}", needed)
+        raise ConfigError(key, f"{configured}: {found.unread.get(configured, f'{kind} cannot feed it')}", needed)
     if sources[0].is_empty:
         raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
 
 
-def _best(sources: Sequence[Source], configured: str | None) -> Source | None:
+def _type_in(log: str, channels: Sequence[Channel], key: str, topic: str) -> str:
+    """Return the message type of a configured topic.
+
+    Raises
+    ------
+    ConfigError
+        The log does not have the topic.
+    """
+    types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
+    if topic not in types:
+        listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, {}))}"
+        raise ConfigError(key, f"{topic} is not in {log}", listed)
+    return types[topic]
+
+
+def _best(sources: Sequence[Kind], configured: str | None) -> Kind | None:
     usable = (source for source in sources if not source.problem or source.topic == configured)
     return next(usable, None)
 
 
-def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> str:
+def _reason(best: Kind, sources: Sequence[Kind], configured: str | None) -> str:
     if configured is not None:
         return f"{best.why}; configured"
     rest = [source.topic for source in sources if source is not best]
@@ -342,14 +349,9 @@ def _reason(best: Source, sources: Sequence[Source], configured: str | None) -> 
 
 def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
     """Return, by topic, why candidates for some roles were refused."""
-    by_role: dict[Role, Sequence[WheelMotion | PositionSource | HeadingSource]] = {
-        "wheels": found.wheels,
-        "gnss": found.gnss,
-        "heading": found.heading,
-    }
     problems: dict[str, dict[str, None]] = {}
     for role in roles:
-        for source in by_role[role]:
+        for source in found.by_role()[role]:
             for topic in source.topic.split(" + "):
                 problems.setdefault(topic, {})[source.problem] = None
     return {topic: ", ".join(reasons) for topic, reasons in problems.items()}

@@ -38,7 +38,7 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
 
     def unusable(problem: str) -> WheelMotion:
         stamps = StampedRows(None, left.log_time_ns, "no header", 0)
-        return motion_of(topic, kind, stamps, score=score, problem=problem)
+        return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=problem)
 
     if not (len(left) and len(right)):
         return unusable(f"{(right if len(left) else left).topic} holds no message")
@@ -56,10 +56,12 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         other = np.interp(moments, right.log_time_ns, values[1])
         why = f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}"
-        return motion_of(topic, kind, stamps, (values[0][both], other), units=(unit, unit), score=score, why=why)
+        pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit=unit, score=score, why=why)
+        return motion_of(pair, (values[0][both], other))
     place = np.clip(np.searchsorted(right.log_time_ns, moments + _half_interval(left), side="right") - 1, 0, None)
     speed = (values[0][both], values[1][place])
-    return motion_of(topic, kind, stamps, speed=speed, units=("unknown", "unknown"), score=score, why=f"{why}: speeds")
+    pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=f"{why}: speeds")
+    return motion_of(pair, speed=speed)
 
 
 def _half_interval(table: TopicTable) -> int:

@@ -17,7 +17,7 @@ from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.position_sources import REFERENCE_WORDS
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.source import HEADER, Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
@@ -42,39 +42,32 @@ SIDEWAYS_SHARE = 0.2
 """A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class WheelMotion:
+Pair = tuple[Floats, Floats]
+"""Of the left and of the right side, (n,) each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelMotion(Source):
     """The motion of the wheels in a topic, or in a pair of topics.
 
     Attributes
     ----------
-    position_left, position_right : (n,) travelled since some start, in `position_unit`; None where not recorded
-    speed_left, speed_right : (n,) in `speed_unit` per second; None where not recorded
+    position : travelled since some start, in `unit`; None where not recorded
+    speed : in `unit` per second; None where not recorded
     twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
-    score : how suitable the type is; `why` is the reason as text
-    problem : why it cannot be used, empty when it can
     joints : the joints that its messages list by name, where they do
     """
 
-    topic: str
-    message_type: str
-    stamps: StampedRows
-    position_left: Floats | None = None
-    position_right: Floats | None = None
-    position_unit: Unit = "rad"
-    speed_left: Floats | None = None
-    speed_right: Floats | None = None
-    speed_unit: Unit = "rad"
+    position: Pair | None = None
+    speed: Pair | None = None
+    unit: Unit = "rad"
     twist: Floats | None = None
-    score: float = 0.0
-    why: str = ""
-    problem: str = ""
     joints: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether no row can be used, even where the topic is configured."""
-        return self.twist is None and self.position_left is None and self.speed_left is None
+        return self.twist is None and self.position is None and self.speed is None
 
 
 _Paths = tuple[str, str, str]
@@ -82,46 +75,29 @@ _Paths = tuple[str, str, str]
 
 Sides = tuple[Floats | None, Floats | None]
 Reader = Callable[[TopicTable, Config], WheelMotion]
-_NOT_RECORDED: Sides = (None, None)
+Entry = tuple[tuple[str, ...], Reader]
+"""The fields of a message type to take, and how to read them."""
 
 
-def no_motion(table: TopicTable, problem: str) -> WheelMotion:
-    """Return an empty motion for a topic that cannot be read, with the reason."""
-    return WheelMotion(table.topic, table.message_type, stamp_rows(table), problem=problem)
+def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides = (None, None)) -> WheelMotion:
+    """Return a motion with what left and right recorded; without what one side lacks, or has no finite value of."""
+    motion = replace(motion, position=_of_both(position), speed=_of_both(speed))
+    if motion.is_empty:
+        return replace(motion, problem=motion.problem or "has neither position nor speed of both sides")
+    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in motion.position or ())
+    if changes or any(_nonzero(values) for values in (*(motion.speed or ()), motion.twist) if values is not None):
+        return motion
+    return replace(motion, score=motion.score - NEVER_MOVES, why=f"{motion.why}, never moves")
 
 
-def motion_of(
-    topic: str, message_type: str, stamps: StampedRows, position: Sides = _NOT_RECORDED, speed: Sides = _NOT_RECORDED,
-    twist: Floats | None = None, units: tuple[Unit, Unit] = ("rad", "rad"), score: float = 0.0, why: str = "",
-    problem: str = "",
-) -> WheelMotion:  # fmt: skip
-    """Return a motion of left and right; a quantity of one side only, or without a finite value, is left out."""
-    recorded = [pair if all(side is not None and bool(np.isfinite(side).any()) for side in pair) else _NOT_RECORDED
-            for pair in (position, speed)]  # fmt: skip
-    values = [side for pair in recorded for side in pair if side is not None] + ([twist] if twist is not None else [])
-    if not values and not problem:
-        problem = "has neither position nor speed of both sides"
-    if (
-        values
-        and not any(_changes(side) for side in recorded[0])
-        and not any(_nonzero(v) for v in (*recorded[1], twist))
-    ):
-        score, why = score - NEVER_MOVES, f"{why}, never moves"
-    return WheelMotion(
-        topic, message_type, stamps, *recorded[0], units[0], *recorded[1], units[1], twist, score, why, problem
-    )
+def _of_both(sides: Sides) -> Pair | None:
+    left, right = sides
+    known = left is not None and right is not None and bool(np.isfinite(left).any() and np.isfinite(right).any())
+    return (left, right) if known and left is not None and right is not None else None
 
 
-def _changes(side: Floats | None) -> bool:
-    return side is not None and float(np.ptp(side[np.isfinite(side)])) > 0.0
-
-
-def _nonzero(values: Floats | None) -> bool:
-    return values is not None and bool(np.any(values[np.isfinite(values)] != 0.0))
-
-
-def _header(*paths: str) -> tuple[str, ...]:
-    return ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *paths)
+def _nonzero(values: Floats) -> bool:
+    return bool(np.any(values[np.isfinite(values)] != 0.0))
 
 
 def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
@@ -162,12 +138,11 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     if not (left and right):
         advice = "name them in wheels.{left,right}_joints"
         named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
-        return no_motion(table, named if texts else "lists no joints")
+        return WheelMotion(**of_topic(table), problem=named if texts else "lists no joints")
     lefts, rights = len(left), len(right)
     if max(lefts, rights) > MOST_WHEELS:
-        return no_motion(
-            table, f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
-        )
+        problem = f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
+        return WheelMotion(**of_topic(table), problem=problem)
     # Joints by their place among the wheels, left ones first; -1 for all others.
     wheel = np.full(len(texts) + 1, -1)
     wheel[left + right] = np.arange(lefts + rights)
@@ -176,14 +151,14 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
     alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
     if not alike.any():
-        return no_motion(table, "left and right wheels come in different messages")
+        return WheelMotion(**of_topic(table), problem="left and right wheels come in different messages")
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
     sides = [*range(lefts)], [*range(lefts, lefts + rights)]
     position = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
     speed = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-    return motion_of(table.topic, table.message_type, stamp_rows(table), position, speed, score=score, why=why)
+    return motion_of(WheelMotion(**of_topic(table), score=score, why=why), position, speed)
 
 
 def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
@@ -232,17 +207,17 @@ def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int
             yield rows, listed[rows], place
 
 
-def _by_name(paths: _Paths, score: float, what: str) -> Reader:
+def _by_name(paths: _Paths, score: float, what: str) -> Entry:
     def read(table: TopicTable, config: Config) -> WheelMotion:
         return replace(_joints(table, config, paths, score, what), joints=tuple(table.words(paths[0])[1]))
 
-    return read
+    return (*HEADER, *paths), read
 
 
 def _by_place(
     paths: tuple[str, str], left: list[int], right: list[int], why: str, stamp: str = "header.stamp"
-) -> Reader:
-    """Return a reader of messages whose lists of positions and of speeds have each side at fixed positions."""
+) -> Entry:
+    """Return the entry of messages whose lists of positions and of speeds have each side at fixed positions."""
     length = max(left + right) + 1
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
@@ -250,28 +225,28 @@ def _by_place(
         if min(position.shape[1], speed.shape[1]) < length:
             raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
         return motion_of(
-            table.topic, table.message_type, stamp_rows(table, stamp),
+            WheelMotion(**of_topic(table, stamp), score=90.0, why=why),
             _side_means(_unwound(position.astype(np.float64)), left, right),
-            _side_means(speed, left, right), score=90.0, why=why,
-        )  # fmt: skip
+            _side_means(speed, left, right),
+        )
 
-    return read
+    return (f"{stamp}.sec", f"{stamp}.nanosec", *paths), read
 
 
-def _segway(prefix: str) -> Reader:
-    """Return a reader of the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
+def _segway(prefix: str, *header: str) -> Entry:
+    """Return the entry of the status of a Segway RMP: wheel displacement [m] and speed [m/s]."""
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         def sides(quantity: str) -> Sides:
             left, right = (table.floats(f"{prefix}{side}_wheel_{quantity}") for side in ("left", "right"))
             return left, right
 
-        return motion_of(
-            table.topic, table.message_type, stamp_rows(table), sides("displacement"), sides("velocity"),
-            units=("m", "m"), score=90.0, why="the base's wheel displacement and speed",
-        )  # fmt: skip
+        why = "the base's wheel displacement and speed"
+        base = WheelMotion(**of_topic(table), unit="m", score=90.0, why=why)
+        return motion_of(base, sides("displacement"), sides("velocity"))
 
-    return read
+    fields = (f"{prefix}{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
+    return (*header, *fields), read
 
 
 def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
@@ -283,73 +258,64 @@ def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score
     problem = ""
     if not _nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
         problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
-    return motion_of(
-        table.topic, table.message_type, stamp_rows(table), twist=twist, score=score, why=why, problem=problem
-    )
+    return motion_of(WheelMotion(**of_topic(table), unit="m", twist=twist, score=score, why=why, problem=problem))
 
 
 def _scout(table: TopicTable, _: Config) -> WheelMotion:
     """Return the body twist in scout_msgs/ScoutStatus (its motor rpm is integer, and before the gearbox)."""
     why = "the base's own speed and turn rate, converted to wheel speeds with the track width"
-    return _twist_motion(table, "linear_velocity", "lateral_velocity", "angular_velocity", 70.0, why)
+    return _twist_motion(table, *_SCOUT, 70.0, why)
 
 
-def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Reader:
-    """Return a reader of a body twist; `fused` is subtracted from the score of a topic named as fused with others."""
+def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 45.0) -> Entry:
+    """Return the entry of a body twist; `fused` is subtracted from the score of a topic named as fused with others."""
+    paths = (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
 
     def read(table: TopicTable, _: Config) -> WheelMotion:
         lowered = score - (fused if _FUSED.search(table.topic) else 0.0)
         why = f"{what}, converted to wheel speeds with the track width"
-        motion = _twist_motion(table, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", lowered, why)
+        motion = _twist_motion(table, *paths, lowered, why)
         if REFERENCE_WORDS.search(table.topic) and not motion.problem:
             return replace(motion, problem="its name is that of a position reference, not of wheels")
         return motion
 
-    return read
-
-
-def _twist_paths(prefix: str) -> tuple[str, ...]:
-    return (f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z")
+    return (*(HEADER if prefix else ()), *paths), read
 
 
 _JOINTS = ("name[*]", "position[*]", "velocity[*]")
-_DRIVERS = ("drivers[*].measured_travel", "drivers[*].measured_velocity")
 _LYNX = ("drivers[*].joint_name", "drivers[*].travel", "drivers[*].velocity")
-_PUMA = ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed")
-_FOUR = ("position[*]", "velocity[*]")
-_SEGWAY = tuple(f"{side}_wheel_{what}" for side in ("left", "right") for what in ("velocity", "displacement"))
-
-_joint_state = _by_name(_JOINTS, 100.0, "wheel joints by name")
-_dynamic_joint_state = _by_name(_JOINTS, 95.0, "wheel joints by name")
-_lynx = _by_name(_LYNX, 90.0, "motor driver feedback by joint name")
-_puma = _by_name(_PUMA, 90.0, "motor driver feedback by device name")
+_PUMA = _by_name(
+    ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed"),
+    90.0, "motor driver feedback by device name",
+)  # fmt: skip
 # Drive.msg of jackal_msgs and of clearpath_platform_msgs: 0 is left, 1 is right.
-_two_drivers = _by_place(_DRIVERS, [0], [1], "motor driver feedback: driver 0 left, 1 right")
-_four_wheels = _by_place(
-    _FOUR, [0, 1], [2, 3], "four wheels: front left, rear left, front right, rear right", stamp="stamp"
-)
-_odometry = _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0)
+_TWO_DRIVERS = _by_place(
+    ("drivers[*].measured_travel", "drivers[*].measured_velocity"), [0], [1],
+    "motor driver feedback: driver 0 left, 1 right",
+)  # fmt: skip
+_SCOUT = ("linear_velocity", "lateral_velocity", "angular_velocity")
+_SEGWAY_BARE, _SEGWAY_STAMPED = _segway(""), _segway("segway.", *HEADER)
 
-_SEGWAY_BARE = (_SEGWAY, _segway(""))
-_SEGWAY_STAMPED = (_header(*(f"segway.{field}" for field in _SEGWAY)), _segway("segway."))
-
-WHEEL_TYPES: dict[str, tuple[tuple[str, ...], Reader]] = {
-    "sensor_msgs/JointState": (_header(*_JOINTS), _joint_state),
-    DYNAMIC_JOINT_STATE: (_header(*_JOINTS), _dynamic_joint_state),
-    "jackal_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
-    "clearpath_platform_msgs/Feedback": (_header(*_DRIVERS), _two_drivers),
-    "clearpath_motor_msgs/LynxMultiFeedback": (_header(*_LYNX), _lynx),
-    "clearpath_motor_msgs/PumaMultiFeedback": (_header(*_PUMA), _puma),
-    "puma_motor_msgs/MultiFeedback": (_header(*_PUMA), _puma),
-    "leo_msgs/WheelStates": (("stamp.sec", "stamp.nanosec", *_FOUR), _four_wheels),
-    "scout_msgs/ScoutStatus": (_header("linear_velocity", "lateral_velocity", "angular_velocity"), _scout),
+WHEEL_TYPES: dict[str, Entry] = {
+    "sensor_msgs/JointState": _by_name(_JOINTS, 100.0, "wheel joints by name"),
+    DYNAMIC_JOINT_STATE: _by_name(_JOINTS, 95.0, "wheel joints by name"),
+    "jackal_msgs/Feedback": _TWO_DRIVERS,
+    "clearpath_platform_msgs/Feedback": _TWO_DRIVERS,
+    "clearpath_motor_msgs/LynxMultiFeedback": _by_name(_LYNX, 90.0, "motor driver feedback by joint name"),
+    "clearpath_motor_msgs/PumaMultiFeedback": _PUMA,
+    "puma_motor_msgs/MultiFeedback": _PUMA,
+    "leo_msgs/WheelStates": _by_place(
+        ("position[*]", "velocity[*]"), [0, 1], [2, 3],
+        "four wheels: front left, rear left, front right, rear right", "stamp",
+    ),
+    "scout_msgs/ScoutStatus": ((*HEADER, *_SCOUT), _scout),
     **dict.fromkeys(("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped"), _SEGWAY_STAMPED),
     "segway_interfaces/Stamped": _SEGWAY_STAMPED,
     **dict.fromkeys(("segway_rmp/SegwayStatus", "segway_rmp_ros2/SegwayStatus"), _SEGWAY_BARE),
     "segway_interfaces/Segwaystatus": _SEGWAY_BARE,
-    "nav_msgs/Odometry": (_header(*_twist_paths("twist.twist.")), _odometry),
-    "geometry_msgs/TwistStamped": (_header(*_twist_paths("twist.")), _twist("twist.", 50.0)),
-    "geometry_msgs/TwistWithCovarianceStamped": (_header(*_twist_paths("twist.twist.")), _twist("twist.twist.", 50.0)),
-    "geometry_msgs/Twist": (_twist_paths(""), _twist("", 40.0)),
-}
+    "nav_msgs/Odometry": _twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0),
+    "geometry_msgs/TwistStamped": _twist("twist.", 50.0),
+    "geometry_msgs/TwistWithCovarianceStamped": _twist("twist.twist.", 50.0),
+    "geometry_msgs/Twist": _twist("", 40.0),
+}  # fmt: skip
 """By message type: the fields to take, and how to read them."""

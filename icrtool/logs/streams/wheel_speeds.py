@@ -8,7 +8,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.streams.stamps import increasing
-from icrtool.logs.streams.wheel_sources import Unit, WheelMotion
+from icrtool.logs.streams.wheel_sources import Pair, Unit, WheelMotion
 from icrtool.records.samples import WheelSamples
 
 MOST_NOT_FINITE = 0.01
@@ -72,16 +72,15 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
         with np.errstate(over="ignore", invalid="ignore"):
             return speed - turn * width / 2, speed + turn * width / 2, "m", False
     wanted = config.wheels.quantity
-    positions = _both(motion.position_left, motion.position_right)
-    speeds = _both(motion.speed_left, motion.speed_right)
+    positions, speeds = motion.position, motion.speed
     by_position = positions is not None and wanted != "velocity" and (wanted != "auto" or _alive(positions, speeds))
     if wanted in ("position", "counts") and positions is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no {wanted}", "leave it on auto")
     if speeds is not None and not by_position:
-        return *speeds, motion.speed_unit, False
+        return *speeds, motion.unit, False
     if positions is None or wanted == "velocity":
         raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
-    unit: Unit = "counts" if wanted == "counts" else motion.position_unit
+    unit: Unit = "counts" if wanted == "counts" else motion.unit
     return *positions, unit, True
 
 
@@ -99,11 +98,7 @@ def _assumptions(motion: WheelMotion, config: Config) -> list[str]:
     return [f"{motion.topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together"]
 
 
-def _both(left: Floats | None, right: Floats | None) -> tuple[Floats, Floats] | None:
-    return (left, right) if left is not None and right is not None else None
-
-
-def _alive(positions: tuple[Floats, Floats], speeds: tuple[Floats, Floats] | None) -> bool:
+def _alive(positions: Pair, speeds: Pair | None) -> bool:
     """Return whether the positions change where the speeds do: some drivers leave the position at zero."""
     finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
     if np.count_nonzero(finite) < len(finite) / 2:

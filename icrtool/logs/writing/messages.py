@@ -128,14 +128,14 @@ def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> TopicPl
 def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where: str) -> dict[str, NDArray[Any]]:
     """Return the body twist as wheel controllers report it: no slip, body x forward and y left (REP-103)."""
     right, left = columns.wheel_v_right_mps, columns.wheel_v_left_mps
-    return {
+    return header_stamps(columns.wheel_stamp_ns) | {
         f"{where}.linear.x": (right + left) / 2,
         f"{where}.angular.z": (right - left) / options.track_width_m,
     }
 
 
 def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
-    changing = header_stamps(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist.twist")
+    changing = _wheel_controller_twist(columns, options, "twist.twist")
     fixed: dict[str, object] = {
         "header.frame_id": "odom",
         "child_frame_id": "base_link",
@@ -145,7 +145,7 @@ def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
 
 
 def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
-    changing = header_stamps(columns.wheel_stamp_ns) | _wheel_controller_twist(columns, options, "twist")
+    changing = _wheel_controller_twist(columns, options, "twist")
     topic, message_type = "/wheel_controller/twist", "geometry_msgs/msg/TwistStamped"
     return TopicPlan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing)
 

@@ -102,7 +102,7 @@ def format_markdown(report: DropoutReport) -> str:
 
 def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str]:
     """Return the table against the baseline: number, difference and its 95 % interval."""
-    shown = shown_horizons(report)
+    shown = shown_horizons(report.horizons_m)
     changes = [f"- {escaped_markdown(change)}" for change in baseline.changes(report.run_summary)]
     lines = [
         "",

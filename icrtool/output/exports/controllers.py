@@ -10,8 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import POSE_AFTER_M, TWIST_OVER_M, export_warnings, factor_to_old
-from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.calibration.controller_numbers import POSE_AFTER_M, export_warnings, factor_to_old
+from icrtool.calibration.error_growth import TWIST_OVER_M
+from icrtool.calibration.record import Calibration, ControllerErrors, ControllerNumbers
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.files.json_file import json_bytes
@@ -129,15 +130,11 @@ def _nav2(errors: ControllerErrors) -> list[str]:
 
 def _controller(calibration: Calibration, errors: ControllerErrors, indent: int) -> list[str]:
     """Return the parameters of a diff_drive_controller."""
-    numbers, radius = calibration.controller_numbers(), calibration.robot["wheel_radius_m"]
+    radius = calibration.robot["wheel_radius_m"]
     lines = [f"wheel_separation: {_number(calibration.width_m)}"]
     if radius is not None:
         lines.append(f"wheel_radius: {_number(radius)}")
-    for key, value, std in (
-        ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std),
-        ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
-        ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
-    ):
+    for key, value, std in controller_rows(calibration.controller_numbers()):
         lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
@@ -146,6 +143,15 @@ def _controller(calibration: Calibration, errors: ControllerErrors, indent: int)
         f"twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
     ]
     return [" " * indent + line for line in lines]
+
+
+def controller_rows(numbers: ControllerNumbers) -> list[tuple[str, float, float]]:
+    """Return what a diff_drive_controller calls each number, its value and its standard deviation."""
+    return [
+        ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std),
+        ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
+        ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
+    ]
 
 
 def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:

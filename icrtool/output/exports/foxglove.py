@@ -110,7 +110,8 @@ def write_foxglove(run: Run, path: Path) -> None:
     ]
     topics = [serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
     topics += [_whole_path(path, store) for path in paths]
-    topics += [_event_topic("/events", _slip_events(run), store), _event_topic("/outages", _outages(run), store)]
+    slip = ({**event, "x_m": event["east_m"], "y_m": event["north_m"]} for event in run.summary["events"])
+    topics += [_event_topic("/events", slip, store), _event_topic("/outages", _outages(run), store)]
     about = {
         "tool_version": __version__, "log": run.name, "robot": run.config.robot.name or "", "usable": str(run.usable),
         "unusable_because": run.summary["unusable_because"] or "",
@@ -249,11 +250,6 @@ def _errors(run: Run) -> TopicPlan:
     columns |= {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
     fixed: dict[str, object] = {"header.frame_id": BODIES["filter"], "horizon_m": ERROR_HORIZON_M}
     return TopicPlan("/open_loop_error", ERROR, run.table.stamp_ns[rows], fixed, columns)
-
-
-def _slip_events(run: Run) -> Iterator[dict[str, Any]]:
-    for event in run.summary["events"]:
-        yield {**event, "x_m": event["east_m"], "y_m": event["north_m"]}
 
 
 def _outages(run: Run) -> Iterator[dict[str, Any]]:

@@ -49,11 +49,11 @@ def format_geojson(run: Run) -> str:
     """
     globe, paths = find_globe(run), paths_of(run)
     features = [
-        *(_path_feature(run, path, globe) for path in paths),
-        *_outage_features(run, paths[0], globe),
+        *path_features(run, paths, globe),
+        *outage_features(run, globe),
         *_state_features(run, globe),
         *_fix_features(run, globe),
-        *_event_features(run, globe),
+        *event_features(run, globe),
     ]
     about = {
         "log": run.name, "robot": run.config.robot.name, "usable": run.usable,
@@ -67,7 +67,8 @@ def _feature(layer: str, geometry: dict[str, Any], properties: dict[str, Any]) -
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **properties}}
 
 
-def _coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
+def coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
+    """Return longitude and latitude [deg] of points (n,) east and north of the datum."""
     latitude, longitude = globe.places(x_m, y_m)
     pairs: list[list[float]] = np.round(np.column_stack([longitude, latitude]), DEGREE_DIGITS).tolist()
     return pairs
@@ -75,33 +76,36 @@ def _coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
 
 def _line(x_m: Floats, y_m: Floats, globe: Globe) -> dict[str, Any]:
     rows = line_rows(x_m, y_m)
-    return {"type": "LineString", "coordinates": _coordinates(x_m[rows], y_m[rows], globe)}
+    return {"type": "LineString", "coordinates": coordinates(x_m[rows], y_m[rows], globe)}
 
 
 def _points(
     layer: str, x_m: Floats, y_m: Floats, globe: Globe, columns: dict[str, list[Any]]
 ) -> Iterator[dict[str, Any]]:
     """Yield a point for each row; `columns` are its attributes."""
-    for pair, values in zip(_coordinates(x_m, y_m, globe), zip(*columns.values(), strict=True), strict=True):
+    for pair, values in zip(coordinates(x_m, y_m, globe), zip(*columns.values(), strict=True), strict=True):
         geometry = {"type": "Point", "coordinates": pair}
         yield _feature(layer, geometry, dict(zip(columns, values, strict=True)))
 
 
-def _path_feature(run: Run, path: ExportPath, globe: Globe) -> dict[str, Any]:
-    length_m = float(np.hypot(np.diff(path.x_m), np.diff(path.y_m)).sum())
-    begin, end = utc_text(path.stamp_ns[[0, -1]])
-    properties = {
-        "path": path.name, "label": LABELS[path.name], "log": run.name, "begin_utc": begin, "end_utc": end,
-        "length_m": length_m, "end_error_m": path.end_error_m, "usable": run.usable,
-    }  # fmt: skip
-    return _feature("path", _line(path.x_m, path.y_m, globe), properties)
+def path_features(run: Run, paths: Sequence[ExportPath], globe: Globe) -> Iterator[dict[str, Any]]:
+    """Yield a line for each path."""
+    for path in paths:
+        length_m = float(np.hypot(np.diff(path.x_m), np.diff(path.y_m)).sum())
+        begin, end = utc_text(path.stamp_ns[[0, -1]])
+        properties = {
+            "path": path.name, "label": LABELS[path.name], "log": run.name, "begin_utc": begin, "end_utc": end,
+            "length_m": length_m, "end_error_m": path.end_error_m, "usable": run.usable,
+        }  # fmt: skip
+        yield _feature("path", _line(path.x_m, path.y_m, globe), properties)
 
 
-def _outage_features(run: Run, path: ExportPath, globe: Globe) -> Iterator[dict[str, Any]]:
+def outage_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
+    """Yield the filter's path in each outage as a line."""
     for span_ns, rows in outage_rows(run):
         begin, end = utc_text(np.array(span_ns, np.int64))
         properties = {"begin_utc": begin, "end_utc": end, "duration_s": (span_ns[1] - span_ns[0]) / 1e9}
-        yield _feature("outage", _line(path.x_m[rows], path.y_m[rows], globe), properties)
+        yield _feature("outage", _line(run.table.east_m[rows], run.table.north_m[rows], globe), properties)
 
 
 def _state_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
@@ -139,7 +143,8 @@ def _fix_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
 _USES = {UNSEEN: "not in the run", GATED: "rejected"}
 
 
-def _event_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
+def event_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
+    """Yield a point for each slip event."""
     events: Sequence[Mapping[str, Any]] = run.summary["events"]
     if not events:
         return

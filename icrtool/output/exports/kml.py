@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats
-from icrtool.output.exports.paths import (
-    LABELS,
-    ExportPath,
-    Globe,
-    PathName,
-    find_globe,
-    line_rows,
-    outage_rows,
-    paths_of,
-    rows_apart,
-    utc_text,
-)
+from icrtool.output.exports.geojson import coordinates, event_features, outage_features, path_features
+from icrtool.output.exports.paths import ExportPath, Globe, PathName, find_globe, paths_of, rows_apart, utc_text
 from icrtool.output.text_format import distance_text, duration_text, run_title, xml_text
 from icrtool.records.run import Run
 
@@ -56,12 +46,25 @@ def format_kml(run: Run) -> str:
         _child(line, "color", color)
         _child(line, "width", "6" if name == "outage" else "3")
     folder = _folder(document, "paths")
-    for path in paths:
-        note = "" if path.name in ("filter", "smoothed") else f"ends {distance_text(path.end_error_m)} off the filter"
-        _line(_placemark(folder, LABELS[path.name], note, path.name), path.x_m, path.y_m, globe)
+    for one in path_features(run, paths, globe):
+        facts = one["properties"]
+        drifts = facts["path"] not in ("filter", "smoothed")
+        note = f"ends {distance_text(facts['end_error_m'])} off the filter" if drifts else ""
+        _placemark(folder, facts["label"], note, facts["path"], geometry=one["geometry"])
     _track(_folder(document, "drive over time"), paths[0], globe)
-    _outages(_folder(document, "outages"), run, paths[0], globe)
-    _events(_folder(document, "slip events"), run, globe)
+    folder = _folder(document, "outages")
+    for number, one in enumerate(outage_features(run, globe), start=1):
+        facts = one["properties"]
+        note = f"{duration_text(facts['duration_s'])} without usable GNSS"
+        span = facts["begin_utc"], facts["end_utc"]
+        _placemark(folder, f"outage {number}", note, "outage", span, one["geometry"])
+    folder = _folder(document, "slip events")
+    for one in event_features(run, globe):
+        facts = one["properties"]
+        lasted = duration_text(facts["end_s"] - facts["begin_s"])
+        note = f"{lasted}, {100 * facts['severity']:.0f} % of the wheels' motion missed"
+        times = utc_text(np.array([facts["begin_ns"], facts["end_ns"]], np.int64))
+        _placemark(folder, facts["kind"], note, span=times, geometry=one["geometry"])
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode")
 
@@ -86,34 +89,28 @@ def _folder(document: ET.Element, name: str) -> ET.Element:
 
 
 def _placemark(
-    folder: ET.Element, name: str, note: str = "", style: str = "", span_ns: tuple[int, int] | None = None
-) -> ET.Element:
-    """Add a place mark without its geometry; its elements have a fixed order."""
+    folder: ET.Element, name: str, note: str = "", style: str = "", span: Sequence[str] = (),
+    geometry: Mapping[str, Any] | None = None,
+) -> ET.Element:  # fmt: skip
+    """Add a place mark with a geometry of GeoJSON on the ground; its elements have a fixed order."""
     placemark = _child(folder, "Placemark")
     _child(placemark, "name", name)
     if note:
         _child(placemark, "description", note)
-    if span_ns is not None:
-        span = _child(placemark, "TimeSpan")
-        for tag, time in zip(("begin", "end"), utc_text(np.array(span_ns, np.int64)), strict=True):
-            _child(span, tag, time)
+    if span:
+        times = _child(placemark, "TimeSpan")
+        for tag, time in zip(("begin", "end"), span, strict=True):
+            _child(times, tag, time)
     if style:
         _child(placemark, "styleUrl", f"#{style}")
+    if geometry is not None:
+        shape, places = _child(placemark, geometry["type"]), geometry["coordinates"]
+        if geometry["type"] == "LineString":
+            _child(shape, "tessellate", "1")
+        else:
+            places = [places]
+        _child(shape, "coordinates", " ".join(f"{east:.9f},{north:.9f},0" for east, north in places))
     return placemark
-
-
-def _line(placemark: ET.Element, x_m: Floats, y_m: Floats, globe: Globe) -> None:
-    """Add a line on the ground through points (n,) east and north of the datum."""
-    rows = line_rows(x_m, y_m)
-    line = _child(placemark, "LineString")
-    _child(line, "tessellate", "1")
-    _child(line, "coordinates", " ".join(_coordinates(x_m[rows], y_m[rows], globe, ",")))
-
-
-def _coordinates(x_m: Floats, y_m: Floats, globe: Globe, separator: str) -> Iterator[str]:
-    latitude, longitude = globe.places(x_m, y_m)
-    for east, north in zip(longitude.tolist(), latitude.tolist(), strict=True):
-        yield f"{east:.9f}{separator}{north:.9f}{separator}0"
 
 
 def _track(folder: ET.Element, path: ExportPath, globe: Globe) -> None:
@@ -122,23 +119,7 @@ def _track(folder: ET.Element, path: ExportPath, globe: Globe) -> None:
     _child(track, "altitudeMode", "clampToGround")
     for time in utc_text(path.stamp_ns[rows]):
         _child(track, "when", time)
-    for place in _coordinates(path.x_m[rows], path.y_m[rows], globe, " "):
-        ET.SubElement(track, f"{{{GX}}}coord").text = place
+    for east, north in coordinates(path.x_m[rows], path.y_m[rows], globe):
+        ET.SubElement(track, f"{{{GX}}}coord").text = f"{east:.9f} {north:.9f} 0"
     for heading_deg in np.mod(90.0 - np.degrees(path.yaw_rad[rows]), 360.0).tolist():
         ET.SubElement(track, f"{{{GX}}}angles").text = f"{heading_deg:.1f} 0 0"
-
-
-def _outages(folder: ET.Element, run: Run, path: ExportPath, globe: Globe) -> None:
-    for number, (span_ns, rows) in enumerate(outage_rows(run), start=1):
-        note = f"{duration_text((span_ns[1] - span_ns[0]) / 1e9)} without usable GNSS"
-        placemark = _placemark(folder, f"outage {number}", note, "outage", span_ns)
-        _line(placemark, path.x_m[rows], path.y_m[rows], globe)
-
-
-def _events(folder: ET.Element, run: Run, globe: Globe) -> None:
-    for event in run.summary["events"]:
-        lasted = duration_text(event["end_s"] - event["begin_s"])
-        note = f"{lasted}, {100 * event['severity']:.0f} % of the wheels' motion missed"
-        placemark = _placemark(folder, event["kind"], note, span_ns=(event["begin_ns"], event["end_ns"]))
-        x_m, y_m = np.array([event["east_m"]]), np.array([event["north_m"]])
-        _child(_child(placemark, "Point"), "coordinates", next(_coordinates(x_m, y_m, globe, ",")))

@@ -25,22 +25,16 @@ def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
     TUM (``evo``): stamp [s], x, y, z, and the quaternion x, y, z, w. KITTI: the upper three rows of the pose matrix,
     row by row, without a stamp. World ENU, body x forward and y left (REP-103); KITTI's own camera frame is not used.
     """
-    return _tum(path) if target == "evo" else _kitti(path)
-
-
-def _tum(path: ExportPath) -> str:
+    if target == "kitti":
+        cos, sin, minus_sin = np.cos(path.yaw_rad), np.sin(path.yaw_rad), -np.sin(path.yaw_rad)
+        matrix = zip(*(_numbers(column) for column in (cos, minus_sin, path.x_m, sin, path.y_m)), strict=True)
+        return "".join(f"{c} {n} 0 {x} {s} {c} 0 {y} 0 0 1 0\n" for c, n, x, s, y in matrix)
     z, w = path.quaternion
     columns = (_numbers(column) for column in (path.x_m, path.y_m, z, w))
     seconds, rest = np.divmod(path.stamp_ns, 1_000_000_000)
     stamps = zip(seconds.tolist(), rest.tolist(), strict=True)
     rows = zip(stamps, *columns, strict=True)
     return "".join(f"{whole}.{part:09d} {x} {y} 0 0 0 {qz} {qw}\n" for (whole, part), x, y, qz, qw in rows)
-
-
-def _kitti(path: ExportPath) -> str:
-    cos, sin, minus_sin = np.cos(path.yaw_rad), np.sin(path.yaw_rad), -np.sin(path.yaw_rad)
-    rows = zip(*(_numbers(column) for column in (cos, minus_sin, path.x_m, sin, path.y_m)), strict=True)
-    return "".join(f"{c} {n} 0 {x} {s} {c} 0 {y} 0 0 1 0\n" for c, n, x, s, y in rows)
 
 
 def _numbers(column: Floats) -> list[float]:

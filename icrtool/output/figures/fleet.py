@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,28 +23,18 @@ COLORS = ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
-class IcrPoint(NamedTuple):
-    """Final ICRs of a log [m] with their standard deviations; `date` is ISO 8601 in UTC."""
-
-    robot: str
-    date: str
-    right_m: float
-    left_m: float
-    right_std_m: float
-    left_std_m: float
-
-
 class FleetNumbers(NamedTuple):
     """What the figures of a batch show.
 
     Attributes
     ----------
+    points : the logs with a date and both lateral ICRs, as fleet.json has them
     errors_m : 95 % error after 10 m of each log, by group
     reasons : how many logs failed, by reason
     """
 
     title: str
-    points: Sequence[IcrPoint]
+    points: Sequence[Mapping[str, Any]]
     errors_m: Mapping[str, Sequence[float]]
     reasons: Mapping[str, int]
 
@@ -58,19 +48,20 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
         fleet.title, "final ICRs of every log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12
     )  # fmt: skip
     panels = figure.subplots(2, 1, sharex=True)
-    for axes, side, label in zip(panels, (0, 1), ("ICR y right [m]", "ICR y left [m]"), strict=True):
-        for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
-            mine = [point for point in fleet.points if point.robot == robot]
+    for axes, side in zip(panels, ("right", "left"), strict=True):
+        for number, robot in enumerate(dict.fromkeys(point["robot"] for point in fleet.points)):
+            mine = [point for point in fleet.points if point["robot"] == robot]
             key = f" {drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
-            when = date2num([np.datetime64(point.date.rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
+            when = date2num([np.datetime64(point["start_utc"].rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
             axes.errorbar(
-                when, [point[2 + side] for point in mine], [point[4 + side] for point in mine],
+                when, [point["icr"][f"y_icr_{side}_m"] for point in mine],
+                [point["icr"][f"std_y_icr_{side}_m"] or 0.0 for point in mine],
                 linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
                 markersize=4.5, capsize=2.0, linewidth=1.0, label=key,
             )  # fmt: skip
-        axes.set_ylabel(label)
+        axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()
-    if last - first < LEAST_DAYS or len({point.date for point in fleet.points}) == 1:
+    if last - first < LEAST_DAYS or len({point["start_utc"] for point in fleet.points}) == 1:
         middle = (first + last) / 2
         panels[-1].set_xlim(middle - LEAST_DAYS / 2, middle + LEAST_DAYS / 2)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]

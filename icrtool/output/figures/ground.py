@@ -22,8 +22,6 @@ FAR_M = 20_000.0
 CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
-Range = tuple[float, float]
-
 
 def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
     """Return the height [in] of axes of a given width that suits points (n,) [m]."""

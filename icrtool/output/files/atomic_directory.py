@@ -15,13 +15,11 @@ from pathlib import Path, PurePosixPath
 from icrtool.errors import OutputError
 from icrtool.output.files import disk
 from icrtool.output.files.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
-from icrtool.records.text import escaped
+from icrtool.records.text import escaped, listed
 from icrtool.records.unfinished import end, unfinished
 
 IsOurs = Callable[[Path], bool]
 """Whether a directory is one that we wrote and may replace."""
-
-NAMES_SHOWN = 5
 
 
 def check_directory(directory: Path, ours: IsOurs, *, kind: str) -> None:
@@ -257,10 +255,7 @@ def _make_parents(place: Path, missing: Collection[Path]) -> None:
 
 def _listed(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:
     """Return names in a line; a directory at the top stands for its files unless it is one of `tops`."""
-    names = list(
-        dict.fromkeys(
-            f"{path.parts[0]}/" if len(path.parts) > 1 and path.parts[0] not in tops else str(path) for path in paths
-        )
+    names = dict.fromkeys(
+        f"{path.parts[0]}/" if len(path.parts) > 1 and path.parts[0] not in tops else str(path) for path in paths
     )
-    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    return escaped(", ".join(names[:NAMES_SHOWN]) + more)
+    return escaped(listed(list(names)))

@@ -6,13 +6,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from icrtool.calibration.record import CALIBRATION_SCHEMA, Calibration
-from icrtool.calibration.stored import calibration_of
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic_file import write_file
 from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.records.run import CALIBRATION_SCHEMA
+
+if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
 
 FILE_NAME = "calibration.json"
 
@@ -29,6 +31,8 @@ def open_calibration(file: Path | str) -> Calibration:
     RunError
         It cannot be read, or is not a calibration.
     """
+    from icrtool.calibration.stored import calibration_of
+
     path = Path(file)
     try:
         return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)

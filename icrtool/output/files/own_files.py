@@ -14,8 +14,6 @@ OWN_FILES = ".icrtool-files"
 
 SCHEMA = "icrtool/files/1"
 
-SUFFIXES = frozenset({".csv", ".json", ".parquet", ".png", ".svg", ".pdf"})
-
 
 def write_own_files(directory: Path, kind: str, made_from: Sequence[str] = ()) -> None:
     """Write the list of all files in a directory that is about to be put in place.
@@ -45,35 +43,19 @@ def files_by_owner(directory: Path, names: Collection[str]) -> tuple[list[PurePo
 
     Parameters
     ----------
-    names : names at the top that are icrtool's though no list has them: files written later than the directory, and
-        directories of an older version, which wrote no lists
-
-    Notes
-    -----
-    In a directory without a list only files with a suffix that icrtool writes count as its own.
+    names : files at the top that are icrtool's though no list has them: they are written later than the directory
     """
-    lists: dict[PurePosixPath, frozenset[str] | None] = {}
     files = list(files_in(directory))
+    lists: dict[PurePosixPath, frozenset[str]] = {}
     for parent in {parent for path in files for parent in path.parents}:
         document = _read(directory / parent)
-        lists[parent] = document[1] if document is not None else None
+        lists[parent] = document[1] if document is not None else frozenset()
 
-    def is_listed(path: PurePosixPath) -> bool:
-        if path.name == OWN_FILES:
-            return True
-        return any((found := lists[parent]) and str(path.relative_to(parent)) in found for parent in path.parents)
+    def is_own(path: PurePosixPath) -> bool:
+        listed = any(str(path.relative_to(parent)) in lists[parent] for parent in path.parents)
+        return listed or path.name == OWN_FILES or str(path) in names
 
-    listed = {path for path in files if is_listed(path)}
-    with_list = {path.parts[0] for path in listed}
-    own = [
-        path
-        for path in files
-        if path in listed
-        or (
-            path.parts[0] in names
-            and (len(path.parts) == 1 or (path.parts[0] not in with_list and path.suffix in SUFFIXES))
-        )
-    ]
+    own = [path for path in files if is_own(path)]
     return own, sorted(set(files) - set(own))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files import disk
 from icrtool.output.files.atomic_directory import exchange, hidden_directory, restore
+from icrtool.output.files.csv_file import read_numbers
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
 
@@ -69,10 +69,10 @@ def write_truth(table: TruthTable, path: Path) -> None:
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    header = ",".join(table.columns()) + "\n"
+    header = ",".join(table) + "\n"
     with path.open("xb") as file:
         file.write(header.encode())
-        rows = pa.table({name: np.ascontiguousarray(values) for name, values in table.columns().items()})
+        rows = pa.table({name: np.ascontiguousarray(values) for name, values in table.items()})
         pc.write_csv(rows, file, pc.WriteOptions(include_header=False, quoting_style="none"))
 
 
@@ -84,20 +84,7 @@ def read_speeds(path: Path) -> TrackSpeeds:
     DataError
         A file that cannot be read, or without usable columns; times that do not increase.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            found = tuple(reader.fieldnames or ())
-            if missing := [name for name in SPEED_COLUMNS if name not in found]:
-                raise DataError(path, f"no column {missing[0]}", f"it holds {', '.join(found) or 'nothing'}")
-            rows = [[float(row[name] or "nan") for name in SPEED_COLUMNS] for row in reader]
-    except OSError as err:
-        raise DataError(path, "cannot be read", err.strerror or str(err)) from err
-    except (UnicodeDecodeError, csv.Error, ValueError, TypeError) as err:
-        raise DataError(path, "not a table of numbers", str(err)) from err
-    t, left, right = np.array(rows, np.float64).reshape(-1, 3).T.copy()
-    if len(t) < 2:
-        raise DataError(path, f"{len(t)} rows", "at least two are needed")
+    t, left, right = read_numbers(path, SPEED_COLUMNS).values()
     if not np.isfinite([t, left, right]).all():
         row = int(np.argmin(np.isfinite([t, left, right]).all(axis=0)))
         raise DataError(path, f"row {row + 1} holds a value that is not a finite number")

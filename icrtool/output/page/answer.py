@@ -4,146 +4,81 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
-from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.dropout import reach_text
-from icrtool.output.text_format import controller_error_text, error_text
+from icrtool.output.exports.controllers import controller_rows, format_export
+from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
-from icrtool.records.run import ICR_WORDS
 from icrtool.records.text import counted
 
 Grade = Literal["good", "care", "bad", "fact"]
-
-IN_SAMPLE = {"icr_final": "ICR, final (fitted to the same drive)"}
+Check = tuple[Grade, str]
+"""One reason to trust the numbers, or not to."""
 
 SMALLEST_SHOWN = 0.0005
 """A standard deviation below this would be printed as zero."""
 
 
-class Reach(NamedTuple):
-    """How far the best model stays within a budget, and the others."""
-
-    budget_m: float
-    label: str
-    text: str
-    interval: str
-    others: tuple[tuple[str, str], ...]
-
-
-class Number(NamedTuple):
-    """A number for a controller with its standard deviation, and what it is."""
-
-    name: str
-    value: str
-    meaning: str
-
-
-class Check(NamedTuple):
-    """One reason to trust the numbers, or not to."""
-
-    grade: Grade
-    text: str
-
-
-class Answer(NamedTuple):
-    """What a reader wants to know first.
-
-    Attributes
-    ----------
-    grade, verdict : may the numbers be used, in one word and in one sentence
-    no_numbers : reason why there is no number, or no multiplier; empty where there is one
-    with_numbers : the error with these numbers alone; empty where it was not measured
-    export : configuration of a diff_drive_controller; empty without a calibration
-    """
-
-    grade: Grade
-    verdict: str
-    reaches: tuple[Reach, ...]
-    numbers: tuple[Number, ...]
-    no_numbers: str
-    with_numbers: str
-    export: str
-    model: str
-    checks: tuple[Check, ...]
-
-
-def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Answer:
-    """Return the answer of a run.
+def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page of a run states first.
 
     Parameters
     ----------
     summary : of the run, equal to its run.json
     report : what report.json holds
+
+    Returns
+    -------
+    dict
+        ``grade`` and ``verdict``: may the numbers be used, in one word and in one sentence; ``checks``: why;
+        ``reaches``: how far each model stays within a budget, a list a budget, the recommended model first;
+        ``numbers``: name and value of what a controller is given, ``with_numbers``: the error with these alone,
+        ``export``: configuration of a diff_drive_controller, ``model``: the recommended one; empty where there is none.
     """
     found = report["recommended"]
     calibration = calibration_of({**found, "created": ""}) if found is not None else None
-    warnings = len(summary["warnings"])
-    grade: Grade
+    grade, verdict = _verdict(summary, report)
+    return {
+        "grade": grade,
+        "verdict": verdict,
+        "checks": _checks(summary, report),
+        "reaches": _reaches(report),
+        "numbers": _numbers(summary["icr"], calibration),
+        "with_numbers": controller_error_text(calibration.controller) if calibration is not None else "",
+        "export": _export(calibration),
+        "model": calibration.fitted.model.label if calibration is not None else "",
+    }
+
+
+def _verdict(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Check:
     if not summary["usable"]:
-        grade, verdict = "bad", f"No: {summary['unusable_because']}."
-    elif not report["passed"]:
-        grade, verdict = "bad", "No: an acceptance limit is not met."
-    elif warnings:
-        grade, verdict = "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
-    else:
-        grade, verdict = "good", "Yes."
-    numbers, no_numbers = _numbers(summary, calibration)
-    return Answer(
-        grade=grade,
-        verdict=verdict,
-        reaches=_reaches(report),
-        numbers=numbers,
-        no_numbers=no_numbers,
-        with_numbers=controller_error_text(calibration.controller) if calibration is not None else "",
-        export=_export(calibration),
-        model=calibration.fitted.model.label if calibration is not None else "",
-        checks=tuple(_checks(summary, report)),
-    )
+        return "bad", f"No: {summary['unusable_because']}."
+    if not report["passed"]:
+        return "bad", "No: an acceptance limit is not met."
+    if warnings := len(summary["warnings"]):
+        return "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
+    return "good", "Yes."
 
 
-def _reaches(report: Mapping[str, Any]) -> tuple[Reach, ...]:
-    rows: list[dict[str, Any]] = [
-        {key: math.nan if value is None else value for key, value in one.items()} for one in report["budgets"]
-    ]
-    known = [BudgetDistance(**one) for one in rows]
-    found = []
-    for budget_m in dict.fromkeys(one.budget_m for one in known):
-        mine = [one for one in known if one.budget_m == budget_m]
-        best = next((one for one in mine if one.model == "recommended"), mine[0])
-        others = tuple((IN_SAMPLE.get(one.model, one.label), reach_text(one)) for one in mine if one is not best)
-        interval = best.interval_text or "too few trials for an interval"
-        if best.beyond and not best.interval_text:
-            interval = f"no trial is longer than {best.distance_m:g} m"
-        found.append(Reach(budget_m, best.label, reach_text(best), interval, others))
-    return tuple(found)
+def _reaches(report: Mapping[str, Any]) -> list[list[BudgetDistance]]:
+    found: dict[float, list[BudgetDistance]] = {}
+    for row in sorted(report["budgets"], key=lambda one: one["model"] != "recommended"):
+        known: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
+        one = BudgetDistance(**known)
+        found.setdefault(one.budget_m, []).append(one)
+    return list(found.values())
 
 
-def _numbers(summary: Mapping[str, Any], calibration: Calibration | None) -> tuple[tuple[Number, ...], str]:
-    icr, numbers = summary["icr"], list[Number]()
-    width = summary["config"]["robot"]["track_width_m"]
+def _numbers(icr: Mapping[str, Any], calibration: Calibration | None) -> list[tuple[str, str]]:
+    rows = []
     if calibration is not None:
-        one, share = calibration.controller_numbers(), "wheels roll this share of the configured radius"
-        meaning = f"the robot turns as if its tracks were {one.multiplier:.2f} times as far apart as {width:g} m"
-        numbers = [
-            Number("wheel_separation_multiplier", _with_std(one.multiplier, one.multiplier_std), meaning),
-            Number("left_wheel_radius_multiplier", _with_std(one.left_radius, one.left_radius_std), f"left {share}"),
-            Number(
-                "right_wheel_radius_multiplier", _with_std(one.right_radius, one.right_radius_std), f"right {share}"
-            ),
-        ]
-    elif (multiplier := icr["separation_multiplier"]) is not None and (
-        std := icr["separation_multiplier_std"]
-    ) is not None:
-        text = _with_std(multiplier, std)
-        numbers = [Number("wheel_separation_multiplier", text, "of the final ICRs; not tested on held-out distance")]
-    why_none = "" if numbers else "The drive shows none of them."
-    if width is None:
-        why_none = "robot.track_width_m is not known: without it there is no multiplier and no no-slip model."
-    return tuple(numbers), why_none
+        rows = controller_rows(calibration.controller_numbers())
+    elif icr["separation_multiplier"] is not None and icr["separation_multiplier_std"] is not None:
+        rows = [("wheel_separation_multiplier", icr["separation_multiplier"], icr["separation_multiplier_std"])]
+    return [(name, _with_std(value, std)) for name, value, std in rows]
 
 
 def _with_std(value: float, std: float) -> str:
@@ -153,10 +88,8 @@ def _with_std(value: float, std: float) -> str:
 
 
 def _export(calibration: Calibration | None) -> str:
-    if calibration is None:
-        return ""
     try:
-        return format_export(calibration, "diff_drive_controller")
+        return format_export(calibration, "diff_drive_controller") if calibration is not None else ""
     except DataError:
         return ""
 
@@ -164,50 +97,32 @@ def _export(calibration: Calibration | None) -> str:
 def _checks(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
     """Return the reasons, the gravest first."""
     grades: dict[Grade, int] = {"bad": 0, "care": 1, "good": 2, "fact": 3}
-    found = [_excitation(summary), *_limits(report), *_incidents(summary, report), *_trials(report)]
-    return sorted(found, key=lambda one: grades[one.grade])
-
-
-def _excitation(summary: Mapping[str, Any]) -> Check:
-    shown = summary["excitation"]
-    weak = [f"{ICR_WORDS[column]} {verdict}" for column, verdict in shown["verdict"].items() if verdict != "shown"]
-    turned = f"it turned {shown['turned_right_deg']:,.0f}° right and {shown['turned_left_deg']:,.0f}° left"
-    if weak:
-        return Check(
-            "care", f"The drive does not show every ICR ({', '.join(weak).replace('weak', 'weakly shown')}): {turned}."
-        )
-    return Check("good", f"The drive shows all three ICRs: {turned}.")
-
-
-def _limits(report: Mapping[str, Any]) -> list[Check]:
-    return [
-        Check("good" if one["passed"] else "bad", f"Acceptance limit: {one['verdict']}.") for one in report["gates"]
-    ]
+    shown = set(summary["excitation"]["verdict"].values()) == {"shown"}
+    found: list[Check] = [("good" if shown else "care", f"The drive: {excitation_text(summary['excitation'])}.")]
+    found += [("good" if one["passed"] else "bad", f"Acceptance limit: {one['verdict']}.") for one in report["gates"]]
+    found += [*_incidents(summary, report), *_trials(report)]
+    return sorted(found, key=lambda one: grades[one[0]])
 
 
 def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
-    """Return what happened on the drive: warnings, slip, outages, rejected fixes."""
+    """Return what happened on the drive: warnings, slip, outages, rejected fixes, jumps."""
     gnss, events = summary["gnss"], summary["events"]
-    found = []
+    found: list[Check] = []
     if warnings := len(summary["warnings"]):
-        found.append(Check("care", f"{counted(warnings, 'warning')} about the log."))
+        found.append(("care", f"{counted(warnings, 'warning')} about the log."))
     if events:
-        kinds = [one["kind"] for one in events]
-        each = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
         what = "the ICRs are not learned there" + ("" if report["without_events"] else ", but trials across them count")
-        found.append(Check("care", f"{counted(len(events), 'slip event')} ({each}): {what}."))
-    real = [one for one in report["outages"] if one["kind"] == "real"]
-    if real:
+        found.append(("care", f"{counted(len(events), 'slip event')} ({event_kinds(events)}): {what}."))
+    if real := [one for one in report["outages"] if one["kind"] == "real"]:
         worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
         error = f"{error_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
-        found.append(Check("fact", f"{counted(len(real), 'real outage')}: in the worst the filter was {error}."))
-    of = gnss["used"] + gnss["rejected"]
-    if of:
-        rejected = f"{gnss['rejected']:,} ({100 * gnss['rejected'] / of:.0f} %)" if gnss["rejected"] else "None"
-        found.append(Check("fact", f"{rejected} of {of:,} positions were rejected."))
+        found.append(("fact", f"{counted(len(real), 'real outage')}: in the worst the filter was {error}."))
+    if of := gnss["used"] + gnss["rejected"]:
+        share = 100 * gnss["rejected"] / of
+        found.append(("fact", f"{gnss['rejected']:,} of {of:,} positions ({share:.0f} %) were rejected."))
     if gnss["jumps"]:
         text = f"{counted(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
-        found.append(Check("care", text))
+        found.append(("care", text))
     return found
 
 
@@ -215,21 +130,19 @@ def _trials(report: Mapping[str, Any]) -> list[Check]:
     """Return how many trials the distances rest on, and what share of the error the reference itself may have."""
     rows = [row for row in report["trials"] if row["trials"]]
     if not rows:
-        return [Check("bad", "No trial was long enough to measure an error.")]
+        return [("bad", "No trial was long enough to measure an error.")]
     row = min(rows, key=lambda one: abs(one["horizon_m"] - CHOICE_HORIZON_M))
     horizon_m = row["horizon_m"]
-    found = [
-        Check("fact", f"{row['trials']:,} trials of {horizon_m:g} m were driven from {report['starts']:,} states.")
+    found: list[Check] = [
+        ("fact", f"{row['trials']:,} trials of {horizon_m:g} m were driven from {report['starts']:,} states.")
     ]
+    icr = [row for one in report["models"] if one["name"] == "icr" for row in one["by_horizon"]]
     own, p95 = (
         next((one["p95_m"] for one in table if one["horizon_m"] == horizon_m), None)
-        for table in (
-            report["reference_error"],
-            *(one["by_horizon"] for one in report["models"] if one["name"] == "icr"),
-        )
+        for table in (report["reference_error"], icr)
     )
     if own is not None and p95 is not None:
         share = f"Up to {error_text(own)}" if own < p95 else "All"
         what = f"the {error_text(p95)} error of the ICRs after {horizon_m:g} m (95 %)"
-        found.append(Check("fact", f"{share} of {what} can be the error of the position reference."))
+        found.append(("fact", f"{share} of {what} can be the error of the position reference."))
     return found

@@ -148,11 +148,9 @@ def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
     fixes = run.sensors.fixes
-    groups = {"used": run.gnss.used, "rejected": run.gnss.rejected}
     found = {}
-    for name, chosen in groups.items():
-        difference = run.gnss.difference[chosen]
-        rows = np.flatnonzero(chosen)[extremes(difference, points=FIX_POINTS)] if len(difference) else np.empty(0, int)
+    for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
+        rows = _extreme_rows(run.gnss.difference, chosen)
         found[name] = {
             "t": packed(run.gnss.t_s[rows], "f64"),
             "north": packed(fixes.north_m[rows] - origin[0], "f32"),
@@ -164,13 +162,17 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
 
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
-    heading = run.heading
-    used = np.flatnonzero(heading.used)
-    rows = used[extremes(heading.difference[used], points=FIX_POINTS)] if len(used) else used
+    rows = _extreme_rows(run.heading.difference, run.heading.used)
     return {
-        "t": packed(heading.t_s[rows], "f64"),
-        "difference_deg": packed(np.degrees(heading.difference[rows]), "f32"),
+        "t": packed(run.heading.t_s[rows], "f64"),
+        "difference_deg": packed(np.degrees(run.heading.difference[rows]), "f32"),
     }
+
+
+def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:
+    """Return the chosen rows, the extremes of many."""
+    rows = np.flatnonzero(chosen)
+    return rows[extremes(difference[rows], points=FIX_POINTS)]
 
 
 def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> dict[str, Any]:

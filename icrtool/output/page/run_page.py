@@ -21,11 +21,10 @@ from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
-from icrtool.output.tables.dropout import SHOWN_HORIZONS_M
-from icrtool.output.text_format import duration_text, error_text, position_word
+from icrtool.output.tables.dropout import shown_horizons
+from icrtool.output.text_format import duration_text, error_text, position_word, role_word
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_WORDS, Run
-from icrtool.records.samples import ROLE_WORDS
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -84,7 +83,8 @@ def run_page(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
         title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
         pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
-        warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]], streams=_streams(summary),
+        warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]],
+        streams=[{**one, "role": role_word(summary, one["role"])} for one in summary["streams"]],
         begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
         coordinates=coordinates, samples=len(run.table),
@@ -131,17 +131,10 @@ def _utc(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
-def _streams(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the streams, with the role of the positions as they are called."""
-    metric = summary["gnss"]["datum"] is None
-    return [{**one, "role": ROLE_WORDS[one["role"]] if metric else one["role"]} for one in summary["streams"]]
-
-
 def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
     horizons = [row["horizon_m"] for row in report["trials"]]
-    distances = np.array(horizons)
-    shown = sorted({int(np.argmin(np.abs(distances - metres))) for metres in SHOWN_HORIZONS_M}) if horizons else []
+    shown = shown_horizons(np.array(horizons))
     models = sorted(report["models"], key=lambda one: one["name"] != "recommended")
     return {
         "heads": _heads([horizons[h] for h in shown]),

@@ -46,12 +46,4 @@ def _settings(calibration: LogCalibration) -> list[Block]:
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
         return [f"nothing to configure: {why}"]
     options = " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings)
-    sections: dict[str, list[str]] = {}
-    for setting in calibration.settings:
-        section, _, key = setting.key.partition(".")
-        why = f"  # {setting.why}" if setting.why else ""
-        # a TOML float keeps its point
-        sections.setdefault(section, []).append(f"  {key} = {float(f'{setting.value:g}')!r}{why}")
-    lines = [line for section, keys in sections.items() for line in (f"  [{section}]", *keys)]
-    head = ("to configure, as options:", f"  {options}", "or in a file for --config:")
-    return [Line("\n".join([*head, *lines]), "as is")]
+    return [Line(f"to configure:\n  {options}", "as is")]

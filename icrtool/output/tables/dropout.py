@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.kernels.arrays import Ints
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
@@ -37,10 +37,6 @@ STARTS_TEXT = {"moving": "moving ", "all": ""}
 
 NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
-
-NEAR_HORIZONS_M = 1.5
-"""Between horizons that are further apart an interpolated distance is marked as one."""
-
 
 Rows = list[list[str]]
 
@@ -78,11 +74,11 @@ def format_dropout(report: DropoutReport) -> Text:
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
 
-def shown_horizons(report: DropoutReport) -> list[int]:
-    """Return the places of the horizons nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
-    if len(report.horizons_m) <= len(SHOWN_HORIZONS_M):
-        return list(range(len(report.horizons_m)))
-    nearest = (int(np.argmin(np.abs(report.horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
+def shown_horizons(horizons_m: Floats) -> list[int]:
+    """Return the places of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
+    if len(horizons_m) <= len(SHOWN_HORIZONS_M):
+        return list(range(len(horizons_m)))
+    nearest = (int(np.argmin(np.abs(horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
     return sorted(set(nearest))
 
 
@@ -101,12 +97,12 @@ def headline(report: DropoutReport) -> list[str]:
         return []
     fitted, numbers = calibration.fitted, calibration.controller_numbers()
     interval = f" ({best.interval_text})" if best.interval_text else ""
-    without = f"; without slip model: {reach_text(reached['no_slip'])}" if "no_slip" in reached else ""
+    without = f"; without slip model: {reached['no_slip'].reach_text}" if "no_slip" in reached else ""
     model = fitted_model_text(fitted)
     alone = controller_error_text(calibration.controller) if len(fitted.parameters) else ""
     return [
         f"Recommended: {model}, tested on distance it was not fitted to.",
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {reach_text(best)}{interval}{without}.",
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {best.reach_text}{interval}{without}.",
         f"Controller: {controller_text(numbers._asdict())}{f'; {alone}' if alone else ''}.",
     ]
 
@@ -125,28 +121,18 @@ def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
     lines = []
     for budget_m in dict.fromkeys(one.budget_m for one in budgets):
         first, *others = (one for one in budgets if one.budget_m == budget_m)
-        more = "".join(f"; {one.label}: {reach_text(one)}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {reach_text(first)} ({first.label}){more}")
+        more = "".join(f"; {one.label}: {one.reach_text}" for one in others)
+        lines.append(f"stays within {budget_m:g} m (95 %) for {first.reach_text} ({first.label}){more}")
     return lines
 
 
-def reach_text(one: BudgetDistance) -> str:
-    """Return how far a model stays within a budget."""
-    if one.beyond:
-        return f"more than {one.distance_m:g} m"
-    low, high = one.between_m
-    # The error grows faster than the distance: on a straight line between far horizons the distance comes out too long.
-    far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
-    return f"{one.distance_m:.1f} m{far}"
-
-
 def _horizon_texts(report: DropoutReport) -> list[str]:
-    return [f"{report.horizons_m[h]:g} m" for h in shown_horizons(report)]
+    return [f"{report.horizons_m[h]:g} m" for h in shown_horizons(report.horizons_m)]
 
 
 def _error_rows(report: DropoutReport) -> Rows:
     """Return 95 %, its interval and the expected error of each model, what is recommended first."""
-    shown, rows = shown_horizons(report), []
+    shown, rows = shown_horizons(report.horizons_m), []
     for result in sorted(report.results, key=lambda one: one.name != "recommended"):
         summary, intervals = result.summary, result.intervals
         label = result.label if len(result.label) <= MODEL else f"{result.label[: MODEL - 1]}…"
@@ -166,7 +152,7 @@ def _ratio_rows(report: DropoutReport) -> Rows:
     rows = []
     for lead, label, column in (("no slip / ICR", "95 %", "p95"), ("", "expected", "expected")):
         ours, theirs = getattr(icr.summary, column), getattr(no_slip.summary, column)
-        ratios = (float(theirs[h] / ours[h]) if ours[h] > 0 else math.nan for h in shown_horizons(report))
+        ratios = (float(theirs[h] / ours[h]) if ours[h] > 0 else math.nan for h in shown_horizons(report.horizons_m))
         rows.append([lead, label, *(f"{ratio:.1f} x" if math.isfinite(ratio) else "-" for ratio in ratios)])
     return rows
 
@@ -179,7 +165,7 @@ def _turning_line(split: TurningSplit) -> str:
 
 def _count_rows(report: DropoutReport) -> Rows:
     """Return the number of trials, and why other starts are none."""
-    shown = shown_horizons(report)
+    shown = shown_horizons(report.horizons_m)
     named = [("trials", report.counts.trials)]
     named += [(one.label, one.starts) for one in no_trial(report) if one.starts[shown].any()]
     return [[label, "", *(f"{int(column[h]):,}" for h in shown)] for label, column in named]
@@ -227,20 +213,14 @@ def _event_lines(report: DropoutReport) -> list[str]:
         return []
     if not cost.events:
         return ["slip events: none in this log; --without-events changes nothing"]
-    both = np.flatnonzero((icr.summary.trials > 0) & (cost.with_events["icr"].trials > 0))
-    number = counted(cost.events, "slip event")
+    left_out, before, after = f"{counted(cost.events, 'slip event')} left out", cost.with_events["icr"], icr.summary
+    both = np.flatnonzero((after.trials > 0) & (before.trials > 0))
     if not len(both):
-        return [f"{number}: no trial is left without them"]
+        return [f"{left_out}: no trial remains"]
     h = int(both[-1])
-    before, after = cost.with_events["icr"], icr.summary
-    errors = [
-        f"{name} {error_text(float(after_m[h]))} instead of {error_text(float(before_m[h]))}"
-        for name, after_m, before_m in (
-            ("95 %", after.p95, before.p95), ("expected", after.expected, before.expected),
-        )
-    ]  # fmt: skip
-    text = f"{number} left out: ICR after {report.horizons_m[h]:g} m {', '.join(errors)}"
-    return [f"{text} ({int(cost.trials[h]):,} trials cross one)"]
+    errors = f"{error_text(float(after.p95[h]))} instead of {error_text(float(before.p95[h]))}"
+    what = f"ICR after {report.horizons_m[h]:g} m 95 % {errors}"
+    return [f"{left_out}: {what} ({int(cost.trials[h]):,} trials cross one)"]
 
 
 def why_no_trial(report: DropoutReport, h: int) -> str | None:
@@ -268,7 +248,7 @@ def _empty_lines(report: DropoutReport) -> list[str]:
 
 
 def _reference_rows(report: DropoutReport) -> Rows:
-    own, shown = report.reference_error, shown_horizons(report)
+    own, shown = report.reference_error, shown_horizons(report.horizons_m)
     if own is None or not np.isfinite(own.p95).any():
         return []
     return [
@@ -290,7 +270,7 @@ def _reference_lines(report: DropoutReport) -> list[str]:
 
 def _learned_blocks(report: DropoutReport) -> list[Block]:
     """Return the errors of the momentary ICRs before and after the ICRs were first learned."""
-    split, shown = report.by_learning, shown_horizons(report)
+    split, shown = report.by_learning, shown_horizons(report.horizons_m)
     if split is None:
         return []
     if split.learned_s is None or split.distance_m is None:

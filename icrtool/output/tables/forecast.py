@@ -1,57 +1,20 @@
-"""A forecast of errors along a path as text, as rows of CSV and as plain data; a planned path from a file."""
+"""A forecast of errors along a path as text, as rows of CSV and as plain data."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
-from icrtool.errors import RunError
 from icrtool.kernels.arrays import Floats
-from icrtool.logs.table_file import csv_frame
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, fitted_model_text
 from icrtool.records.text import counted
 
-PLAN_COLUMNS = ("east_m", "north_m")
-
 SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-
-LARGEST_PLAN_BYTES = 50_000_000
-
-
-def read_plan(file: Path) -> tuple[Floats, Floats, Floats | None]:
-    """Read a planned path: columns ``east_m``, ``north_m`` and, optional, ``speed_mps``.
-
-    Raises
-    ------
-    RunError
-        The file cannot be read, or a column is missing or holds text.
-    """
-    import pandas as pd
-
-    advice = "write a CSV file with the columns east_m, north_m and, if you like, speed_mps"
-    try:
-        if file.stat().st_size > LARGEST_PLAN_BYTES:
-            raise RunError(file, f"larger than {LARGEST_PLAN_BYTES / 1e6:g} MB", "thin out its points")
-        table = csv_frame(file)
-        if missing := [name for name in PLAN_COLUMNS if name not in table]:
-            raise RunError(file, f"no column {missing[0]}", advice)
-        columns = [
-            pd.to_numeric(table[name], errors="coerce") for name in (*PLAN_COLUMNS, "speed_mps") if name in table
-        ]
-    except OSError as err:
-        raise RunError(file, "cannot be read", err.strerror or str(err)) from err
-    except (ValueError, OverflowError) as err:
-        raise RunError(file, "not a CSV table of numbers", advice) from err
-    east, north, *speed = (column.to_numpy(np.float64) for column in columns)
-    if len(east) < 2:
-        raise RunError(file, f"{len(east)} points", "a path has two at least")
-    return east, north, speed[0] if speed else None
 
 
 def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from icrtool.calibration.model_comparison import ROWS, ModelComparison
+from icrtool.kernels.open_loop.trials import Summary
 from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
 from icrtool.output.text_format import FITTED
 from icrtool.records.dropout import ModelScore
+from icrtool.records.plain_data import rows_of
 
 COMPARISON_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -42,17 +44,18 @@ def extended_line(comparison: ModelComparison) -> str:
     return f"extended: chosen without the block that it is tested on: {'; '.join(used)}; {whole}"
 
 
-def comparison_rows(comparison: ModelComparison) -> Iterator[Sequence[str | int | float]]:
+def comparison_rows(comparison: ModelComparison) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of ladder.csv, a model and horizon each; see `COMPARISON_COLUMNS`."""
     for score in comparison.scores:
-        for h, horizon in enumerate(comparison.horizons_m):
-            s = score.summary
-            numbers = (float(column[h]) for column in (s.expected, s.p50, s.p95, s.largest))
-            expected, p50, p95, largest = numbers
-            yield (
-                score.name, FITTED[score.fitted] or "not fitted", _heading(score, comparison), horizon,
-                int(s.trials[h]), expected, p50, p95, largest, 100.0 * expected / horizon, 100.0 * p95 / horizon,
-            )  # fmt: skip
+        fitted, heading = FITTED[score.fitted] or "not fitted", _heading(score, comparison)
+        for row in rows_of({"horizon_m": comparison.horizons_m, **error_columns(score.summary)}):
+            shares = (100.0 * row[name] / row["horizon_m"] for name in ("expected_error_m", "p95_m"))
+            yield score.name, fitted, heading, *row.values(), *shares
+
+
+def error_columns(summary: Summary) -> dict[str, Any]:
+    """Return errors by horizon, under their names in files."""
+    return dict(zip(("trials", "expected_error_m", "p50_m", "p95_m", "max_m"), summary, strict=True))
 
 
 def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
@@ -71,11 +74,7 @@ def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
                 "label": score.label,
                 "fitted": FITTED[score.fitted] or "not fitted",
                 "heading": _heading(score, comparison),
-                "trials": score.summary.trials.tolist(),
-                "expected_error_m": score.summary.expected.tolist(),
-                "p50_m": score.summary.p50.tolist(),
-                "p95_m": score.summary.p95.tolist(),
-                "max_m": score.summary.largest.tolist(),
+                **error_columns(score.summary),
             }
             for score in comparison.scores
         ],
@@ -92,13 +91,12 @@ def _fit_name(name: str, comparison: ModelComparison) -> str:
 
 def _fit(fit: FittedModel, width_m: float) -> dict[str, Any]:
     """Return parameters of a fit, and the track ICRs of one by wheels alone, with one standard deviation."""
-    terms = fit.model.terms
-    value = dict(zip(terms, fit.parameters.tolist(), strict=True))
-    std = dict(zip(terms, fit.std.tolist(), strict=True))
+    value = dict(zip(fit.model.terms, fit.parameters, strict=True))
+    std = dict(zip(fit.model.terms, fit.std, strict=True))
     if not fit.model.uses_gyro:
         geometry, covariance = fit.geometry(width_m, TypicalDrive())
         value |= geometry._asdict()
-        std |= dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        std |= dict(zip(geometry._fields, np.sqrt(np.diag(covariance)), strict=True))
     return {"value": value, "std": std}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.output.tables.run import Row, excitation_rows
+from icrtool.output.tables.run import Row, excitation_row
 from icrtool.output.text_format import distance_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.tables import RobotLog
@@ -39,7 +39,7 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
 
 def verdict_rows(run: Run | None, problem: IcrToolError | None, config: Config) -> list[Row]:
     """Return whether a log can be fitted, what it shows, and what is missing."""
-    rows = excitation_rows(run) if run is not None else []
+    rows = [excitation_row(run)] if run is not None else []
     rows.append(("verdict", verdict(run, problem)))
     if run is not None and config.robot.track_width_m is None:
         missing = (

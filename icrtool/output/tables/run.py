@@ -10,14 +10,16 @@ from icrtool.output.text_format import (
     distance_text,
     duration_text,
     error_text,
+    event_kinds,
+    excitation_text,
     model_text,
     position_word,
+    role_word,
     run_title,
     unusable_lines,
 )
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ClassDocument
-from icrtool.records.samples import ROLE_WORDS
 from icrtool.records.text import counted
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
@@ -42,7 +44,7 @@ def format_run(run: Run) -> Text:
     drive = run.summary["drive"]
     driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s (mean ± std)"
-    learned = [*_multiplier_rows(run), *_recommended_rows(run), *excitation_rows(run)]
+    learned = [*_multiplier_rows(run), *_recommended_rows(run), excitation_row(run)]
     measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
     return Text(
         [
@@ -62,17 +64,9 @@ def format_run(run: Run) -> Text:
     )
 
 
-def excitation_rows(run: Run) -> list[Row]:
-    """Return what the drive could show of the ICRs at best, and how it turned; advice is among the warnings."""
-    found = run.summary["excitation"]
-    verdicts = found["verdict"]
-    if set(verdicts.values()) == {"shown"}:
-        shown = "enough to show all three ICRs"
-    else:
-        shown = ", ".join(f"{ICR_WORDS[column]} {verdicts[column]}" for column in ICR_COLUMNS)
-    right, left = found["turned_right_deg"], found["turned_left_deg"]
-    spun = found["spun_right_deg"] + found["spun_left_deg"]
-    return [("excitation", f"{shown}; turned {right:,.0f}° right, {left:,.0f}° left, {spun:,.0f}° of it on the spot")]
+def excitation_row(run: Run) -> Row:
+    """Return what the drive could show of the ICRs; advice is among the warnings."""
+    return "excitation", excitation_text(run.summary["excitation"])
 
 
 def _stream_table(run: Run) -> Table:
@@ -82,8 +76,7 @@ def _stream_table(run: Run) -> Table:
         type_name = stream["message_type"].replace("/msg/", "/")
         hz = stream["rate_hz"]
         rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
-        role = ROLE_WORDS[stream["role"]] if run.summary["gnss"]["datum"] is None else stream["role"]
-        rows.append((role, stream["topic"], type_name, rate, count, stream["clock"]))
+        rows.append((role_word(run.summary, stream["role"]), stream["topic"], type_name, rate, count, stream["clock"]))
     widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
     # Long names are cut: the topic keeps its end, the type its begin.
     space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
@@ -228,13 +221,11 @@ def event_rows(run: Run) -> list[Row]:
     events = run.summary["events"]
     if not events:
         return []
-    kinds = [event["kind"] for event in events]
-    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
     worst = max(events, key=lambda event: (event["end_s"] - event["begin_s"]) * event["severity"])
     lasted = duration_text(worst["end_s"] - worst["begin_s"])
     missed = f"{100 * worst['severity']:.0f} % of the wheels' motion missed"
     worst_text = f"worst: {worst['kind']} from {worst['begin_s']:.1f} s for {lasted}, {missed}"
-    return [("slip", f"{counts}; the ICRs are not learned there"), ("", worst_text)]
+    return [("slip", f"{event_kinds(events)}; the ICRs are not learned there"), ("", worst_text)]
 
 
 def _tail(text: str, width: int) -> str:

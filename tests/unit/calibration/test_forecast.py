@@ -15,10 +15,11 @@ from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast
 from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
-from icrtool.errors import DataError, IcrToolError, RunError
+from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import MODELS, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
-from icrtool.output.tables.forecast import forecast_csv, reach, read_plan
+from icrtool.output.files.csv_file import read_numbers
+from icrtool.output.tables.forecast import forecast_csv, reach
 from support.recordings import WIDTH_M, draw_parameters, make_recording
 
 SIX = MODELS["six"]
@@ -132,10 +133,14 @@ def test_the_sources_come_back_from_a_file_and_an_older_file_has_none(calibratio
         forecast_plan(older, np.zeros(2), np.array([0.0, 9.0]))
 
 
+def read_plan(file: Path) -> dict[str, np.ndarray]:
+    return read_numbers(file, ("east_m", "north_m"), ("speed_mps",))
+
+
 def test_a_plan_is_read_from_a_table(tmp_path: Path, calibration: Calibration) -> None:
     file = tmp_path / "plan.csv"
     file.write_text("east_m,north_m,speed_mps\n0,0,0.4\n6,0,0.8\n6,5,0.8\n")
-    found = forecast_plan(calibration, *read_plan(file))
+    found = forecast_plan(calibration, **read_plan(file))
     assert found.distance_m[-1] == 11.0
     assert (found.east_m[-1], found.north_m[-1]) == pytest.approx((6.0, 5.0), abs=0.2)
     assert np.all(np.diff(found.p95_m) > 0.0)
@@ -146,7 +151,7 @@ def test_a_plan_is_read_from_a_table(tmp_path: Path, calibration: Calibration) -
 def test_a_table_that_is_no_plan_is_one_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "plan.csv"
     file.write_text(text)
-    with pytest.raises(RunError):
+    with pytest.raises(DataError):
         read_plan(file)
 
 
@@ -176,7 +181,7 @@ def test_a_plan_with_an_edited_cell_is_one_error_or_a_forecast(
     file = tmp_path / "plan.csv"
     file.write_text(f"east_m,north_m,speed_mps\n0,0,0.4\n{','.join(row)}\n12,0,0.4\n")
     with suppress(IcrToolError):
-        assert np.isfinite(forecast_plan(calibration, *read_plan(file)).p95_m).all()
+        assert np.isfinite(forecast_plan(calibration, **read_plan(file)).p95_m).all()
 
 
 def test_reverse_along_a_path_is_as_uncertain_as_forward(calibration: Calibration) -> None:

@@ -12,7 +12,14 @@ import pytest
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
 from icrtool.calibration.model_choice import choose
-from icrtool.calibration.pooled import CalibrationResult, calibrate, held_out_predictor, predictor, recording_of
+from icrtool.calibration.pooled import (
+    CalibrationResult,
+    calibrate,
+    held_out_predictor,
+    predictor,
+    recording_of,
+    with_turn_rate,
+)
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
@@ -23,6 +30,7 @@ from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path
 from icrtool.output.files.calibration_file import open_calibration, write_calibration
 from icrtool.output.tables.held_out import format_result
+from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors
 
@@ -49,6 +57,17 @@ def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) 
     table = result.wheels
     # one multiplier and a heading offset of each log do well over a few metres
     assert table.score("recommended").together.p95[2] < 0.5 * table.score("multiplier").together.p95[2]
+
+
+def test_a_gyro_on_a_circle_turns_with_the_robot() -> None:
+    """A noisy gyro of constant rate: a scale of 0.9 with a bias makes the same turns as a scale of one."""
+    made, rng = make_recording(SIX, TRUTH, seconds=120.0), np.random.default_rng(4)
+    circle = replace(made, drive=made.drive._replace(heading=0.18 * made.t_s))
+    angle = circle.drive.heading + np.cumsum(rng.normal(0.0, 0.003, len(made.t_s)))
+    found = with_turn_rate(circle, MeasuredHeading("gyro", angle))
+    assert found.gyro_radps is not None
+    other = np.cumsum(rng.normal(0.0, 0.003, len(made.t_s)))
+    assert with_turn_rate(circle, MeasuredHeading("gyro", other)).gyro_radps is None
 
 
 def test_wheels_and_gyro_together_are_not_worse_than_either(result: CalibrationResult) -> None:

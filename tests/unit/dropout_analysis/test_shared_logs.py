@@ -25,7 +25,7 @@ LOGS = {
 EQUAL_M = 1e-9
 """What the fast algorithm promises."""
 
-MOST_STEPS = 6e7
+MOST_STEPS = 2e7
 """Steps of direct integration a model and log: above, every so many-th start is tried."""
 
 

@@ -21,6 +21,7 @@ from icrtool.kernels.robust import (
     robust_weights,
     sandwich_covariance,
     soft_l1_weights,
+    student_covariance,
 )
 
 TRUTH = np.array([1.5, -0.7])
@@ -196,3 +197,20 @@ def test_groups_that_differ_are_covered_where_they_are_few() -> None:
     covered = {expected: np.mean(np.array(errors) < 2.0) for expected, errors in z.items()}
     assert covered[None] < 0.88
     assert 0.88 < covered[spread] < 0.99
+
+
+@pytest.mark.parametrize(("count", "together"), [(3, 0.3), (12, 0.3), (12, -0.3)])
+def test_two_standard_deviations_of_few_groups_hold(count: int, together: float) -> None:
+    """Residuals of a group that are alike, or that cancel one another: their number alone gives neither variance."""
+    rng, size, draws = np.random.default_rng(2), 6, 400
+    groups = np.repeat(np.arange(count), size)
+    alike = np.linalg.cholesky(np.eye(size) * (1.0 - together * 0.6) + together * 0.6)
+    inside = 0
+    for _ in range(draws):
+        values = (rng.normal(0.0, 0.1, (count, size)) @ alike.T).ravel()
+        zero, ones = np.zeros(1), np.ones((len(values), 1))
+        found = robust_least_squares(
+            lambda x, values=values, ones=ones: (x - values, ones), zero, zero, np.array([1e3]), group=groups
+        )
+        inside += abs(found.x[0]) < 2.0 * np.sqrt(student_covariance(found, groups)[0, 0])
+    assert 0.90 < inside / draws < 0.985

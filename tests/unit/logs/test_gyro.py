@@ -17,7 +17,7 @@ RATE = 0.3 * np.sin(np.linspace(0.0, 6.0, COUNT))
 
 def imu(topic: str, rate: Any = RATE, frame: str = "imu_link", count: int = COUNT) -> TopicTable:
     columns = {"angular_velocity.z": np.asarray(rate)[:count], "header.frame_id": np.zeros(count, np.int64)}
-    return TopicTable(topic, "sensor_msgs/Imu", TIMES[:count], columns, {"header.frame_id": [frame]}, 0, "the log")
+    return TopicTable(topic, "sensor_msgs/Imu", TIMES[:count], columns, {"header.frame_id": [frame]}, 0)
 
 
 @pytest.mark.parametrize(("frame", "sign"), [("imu_link", -1.0), ("imu_link_ned", 1.0)])
@@ -45,7 +45,7 @@ def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() 
     assert find_gyro([imu("/imu", np.zeros(COUNT)), imu("/b", np.full(COUNT, np.nan))], "/w", "/h", "log") is None
     spoilt = np.where(np.arange(2 * COUNT) == 7, 1e6, np.tile(RATE, 2))
     times = TIMES[0] + 10_000_000 * np.arange(2 * COUNT)
-    tables = [TopicTable("/imu", "sensor_msgs/Imu", times, {"angular_velocity.z": spoilt}, {}, 0, "the log")]
+    tables = [TopicTable("/imu", "sensor_msgs/Imu", times, {"angular_velocity.z": spoilt}, {}, 0)]
     found = find_gyro(tables, "/w", "/h", "log")
     assert found is not None
     assert len(found.rate_radps) == 2 * COUNT - 1

@@ -33,7 +33,7 @@ def table_of(
         else:
             arrays[path] = np.asarray(values)
     length = len(next(iter(arrays.values())))
-    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, found, 0, "the log")
+    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, found, 0)
 
 
 def position(message_type: str, topic: str = "/topic", **columns: Any) -> PositionSource:
@@ -449,7 +449,7 @@ def test_a_position_without_a_field_it_needs_is_refused_by_the_field_s_name(name
 def stamped(header_ns: Any, log_ns: Any) -> TopicTable:
     header = np.asarray(header_ns)
     columns = {"header.stamp.sec": header // 10**9, "header.stamp.nanosec": header % 10**9}
-    return TopicTable("/t", "t/T", np.asarray(log_ns), columns, {}, 0, "the log")
+    return TopicTable("/t", "t/T", np.asarray(log_ns), columns, {}, 0)
 
 
 @pytest.mark.parametrize("count", [20, 300])

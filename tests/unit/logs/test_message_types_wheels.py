@@ -73,7 +73,7 @@ def write_bag(path: Path, publishers: Sequence[tuple[str, list[Any]]], name: str
 def column_table(message_type: str, topic: str = "/topic", **columns: Any) -> TopicTable:
     arrays = {path.replace("__", "."): np.asarray(values) for path, values in columns.items()}
     length = len(next(iter(arrays.values())))
-    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, {}, 0, "the log")
+    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, {}, 0)
 
 
 def read(table: TopicTable, config: Any = CONFIG) -> WheelMotion:
@@ -95,10 +95,10 @@ def test_joints_are_told_apart_by_name_when_their_order_changes(tmp_path: Path, 
         messages.append(joint_state(store, START_NS + i * STEP_NS, names, position[i, order], velocity[i, order]))
     write = write_bag if ros1 else write_mcap
     motion = wheels_of(write(tmp_path / "log", [("/joint_states", messages)], "sensor_msgs/msg/JointState"))
-    assert motion.position_left is not None
-    assert motion.speed_right is not None
-    np.testing.assert_array_equal(motion.position_left, position[:, [0, 2]].mean(axis=1))
-    np.testing.assert_array_equal(motion.speed_right, velocity[:, [1, 3]].mean(axis=1))
+    assert motion.position is not None
+    assert motion.speed is not None
+    np.testing.assert_array_equal(motion.position[0], position[:, [0, 2]].mean(axis=1))
+    np.testing.assert_array_equal(motion.speed[1], velocity[:, [1, 3]].mean(axis=1))
     assert motion.stamps.header_ns is not None
     assert motion.stamps.header_ns.tolist() == [START_NS + i * STEP_NS for i in range(40)]
 
@@ -116,10 +116,10 @@ def test_an_arm_on_the_same_topic_is_not_part_of_the_wheels(tmp_path: Path, ros1
     publishers = [("/joint_states", arm), ("/joint_states", messages)]
     motion = wheels_of(write(tmp_path / "log", publishers, "sensor_msgs/msg/JointState"))
     assert motion.problem == ""
-    assert motion.position_left is not None
-    assert motion.speed_right is not None
-    np.testing.assert_array_equal(motion.position_left, wheels[:, [0, 2]].mean(axis=1))
-    np.testing.assert_array_equal(motion.speed_right, 2 * wheels[:, [1, 3]].mean(axis=1))
+    assert motion.position is not None
+    assert motion.speed is not None
+    np.testing.assert_array_equal(motion.position[0], wheels[:, [0, 2]].mean(axis=1))
+    np.testing.assert_array_equal(motion.speed[1], 2 * wheels[:, [1, 3]].mean(axis=1))
     assert len(motion.stamps.log_ns) == count
 
 
@@ -130,8 +130,8 @@ def test_axles_that_publish_apart_are_not_averaged_by_turns(tmp_path: Path) -> N
         tmp_path / "log.mcap", [("/joint_states", front), ("/joint_states", rear)], "sensor_msgs/msg/JointState"
     )
     motion = wheels_of(path)
-    assert motion.position_right is not None
-    assert motion.position_right.tolist() == [2.0 * i for i in range(20)]
+    assert motion.position is not None
+    assert motion.position[1].tolist() == [2.0 * i for i in range(20)]
 
 
 def test_sides_in_different_messages_are_refused_in_words(tmp_path: Path) -> None:
@@ -149,14 +149,10 @@ def test_a_list_left_empty_is_not_told(tmp_path: Path, lacking: str) -> None:
         for i, v in enumerate(values)
     ]
     motion = wheels_of(write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState"))
-    told, untold = (
-        (motion.speed_left, motion.position_left)
-        if lacking == "position"
-        else (motion.position_left, motion.speed_left)
-    )
+    told, untold = (motion.speed, motion.position) if lacking == "position" else (motion.position, motion.speed)
     assert untold is None
     assert told is not None
-    assert told.tolist() == [0.75 * i for i in range(10)]
+    assert told[0].tolist() == [0.75 * i for i in range(10)]
 
 
 def test_a_joint_that_never_says_a_number_is_left_out_of_its_side(tmp_path: Path) -> None:
@@ -165,10 +161,10 @@ def test_a_joint_that_never_says_a_number_is_left_out_of_its_side(tmp_path: Path
         for i in range(6)
     ]
     motion = wheels_of(write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState"))
-    assert motion.position_left is not None
-    assert motion.position_right is not None
-    np.testing.assert_array_equal(motion.position_left, np.arange(6.0))
-    np.testing.assert_array_equal(motion.position_right, [0.0, 2.0, 4.0, 6.0, np.nan, 10.0])
+    assert motion.position is not None
+    assert motion.position is not None
+    np.testing.assert_array_equal(motion.position[0], np.arange(6.0))
+    np.testing.assert_array_equal(motion.position[1], [0.0, 2.0, 4.0, 6.0, np.nan, 10.0])
 
 
 def test_all_nan_joints_tell_nothing(tmp_path: Path) -> None:
@@ -182,8 +178,8 @@ def test_configured_joints_go_before_names(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState")
     assert "no left and right wheel among its joints a, b, c" in wheels_of(path).problem
     motion = wheels_of(path, 'wheels.left_joints=["b"]', 'wheels.right_joints=["a"]')
-    assert motion.position_left is not None
-    assert motion.position_left.tolist() == [2.0 * i for i in range(6)]
+    assert motion.position is not None
+    assert motion.position[0].tolist() == [2.0 * i for i in range(6)]
 
 
 @pytest.mark.parametrize(
@@ -203,9 +199,9 @@ def test_counters_are_unwrapped_at_the_width_of_their_type(tmp_path: Path, name:
     publishers = [("/robot/lwheel_ticks", messages), ("/robot/rwheel_ticks", messages)]
     motion = wheels_of(write_mcap(tmp_path / "log.mcap", publishers, f"std_msgs/msg/{name}"))
     assert motion.topic == "/robot/lwheel_ticks + /robot/rwheel_ticks"
-    assert motion.position_unit == ("unknown" if name.startswith("Float") else "counts")
-    for side in (motion.position_left, motion.position_right):
-        assert side is not None
+    assert motion.unit == ("unknown" if name.startswith("Float") else "counts")
+    assert motion.position is not None
+    for side in motion.position:
         np.testing.assert_array_equal(side - side[0], travelled - travelled[0])
 
 
@@ -220,64 +216,62 @@ def test_a_pair_is_read_only_while_both_sides_were_recorded() -> None:
     left, right = pair_tables(np.arange(100.0), np.arange(100.0), topic="angle")
     late = right.rows(np.arange(100) >= 60)
     motion = pair_motion(left, late, CONFIG)
-    assert motion.position_left is not None
-    assert motion.position_right is not None
-    np.testing.assert_array_equal(motion.position_left, motion.position_right)
-    assert motion.position_left.tolist() == list(range(60, 100))
+    assert motion.position is not None
+    assert motion.position is not None
+    np.testing.assert_array_equal(motion.position[0], motion.position[1])
+    assert motion.position[0].tolist() == list(range(60, 100))
 
 
 def test_a_pair_of_different_integers_is_unwrapped_side_by_side() -> None:
     left, right = pair_tables([32_000, -32_000], [65_500, 66_500], kinds=("Int16", "Int32"), topic="ticks")
     motion = pair_motion(left, right, CONFIG)
     assert motion.message_type == "std_msgs/Int16 + std_msgs/Int32"
-    assert motion.position_left is not None
-    assert motion.position_right is not None
-    assert np.diff(motion.position_left) == 1536
-    assert np.diff(motion.position_right) == 1000
+    assert motion.position is not None
+    assert motion.position is not None
+    assert np.diff(motion.position[0]) == 1536
+    assert np.diff(motion.position[1]) == 1000
 
 
 def test_a_side_without_messages_is_refused_in_words() -> None:
     left, right = pair_tables([1.0, 2.0], [1.0, 2.0])
-    nothing = TopicTable(right.topic, right.message_type, np.empty(0, np.int64), {}, {}, 0, "the log")
+    nothing = TopicTable(right.topic, right.message_type, np.empty(0, np.int64), {}, {}, 0)
     assert pair_motion(left, nothing, CONFIG).problem == "/right/speed holds no message"
     never = pair_motion(left, right.rows(np.array([True, False])), CONFIG)
     assert never.problem == ""
-    gone = TopicTable(right.topic, right.message_type, right.log_time_ns + 10**12, right.columns, {}, 0, "the log")
+    gone = TopicTable(right.topic, right.message_type, right.log_time_ns + 10**12, right.columns, {}, 0)
     assert pair_motion(left, gone, CONFIG).problem == "the two sides were not recorded at the same time"
 
 
 def test_the_second_message_of_a_cycle_belongs_to_the_first() -> None:
     left, right = pair_tables([1.0, 2.0, 3.0], [10.0, 20.0, 30.0])
-    shifted = TopicTable(
-        right.topic, right.message_type, right.log_time_ns + 3_000_000, right.columns, {}, 0, "the log"
-    )
+    shifted = TopicTable(right.topic, right.message_type, right.log_time_ns + 3_000_000, right.columns, {}, 0)
     motion = pair_motion(left, shifted, CONFIG)
-    assert motion.speed_right is not None
-    assert motion.speed_right.tolist() == [10.0, 20.0, 30.0]
+    assert motion.speed is not None
+    assert motion.speed[1].tolist() == [10.0, 20.0, 30.0]
 
 
 def drivers(package: str) -> TopicTable:
     travel, velocity = np.array([[1.0, 2.0], [3.0, 5.0]]), np.array([[0.1, 0.2], [0.3, 0.5]])
     columns = {"drivers[*].measured_travel": travel, "drivers[*].measured_velocity": velocity}
-    return TopicTable("/feedback", f"{package}/Feedback", START_NS + np.arange(2), columns, {}, 0, "the log")
+    return TopicTable("/feedback", f"{package}/Feedback", START_NS + np.arange(2), columns, {}, 0)
 
 
 @pytest.mark.parametrize("package", ["jackal_msgs", "clearpath_platform_msgs"])
 def test_driver_0_is_left_and_driver_1_is_right(package: str) -> None:
     motion = read(drivers(package))
-    assert motion.position_left is not None
-    assert motion.speed_right is not None
-    assert motion.position_left.tolist() == [1.0, 3.0]
-    assert motion.speed_right.tolist() == [0.2, 0.5]
-    assert motion.position_unit == motion.speed_unit == "rad"
+    assert motion.position is not None
+    assert motion.speed is not None
+    assert motion.position[0].tolist() == [1.0, 3.0]
+    assert motion.speed[1].tolist() == [0.2, 0.5]
+    assert motion.unit == "rad"
 
 
 def test_four_wheels_of_a_leo_are_front_and_rear_left_then_right() -> None:
     columns = {"position[*]": np.array([[1.0, 3.0, 5.0, 9.0]] * 2), "velocity[*]": np.array([[1.0, 2.0, 3.0, 4.0]] * 2)}
-    motion = read(TopicTable("/wheels", "leo_msgs/WheelStates", START_NS + np.arange(2), columns, {}, 0, "the log"))
-    assert motion.position_left is not None
-    assert motion.position_right is not None
-    assert (motion.position_left[0], motion.position_right[0]) == (2.0, 7.0)
+    motion = read(TopicTable("/wheels", "leo_msgs/WheelStates", START_NS + np.arange(2), columns, {}, 0))
+    assert motion.position is not None
+    assert motion.position is not None
+    assert (motion.position[0][0], motion.position[1][0]) == (2.0, 7.0)
 
 
 def test_a_segway_tells_metres() -> None:
@@ -287,10 +281,10 @@ def test_a_segway_tells_metres() -> None:
         for what in ("velocity", "displacement")
     }
     for name in ("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped", "segway_interfaces/Stamped"):
-        motion = read(TopicTable("/status", name, START_NS + np.arange(2), columns, {}, 0, "the log"))
-        assert motion.position_unit == motion.speed_unit == "m"
-        assert motion.position_right is not None
-        assert motion.position_right.tolist() == [3.0, 6.0]
+        motion = read(TopicTable("/status", name, START_NS + np.arange(2), columns, {}, 0))
+        assert motion.unit == "m"
+        assert motion.position is not None
+        assert motion.position[1].tolist() == [3.0, 6.0]
 
 
 def feedback_with_names(message_type: str, names: str, velocity: str, travel: str) -> TopicTable:
@@ -300,7 +294,7 @@ def feedback_with_names(message_type: str, names: str, velocity: str, travel: st
         velocity: np.array([[0.1, 0.2], [2.0, 1.0]]),
     }
     texts = {names: ["front_left_wheel_joint", "front_right_wheel_joint"]}
-    return TopicTable("/a/feedback", message_type, START_NS + np.arange(2), columns, texts, 0, "the log")
+    return TopicTable("/a/feedback", message_type, START_NS + np.arange(2), columns, texts, 0)
 
 
 @pytest.mark.parametrize(
@@ -315,15 +309,15 @@ def feedback_with_names(message_type: str, names: str, velocity: str, travel: st
 )
 def test_motor_drivers_are_told_apart_by_their_joint(message_type: str, names: str, velocity: str, travel: str) -> None:
     motion = read(feedback_with_names(message_type, names, velocity, travel))
-    assert motion.position_left is not None
-    assert motion.speed_right is not None
-    assert motion.position_left.tolist() == [1.0, 10.0]
-    assert motion.speed_right.tolist() == [0.2, 2.0]
+    assert motion.position is not None
+    assert motion.speed is not None
+    assert motion.position[0].tolist() == [1.0, 10.0]
+    assert motion.speed[1].tolist() == [0.2, 2.0]
 
 
 def twist_table(message_type: str, topic: str, prefix: str, x: Any, y: Any, turn: Any) -> TopicTable:
     columns = {f"{prefix}linear.x": np.array(x), f"{prefix}linear.y": np.array(y), f"{prefix}angular.z": np.array(turn)}
-    return TopicTable(topic, message_type, START_NS + np.arange(len(x)), columns, {}, 0, "the log")
+    return TopicTable(topic, message_type, START_NS + np.arange(len(x)), columns, {}, 0)
 
 
 @pytest.mark.parametrize(

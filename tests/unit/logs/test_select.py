@@ -37,7 +37,7 @@ def table(topic: str, message_type: str, texts: dict[str, list[str]] | None = No
     for path, found in (texts or {}).items():
         codes = np.tile(np.arange(len(found)), (COUNT, 1))
         arrays.setdefault(path, codes if "[*]" in path else codes[:, 0])
-    return TopicTable(topic, message_type, TIMES, arrays, texts or {}, 0, "the log")
+    return TopicTable(topic, message_type, TIMES, arrays, texts or {}, 0)
 
 
 def joints(
@@ -45,9 +45,7 @@ def joints(
 ) -> TopicTable:
     values = np.column_stack([WAVE * scale] * len(names))
     found = table(topic, "sensor_msgs/JointState", {"name[*]": list(names)})
-    return TopicTable(
-        topic, found.message_type, TIMES, {**found.columns, "velocity[*]": values}, found.texts, 0, "the log"
-    )
+    return TopicTable(topic, found.message_type, TIMES, {**found.columns, "velocity[*]": values}, found.texts, 0)
 
 
 def orientation(prefix: str = "orientation") -> dict[str, Any]:
@@ -65,7 +63,7 @@ def fix(topic: str = "/gps/fix", std_m: float = 0.02) -> TopicTable:
         topic, "sensor_msgs/NavSatFix", status__status=np.zeros(COUNT), latitude=48.0 + WAVE * 1e-4,
         longitude=11.0 + WAVE * 1e-4, altitude=np.full(COUNT, 500.0), position_covariance_type=np.full(COUNT, 2),
     )  # fmt: skip
-    return TopicTable(topic, found.message_type, TIMES, found.columns | covariance, {}, 0, "the log")
+    return TopicTable(topic, found.message_type, TIMES, found.columns | covariance, {}, 0)
 
 
 def odometry(topic: str = "/odom", frame: str = "odom") -> TopicTable:
@@ -325,7 +323,7 @@ def test_what_came_into_question_is_listed_first_with_the_reason() -> None:
 
 
 def test_a_topic_whose_messages_are_all_damaged_says_so() -> None:
-    nothing = TopicTable("/gps/fix", "sensor_msgs/NavSatFix", TIMES[:0], {}, {}, 7, "the log")
+    nothing = TopicTable("/gps/fix", "sensor_msgs/NavSatFix", TIMES[:0], {}, {}, 7)
     with pytest.raises(MissingStreamError, match=r"/gps/fix .*none of its 7 messages"):
         choose([joints(), nothing, imu()])
 
@@ -350,7 +348,7 @@ def test_a_topic_whose_messages_are_all_damaged_says_so() -> None:
     ],
 )
 def test_a_configured_topic_that_cannot_be_used_is_a_clear_error(setting: str, sentence: str) -> None:
-    empty = TopicTable("/empty/fix", "sensor_msgs/NavSatFix", TIMES[:0], {}, {}, 0, "the log")
+    empty = TopicTable("/empty/fix", "sensor_msgs/NavSatFix", TIMES[:0], {}, {}, 0)
     bad = fix("/bad/fix")
     bad.columns["status.status"] = np.full(COUNT, -1)
     tables = [joints(), fix(), imu(), empty, bad, joints("/arm", names=("a", "b")), side("/left/speed")]
@@ -377,9 +375,9 @@ def test_a_configured_topic_that_cannot_be_used_is_a_clear_error(setting: str, s
     ],
 )
 def test_a_configured_pair_that_cannot_be_used_is_a_clear_error(left: str, right: str, sentence: str) -> None:
-    empty = TopicTable("/b/empty", "std_msgs/Float64", TIMES[:0], {}, {}, 0, "the log")
+    empty = TopicTable("/b/empty", "std_msgs/Float64", TIMES[:0], {}, {}, 0)
     later = side("/b/later")
-    later = TopicTable(later.topic, later.message_type, TIMES + 10**13, later.columns, {}, 0, "the log")
+    later = TopicTable(later.topic, later.message_type, TIMES + 10**13, later.columns, {}, 0)
     tables = [joints(), fix(), imu(), side("/a/speed"), side("/b/speed"), empty, later]
     with pytest.raises(ConfigError, match=sentence):
         choose(tables, f"topics.wheel_left={left}", f"topics.wheel_right={right}")

@@ -22,7 +22,8 @@ NOTHING = PositionFixes(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
 
 def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[str]]:
     stamps = STEP_NS * np.arange(len(left), dtype=np.int64)
-    motion = motion_of("/wheels", "some/Type", StampedRows(None, stamps, "", 0), position=(left, right))
+    empty = WheelMotion(topic="/wheels", message_type="some/Type", stamps=StampedRows(None, stamps, "", 0))
+    motion = motion_of(empty, position=(left, right))
     raw, _ = wheel_samples(motion, stamps, CONFIG, "log")
     headings = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
     log = with_wheel_speeds(RobotLog("log", raw, NOTHING, headings, None, (), (), {}, ()), CONFIG)
@@ -58,17 +59,15 @@ def within_a_turn(positions: Floats, low: float) -> Floats:
 def test_joints_told_within_one_turn_are_read_like_those_that_go_on(travel: Floats, low: float) -> None:
     positions = np.column_stack([travel, travel + 1.0, -0.7 * travel, 2.0 - 0.7 * travel])
     whole, wrapped = (joints_motion(each) for each in (positions, within_a_turn(positions, low)))
-    for one, other in zip(
-        (whole.position_left, whole.position_right), (wrapped.position_left, wrapped.position_right), strict=True
-    ):
+    for one, other in zip(whole.position or (), wrapped.position or (), strict=True):
         assert np.diff(other) == pytest.approx(np.diff(one), abs=1e-9)
 
 
 def test_a_gap_in_less_than_a_turn_is_no_wrap() -> None:
     positions = np.repeat(np.array([0.0, 0.1, 5.0, 5.1, 5.2])[:, None], 4, axis=1)
-    left = joints_motion(positions).position_left
-    assert left is not None
-    assert left.tolist() == positions[:, 0].tolist()
+    sides = joints_motion(positions).position
+    assert sides is not None
+    assert sides[0].tolist() == positions[:, 0].tolist()
 
 
 def joints_motion(positions: Floats) -> WheelMotion:
@@ -79,7 +78,7 @@ def joints_motion(positions: Floats) -> WheelMotion:
         "velocity[*]": np.full((rows, 4), np.nan),
     }  # fmt: skip
     times = STEP_NS * np.arange(rows, dtype=np.int64)
-    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0, "test")
+    table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0)
     return WHEEL_TYPES["sensor_msgs/JointState"][1](table, CONFIG)
 
 

@@ -96,7 +96,7 @@ def test_parameters_drawn_from_the_prior_come_back_within_two_standard_deviation
     """Slip that wanders makes the errors of neighbouring windows alike."""
     models, seeds = (FREE[-4:-2], range(6)) if gyro else (FREE, SEEDS)
     inside, total = np.sum([count_within(model, seeds, gyro=gyro) for model in models], axis=0)
-    assert 0.90 <= inside / total <= (1.0 if gyro else 0.995)
+    assert 0.88 <= inside / total <= 0.99
 
 
 @pytest.mark.stress
@@ -105,8 +105,7 @@ def test_parameters_drawn_from_the_prior_come_back_within_two_standard_deviation
 def test_two_hundred_robots_of_each_model_come_back(model: MotionModel, gyro: bool) -> None:
     inside, total = count_within(model, range(200), gyro=gyro)
     print(f"{model.name}, gyro {gyro}: {inside} of {total} within two standard deviations, {inside / total:.3f}")
-    # with a gyro, standard deviations are too wide: of `multiplier` and `icr` all come back
-    assert 0.90 <= inside / total <= (1.0 if gyro else 0.985)
+    assert 0.90 <= inside / total <= 0.98
 
 
 def test_pooled_recordings_have_constants_of_their_own() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from icrtool.output.figures.fleet import FleetNumbers, IcrPoint, fleet_errors, fleet_failures, fleet_icrs
+from icrtool.output.figures.fleet import FleetNumbers, fleet_errors, fleet_failures, fleet_icrs
 from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
@@ -32,7 +32,8 @@ def test_an_ordinary_name_is_unchanged() -> None:
 
 def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
     names = (*HOSTILE, "_hidden", "W" * 300)
-    points = [IcrPoint(name, "2025-10-09T08:53:21Z", 0.4, -0.4, 0.01, 0.01) for name in names]
+    icr = {"y_icr_right_m": 0.4, "y_icr_left_m": -0.4, "std_y_icr_right_m": 0.01, "std_y_icr_left_m": 0.01}
+    points = [{"robot": name, "start_utc": "2025-10-09T08:53:21Z", "icr": icr} for name in names]
     fleet = FleetNumbers("logs", points, {name: [0.1, 0.2] for name in names}, dict.fromkeys(names, 1))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

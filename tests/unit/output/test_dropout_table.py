@@ -54,7 +54,7 @@ def row_of(text: str, begin: str) -> list[str]:
 
 
 def test_the_table_shows_the_horizons_nearest_to_1_5_10_and_20_m(content: DropoutReport) -> None:
-    assert shown_horizons(content) == [1, 2, 3, 4]
+    assert shown_horizons(content.horizons_m) == [1, 2, 3, 4]
     assert row_of(format_dropout(content), "distance without GNSS") == ["1", "m", "5", "m", "9", "m", "30", "m"]
 
 

@@ -13,6 +13,7 @@ import pytest
 from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output import run_directory
+from icrtool.output.files.atomic_directory import atomic_directory
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
@@ -101,8 +102,8 @@ def test_the_same_run_makes_the_same_bytes(tmp_path: Path, run: Run) -> None:
 
 
 def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Run) -> None:
-    (written / "dropout").mkdir()
-    (written / "dropout" / "summary.csv").write_text("of the old states")
+    with atomic_directory(written / "dropout", lambda _: False, kind="dropout report") as partial:
+        (partial / "summary.csv").write_text("of the old states")
     write_run(run, written, states="parquet", plots=())
     assert names_in(written) == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]

@@ -113,7 +113,7 @@ def test_the_truth_reads_back_to_the_last_bit(tmp_path: Path) -> None:
     _, truth = simulate(DrivePlan(duration_s=3.0), Sensors(), 0)
     write_truth(truth, tmp_path / "truth.csv")
     table = pd.read_csv(tmp_path / "truth.csv")
-    for name, values in truth.columns().items():
+    for name, values in truth.items():
         np.testing.assert_array_equal(table[name].to_numpy(), values)
 
 

@@ -188,9 +188,9 @@ def test_a_fix_is_called_what_a_receiver_of_its_noise_would_call_it(std: float, 
 
 def test_the_truth_table_stands_at_the_wheel_stamps() -> None:
     told, table = simulate(DrivePlan(duration_s=20.0, changes=((10.0, (0.6, -0.6, 0.1)),)), Sensors(), 0)
-    np.testing.assert_array_equal(table.stamp_ns, told.wheel_stamp_ns)
-    np.testing.assert_array_equal(np.unique(table.x_icr_m), [-0.25, 0.1])
-    assert list(table.columns()) == [
+    np.testing.assert_array_equal(table["stamp_ns"], told.wheel_stamp_ns)
+    np.testing.assert_array_equal(np.unique(table["x_icr_m"]), [-0.25, 0.1])
+    assert list(table) == [
         "stamp_ns", "t_s", "north_m", "east_m", "heading_rad", "y_icr_right_m", "y_icr_left_m", "x_icr_m",
         "v_left_mps", "v_right_mps",
     ]  # fmt: skip

@@ -15,7 +15,7 @@ from icrtool.simulation import study_runs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import KINDS, StudyRequest, StudyResult, default_request, run_study, statistics
 from icrtool.simulation.study_consistency import chi2_band, errors_over_std
-from icrtool.simulation.study_measures import convergence_times, settling_times
+from icrtool.simulation.study_measures import convergence_time, settling_time
 
 
 def request(name: Any, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
@@ -64,7 +64,6 @@ def test_every_study_runs_small_and_says_the_same_again(name) -> None:
 def test_a_run_depends_neither_on_the_others_nor_on_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     few, many = (run_study(request("rate", runs, 5.0, values=(50.0,))) for runs in (2, 5))
     monkeypatch.setattr(study_runs.os, "cpu_count", lambda: 1)
-    monkeypatch.setattr(study_runs, "CHUNK_STATES", 300)
     alone = run_study(request("rate", 5, 5.0, values=(50.0,)))
     for name in ("error_y_icr_right_m", "nis_gnss"):
         np.testing.assert_array_equal(np.asarray(many.columns[name]), np.asarray(alone.columns[name]))
@@ -197,22 +196,22 @@ def test_errors_over_std_of_a_known_gaussian_are_chi_squared() -> None:
 
 def test_a_ramp_rises_and_settles_when_it_should() -> None:
     t = np.arange(0, 11.0, 0.01)
-    value = np.minimum(t / 10.0, 1.0)[None, :]
-    assert convergence_times(t, value, 1.0)[0] == pytest.approx(8.0, abs=0.011)
-    assert settling_times(t, value, 1.0)[0] == pytest.approx(9.0, abs=0.011)
+    value = np.minimum(t / 10.0, 1.0)
+    assert convergence_time(t, value, 1.0) == pytest.approx(8.0, abs=0.011)
+    assert settling_time(t, value, 1.0) == pytest.approx(9.0, abs=0.011)
 
 
 def test_what_never_arrives_has_no_time() -> None:
     t = np.arange(0, 10.0, 0.1)
     value = np.vstack([0.5 * t / 10.0, np.full(100, np.nan), np.where(t < 9.9, 1.0, 0.0)])
     value[:, 0] = 0.0
-    assert np.isnan(convergence_times(t, value[:2], 1.0)).all()
-    assert np.isnan(settling_times(t, value, 1.0)).all()
+    assert np.isnan([convergence_time(t, one, 1.0) for one in value[:2]]).all()
+    assert np.isnan([settling_time(t, one, 1.0) for one in value]).all()
 
 
 def test_an_estimate_that_starts_on_the_truth_has_settled_at_once() -> None:
     t = np.arange(0, 5.0, 0.1)
-    assert settling_times(t, np.full((1, 50), 0.7), 0.7)[0] == 0.0
+    assert settling_time(t, np.full(50, 0.7), 0.7) == 0.0
 
 
 def test_statistics_pass_over_what_is_missing() -> None:

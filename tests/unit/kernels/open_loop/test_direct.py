@@ -274,7 +274,7 @@ class TestKernelsAgainstTheirPythonFunction:
     def test_trial_ends(self):
         drive, _ = troubled_drive()
         ends = np.empty((len(HORIZONS), 260), dtype=np.int64)
-        open_loop.find_trial_ends.py_func(drive, HORIZONS, 0, ends)
+        open_loop.find_trial_ends.py_func(drive, HORIZONS, np.arange(ends.shape[1]), ends)
         np.testing.assert_array_equal(ends.T, trial_ends(drive, HORIZONS))
 
     def test_direct_integration(self):

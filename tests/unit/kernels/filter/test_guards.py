@@ -1,4 +1,4 @@
-"""The batch kernel compared with single runs, and each sign guard with complex-step differences."""
+"""Each sign guard compared with complex-step differences, the covariance at stops, and motion by the filter's model."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.filter import batch_filter as study
+from icrtool.kernels.arcs import model_states
 from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.ekf_step import predict
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
+from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
 from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
 from support.matrix_filter import step_state
 
@@ -35,41 +35,25 @@ PARAMETERS = FilterParameters(
 )
 
 
-def make_batch(runs: int, icrs: tuple[float, float, float], stops: tuple[int, ...] = ()) -> study.Batch:
+def filtered(
+    icrs: tuple[float, float, float], parameters: FilterParameters = PARAMETERS, rows: int = 600,
+    stops: tuple[int, ...] = (), change_s: float = 8.0,
+) -> FilterOutput:  # fmt: skip
     rng = np.random.default_rng(3)
     t = np.arange(600) / 50
     fix = np.arange(0, 600, 5)
-    v_left = np.tile(0.4 + 0.2 * np.sin(0.7 * t), (runs, 1)) + rng.normal(0, 0.01, (runs, 600))
-    v_right = np.tile(0.4 + 0.2 * np.sin(0.5 * t), (runs, 1)) + rng.normal(0, 0.01, (runs, 600))
-    truth = np.zeros((runs, 600, 6))
-    truth[:, 0, 3:] = [0.5, -0.75, -0.25]
-    for run in range(runs):
-        truth[run] = study.model_states(
-            truth[run, 0], t, v_left[run], v_right[run], np.zeros(6), False, np.zeros((600, 6))
-        )
-    return study.Batch(
-        wheel_t=t,
-        gnss_t=t[fix],
-        heading_t=t,
-        change_t=np.array([8.0]),
-        gnss_r=np.full((len(fix), 2), 1e-4),
-        heading_r=np.full(600, math.radians(1) ** 2),
-        v_left=v_left,
-        v_right=v_right,
-        gnss_z=truth[:, fix, :2] + rng.normal(0, 0.01, (runs, len(fix), 2)),
-        heading_z=truth[:, :, 2] + rng.normal(0, math.radians(1), (runs, 600)),
-        t0=0.0,
-        x0=np.tile([0.0, 0.0, 0.0, *icrs], (runs, 1)),
-        P0=np.diag([1e-4, 1e-4, math.radians(1) ** 2, 0.25, 0.25, 0.25])[np.triu_indices(6)],
-        stops=np.array([*stops, 599]),
-    )
-
-
-def single(batch: study.Batch, run: int) -> FilterInputs:
-    return FilterInputs(
-        batch.wheel_t, batch.v_left[run], batch.v_right[run], batch.gnss_t, batch.gnss_z[run], batch.gnss_r,
-        batch.heading_t, batch.heading_z[run], batch.heading_r, batch.change_t,
+    v_left = 0.4 + 0.2 * np.sin(0.7 * t) + rng.normal(0, 0.01, 600)
+    v_right = 0.4 + 0.2 * np.sin(0.5 * t) + rng.normal(0, 0.01, 600)
+    x0 = np.array([0.0, 0.0, 0.0, 0.5, -0.75, -0.25])
+    truth = model_states(x0, t, v_left, v_right, np.zeros(6), False, np.zeros((600, 6)))
+    data = FilterInputs(
+        t[:rows], v_left[:rows], v_right[:rows],
+        t[fix], truth[fix, :2] + rng.normal(0, 0.01, (len(fix), 2)), np.full((len(fix), 2), 1e-4),
+        t, truth[:, 2] + rng.normal(0, math.radians(1), 600), np.full(600, math.radians(1) ** 2), np.array([change_s]),
     )  # fmt: skip
+    x0[3:] = icrs
+    P0 = np.diag([1e-4, 1e-4, math.radians(1) ** 2, 0.25, 0.25, 0.25])
+    return run_ekf(data, 0.0, x0, P0, parameters, stops)
 
 
 def full(upper: np.ndarray) -> np.ndarray:
@@ -78,38 +62,25 @@ def full(upper: np.ndarray) -> np.ndarray:
     return P + np.triu(P, 1).T
 
 
-def test_a_batch_gives_every_run_what_the_filter_gives_it_alone() -> None:
-    batch = make_batch(3, (0.6, -0.6, 0.0), stops=(100, 333))
-    out = study.run_batch(batch, PARAMETERS)
-    for run in range(3):
-        alone = run_ekf(single(batch, run), 0.0, batch.x0[run], full(batch.P0), PARAMETERS)
-        np.testing.assert_array_equal(out.x[run], alone.x)
-        np.testing.assert_array_equal(out.variance[run], alone.variance)
-        np.testing.assert_array_equal(out.gnss_nis[run], alone.gnss_nis)
-        np.testing.assert_array_equal(out.heading_nis[run], alone.heading_nis)
-        np.testing.assert_array_equal(out.P[run, -1], alone.P)
-
-
 def test_the_covariance_at_a_stop_is_that_of_a_run_that_ends_there() -> None:
-    batch = make_batch(2, (0.6, -0.6, 0.0), stops=(250,))
-    out = study.run_batch(batch, PARAMETERS)
-    data = single(batch, 1)
-    data = data._replace(wheel_t=data.wheel_t[:251], v_left=data.v_left[:251], v_right=data.v_right[:251])
-    np.testing.assert_array_equal(out.P[1, 0], run_ekf(data, 0.0, batch.x0[1], full(batch.P0), PARAMETERS).P)
+    icrs = (0.6, -0.6, 0.0)
+    out = filtered(icrs, stops=(100, 250, 599))
+    np.testing.assert_array_equal(out.P_at_stops, [filtered(icrs, rows=rows).P for rows in (101, 251, 600)])
+    np.testing.assert_array_equal(out.x, filtered(icrs).x)
 
 
 @pytest.mark.parametrize("guard", [UNGUARDED, PRINTED])
 def test_all_guards_agree_while_the_icrs_are_proper(guard: int) -> None:
-    batch = make_batch(2, (0.6, -0.6, 0.0))._replace(change_t=np.empty(0))
-    guarded, other = study.run_batch(batch, PARAMETERS), study.run_batch(batch, PARAMETERS._replace(guard=guard))
-    np.testing.assert_array_equal(guarded.x, other.x)
+    icrs, never = (0.6, -0.6, 0.0), 100.0
+    other = filtered(icrs, PARAMETERS._replace(guard=guard), change_s=never)
+    np.testing.assert_array_equal(filtered(icrs, change_s=never).x, other.x)
 
 
 @pytest.mark.parametrize("guard", [UNGUARDED, PRINTED])
 def test_guards_differ_where_the_icrs_are_inverted(guard: int) -> None:
-    batch = make_batch(2, (-0.5, 0.4, 0.1))
-    guarded, other = study.run_batch(batch, PARAMETERS), study.run_batch(batch, PARAMETERS._replace(guard=guard))
-    assert np.abs(guarded.x[:, 20] - other.x[:, 20]).max() > 1e-3
+    icrs = (-0.5, 0.4, 0.1)
+    guarded, other = filtered(icrs), filtered(icrs, PARAMETERS._replace(guard=guard))
+    assert np.abs(guarded.x[20] - other.x[20]).max() > 1e-3
 
 
 def unguarded_step(x: np.ndarray, v_left: float, v_right: float, dt: float) -> np.ndarray:
@@ -148,7 +119,7 @@ def test_model_states_without_noise_are_euler_steps() -> None:
     t = np.arange(50) / 10
     v_left, v_right = np.sin(t), np.cos(t)
     x0 = np.array([1.0, 2.0, 0.3, 0.5, -0.75, -0.25])
-    states = study.model_states(x0, t, v_left, v_right, np.ones(6), False, np.zeros((50, 6)))
+    states = model_states(x0, t, v_left, v_right, np.ones(6), False, np.zeros((50, 6)))
     x = x0
     for k in range(49):
         x = step_state(x, v_left[k], v_right[k], t[k + 1] - t[k])
@@ -161,5 +132,5 @@ def test_model_states_are_disturbed_as_the_filter_expects(rate_invariant: bool, 
     t = np.arange(20_000) / 10
     std = np.array([0.2, 0.2, 0.1, 0.0, 0.0, 0.0])
     x0 = np.array([0.0, 0.0, 0.0, 0.5, -0.75, -0.25])
-    states = study.model_states(x0, t, np.zeros(20_000), np.zeros(20_000), std, rate_invariant, noise)
+    states = model_states(x0, t, np.zeros(20_000), np.zeros(20_000), std, rate_invariant, noise)
     np.testing.assert_allclose(np.diff(states, axis=0).std(axis=0), scale * std, rtol=0.02)
