@@ -197,13 +197,12 @@ class _Compiler:
         else:
             self.message(inner, f"{path}.", loop)
         self._emit(END_LOOP)
-        stride = max(self.columns - first, 1) if takes else 0
-        self.slots |= {
-            name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
-        }
-        self.rows[begin][5] = stride
         self.rows[begin][6] = len(self.rows)
         if takes:
+            stride = self.rows[begin][5] = max(self.columns - first, 1)
+            self.slots |= {
+                name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
+            }
             self.columns = first + stride * repeat
             self._check_columns()
             self._last_take = len(self.rows)
