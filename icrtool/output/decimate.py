@@ -33,12 +33,11 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
     bins = max(points // (2 * len(columns)), 1)
     width = -(-rows // bins)
     begin = np.arange(0, rows, width)
-    chosen = [np.array([0, rows - 1])]
+    chosen, padded = [np.array([0, rows - 1])], np.full(len(begin) * width, np.inf)
     for column in columns:
         missing = np.isnan(column)
         chosen.append(np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]])))
         for sign in (1.0, -1.0):
-            padded = np.full(len(begin) * width, np.inf)
             np.multiply(column, sign, out=padded[:rows])
             padded[:rows][missing] = np.inf
             chosen.append(begin + padded.reshape(-1, width).argmin(axis=1))
