@@ -65,6 +65,43 @@ def ingest(logs: dict[str, Path], repeats: int) -> None:
         row(f"ingest {name} against AnyReader", ours, [time.perf_counter() - begin], goals[name])
 
 
+def against_decompression(log: Path, repeats: int) -> None:
+    """Read an MCAP log, and decompress its chunks in one thread, in turn."""
+    import zstandard
+    from mcap.reader import make_reader
+
+    import icrtool
+
+    config = icrtool.load_config(robot="segway-rmp400")
+    with log.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        chunks = []
+        for index in summary.chunk_indexes if summary else ():
+            stream.seek(index.chunk_start_offset + index.chunk_length - index.compressed_size)
+            chunks.append((stream.read(index.compressed_size), index.uncompressed_size))
+
+    def decompress() -> None:
+        for packed, size in chunks:
+            zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+
+    wall, cpu = [], []
+    icrtool.read_log(log, config)
+    for _ in range(max(repeats, 5)):
+        both = [cost(call) for call in (lambda: icrtool.read_log(log, config), decompress)]
+        wall.append(both[0][0] / both[1][0])
+        cpu.append(both[0][1] / both[1][1])
+    row("read hour.mcap, in decompressions of its chunks by one thread", wall, goal="<= 3", unit="times")
+    row("the same in CPU time", cpu, unit="times")
+
+
+def cost(call: Callable[[], object]) -> tuple[float, float]:
+    """Return the wall and CPU seconds of a call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
 def filter_speed(logs: dict[str, Path], repeats: int) -> None:
     """Run the filter alone on one core."""
     import icrtool
@@ -195,6 +232,7 @@ def main() -> None:
         chosen = options.only
         if chosen in (None, "ingest"):
             ingest(logs, options.repeats)
+            against_decompression(logs["hour.mcap"], options.repeats)
         if chosen in (None, "filter"):
             filter_speed(logs, options.repeats)
         if chosen in (None, "commands"):

@@ -358,9 +358,7 @@ def _flaw(value: object) -> str | None:
         return next(filter(None, map(_flaw, value)), None)
     if isinstance(value, float) and not math.isfinite(value):
         return "not a finite number"
-    # An argument that is not UTF-8 comes with lone surrogates, which no JSON file takes.
-    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-        return "not text in UTF-8"
+    # Lone surrogates, of an argument that is not UTF-8, do not print either; no JSON file takes them.
     if isinstance(value, str) and not value.isprintable():
         return "has characters that do not print"
     return None

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from functools import partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 
@@ -168,8 +169,7 @@ def _all_of(
     pending: dict[Future[Row], Request] = {}
     try:
         for request in requests:
-            stage = _stage(watch, request.row.log) if isinstance(executor, ThreadPoolExecutor) and watch else None
-            extra = (stage,) if stage is not None else ()
+            extra = (partial(watch, request.row.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
             pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
         for future in as_completed(pending):
             yield pending[future], future.result()
@@ -178,10 +178,6 @@ def _all_of(
             future.cancel()
         close_all()
         raise
-
-
-def _stage(watch: Watch, log: str) -> Callable[[str], None]:
-    return lambda stage: watch(log, stage)
 
 
 def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:

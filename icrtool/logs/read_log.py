@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from icrtool.errors import DataError, DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.split_files import file_sha256, log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.dynamic_joints import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -105,7 +104,7 @@ def survey_log(
     try:
         with ThreadPoolExecutor(1) as pool:
             try:
-                hashes = [pool.submit(_fingerprint, file, ended) for file in container.files]
+                hashes = [pool.submit(file_sha256, file, ended) for file in container.files]
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
@@ -273,21 +272,25 @@ def _collect(
     static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
     wanted |= static
     cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
-    for whole in container.blocks(frozenset(wanted), cut):
-        block = cut.of(whole)
-        for number in np.unique(block.channel).tolist():
-            if number not in wanted:
-                continue
-            try:
-                if number not in collectors:
-                    # A definition is compiled when its first message comes: a log may declare any number of topics.
-                    collectors[number] = collector_for(by_id[number], wanted[number])
-                if (collector := collectors[number]) is not None:
-                    collector.feed(block, block.channel == number)
-            except DefinitionError as err:
-                unread[by_id[number].topic], collectors[number] = str(err), None
-        if progress is not None:
-            progress(container.share_read())
+    with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
+        for whole in blocks:
+            block = cut.of(whole)
+            left = block.channel
+            while len(left):
+                number = int(left[0])
+                left = left[left != number]
+                if number not in wanted:
+                    continue
+                try:
+                    if number not in collectors:
+                        # A definition is compiled when its first message comes: a log may declare any number of topics.
+                        collectors[number] = collector_for(by_id[number], wanted[number])
+                    if (collector := collectors[number]) is not None:
+                        collector.feed(block, number)
+                except DefinitionError as err:
+                    unread[by_id[number].topic], collectors[number] = str(err), None
+            if progress is not None:
+                progress(container.share_read())
     tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
     silent = [by_id[number] for number in wanted if number not in collectors]
     tables += [_empty_table(channel) for channel in silent]
@@ -296,15 +299,6 @@ def _collect(
 
 def _empty_table(channel: Channel) -> TopicTable:
     return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0)
-
-
-def _fingerprint(file: Path, ended: Event) -> str:
-    """Return the SHA-256 of a file, or of its beginning once `ended` is set."""
-    digest, piece = hashlib.sha256(), bytearray(1 << 20)
-    with file.open("rb", buffering=0) as stream:
-        while not ended.is_set() and (count := stream.readinto(piece)):
-            digest.update(memoryview(piece)[:count])
-    return digest.hexdigest()
 
 
 def _input_of(file: Path, pending: Future[str]) -> InputFile:

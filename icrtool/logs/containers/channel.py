@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -99,16 +99,6 @@ class Block(NamedTuple):
     end: Ints
 
 
-def joined(blocks: Sequence[Block]) -> Block:
-    """Return the messages of several blocks as one that has memory of its own."""
-    data, channel, times, start, end = zip(*blocks, strict=True)
-    shift = np.cumsum([0, *map(len, data[:-1])])
-    starts, ends = (np.concatenate([at + by for at, by in zip(column, shift, strict=True)]) for column in (start, end))
-    bytes_ = np.concatenate(data)
-    bytes_.flags.writeable = False
-    return Block(bytes_, np.concatenate(channel), np.concatenate(times), starts, ends)
-
-
 class Container(Protocol):
     """A log file or directory, opened."""
 
@@ -127,7 +117,7 @@ class Container(Protocol):
         """The files that make up this log."""
         ...
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
         """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
 
         What an index shows to be outside the cut is not read.
@@ -163,7 +153,8 @@ class Problems(list[str]):
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
     """Return a block without the messages whose log time is negative or beyond `LAST_TIME_NS`."""
-    possible = (block.log_time_ns >= 0) & (block.log_time_ns < LATEST_NS)
+    # Negative ones are above all others as unsigned numbers.
+    possible = block.log_time_ns.view(np.uint64) < LATEST_NS
     if possible.all():
         return block
     problems.add("messages with an impossible log time left out")

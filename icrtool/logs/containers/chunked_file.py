@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,51 +14,64 @@ from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space
 
-MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
+MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
 
-MOST_ROWS = 1 << 18
-"""Records that a scan finds at a time."""
+MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
+"""Messages that a scan finds at a time; a record has more bytes than this."""
 
 
-class IndexedChunk(Protocol):
-    """First and last log time of a chunk [ns], 0 where they are not known."""
+class Chunk(NamedTuple):
+    """A chunk in a file, and its entry in the index.
 
-    @property
-    def begin_ns(self) -> int:
-        """First log time."""
-        ...
+    Attributes
+    ----------
+    at, length : where its content is in the file; of a bag only where its record begins
+    channels : those it holds, None without an entry
+    begin_ns, end_ns : first and last log time in it, 0 where they are not known
+    index_length : of the message index records that follow it
+    size : of its records, decompressed
+    stored : they are not compressed
+    """
 
-    @property
-    def end_ns(self) -> int:
-        """Last log time."""
-        ...
+    at: int
+    length: int = 0
+    channels: frozenset[int] | None = None
+    begin_ns: int = 0
+    end_ns: int = 0
+    index_length: int = 0
+    size: int = 0
+    stored: bool = False
+
+
+class Spaces(NamedTuple):
+    """Memory for a chunk as it is in the file, for its records, and for records of several chunks."""
+
+    packed: Space
+    records: Space
+    joined: Space
 
 
 class ChunkedFile(ABC):
-    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
+    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
 
-    Parameters
-    ----------
-    message : operation code of a record that is a message
-    """
+    _chunks: Sequence[Chunk] | None = None
 
-    _chunks: Sequence[IndexedChunk] | None = None
-
-    def __init__(self, path: Path, message: int) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.files = [path]
         self.problems = Problems(path.name)
-        self._message = message
-        self._rows: Ints = np.empty((0, 5), np.int64)
-        self._inflation, self._space = Inflation(), Space()
+        self._inflation = Inflation()
+        # A block is used while the next one is made.
+        self._spaces, self._other_spaces = (Spaces(Space(), Space(), Space()) for _ in range(2))
         self._stream = path.open("rb")
+        self._at = 0
         self._size = path.stat().st_size
 
     @abstractmethod
-    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        """Yield the messages of the wanted channels by the index."""
+    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted channels in some chunks."""
 
     @abstractmethod
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -69,18 +83,28 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
         """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
 
     @abstractmethod
     def _learn(self, row: Ints, data: Bytes) -> None:
-        """Remember a record that is no message; `row` is that of the scan of `data`."""
+        """Remember a record that is no message; `row` is its column in `others` of the scan of `data`."""
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
-        """Yield the messages of the wanted channels, chunk by chunk."""
-        if wanted:
-            yield from self._read_in_order() if self._chunks is None else self._indexed(wanted, cut)
-            self._free()
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+        """Yield the messages of the wanted channels, chunk by chunk; the next is made while one is used."""
+        if not wanted:
+            return
+        if self._chunks is None:
+            blocks = self._read_in_order()
+        else:
+            needed = [one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted)]
+            blocks = self._indexed(needed, wanted)
+        with ThreadPoolExecutor(1) as pool:
+            pending = pool.submit(next, blocks, None)
+            while (block := pending.result()) is not None:
+                pending = pool.submit(next, blocks, None)
+                yield block
+        self._free()
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels."""
@@ -90,13 +114,12 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        self._rows = np.empty((0, 5), np.int64)
-        self._space.free()
-        self._inflation.free()
+        for space in (*self._spaces, *self._other_spaces):
+            space.free()
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
-        return self._stream.tell() / max(self._size, 1)
+        return self._at / max(self._size, 1)
 
     def close(self) -> None:
         """Release the file."""
@@ -107,17 +130,22 @@ class ChunkedFile(ABC):
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
-    def _read(self, at: int, length: int) -> memoryview:
-        """Return bytes of the file, as many as there are, valid until the next call."""
-        length = min(length, self._size - at)
-        if length <= 0:
-            return memoryview(b"")
+    def _bytes(self, at: int, count: int) -> bytes:
+        """Return bytes of the file, as many as there are."""
         self._stream.seek(at)
-        space = self._space.of(length).data
-        return space[: self._stream.readinto(space)]
+        return self._stream.read(count)
+
+    def _read(self, at: int, length: int) -> Bytes:
+        """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
+        space = self._spaces.packed.of(max(min(length, self._size - at), 0))
+        self._at = min(at, self._size)
+        self._stream.seek(self._at)
+        found = space[: self._stream.readinto(space.data)]
+        found.flags.writeable = False  # as what is decompressed: the kernels are compiled once
+        return found
 
     def _chunk(
-        self, at: int, length: int, place: int, unpack: Callable[[memoryview], Bytes], *, learn: bool, cut: bool
+        self, at: int, length: int, place: int, unpack: Callable[[Bytes], Bytes], *, learn: bool, cut: bool
     ) -> Iterator[Block]:
         """Yield the messages of a chunk.
 
@@ -141,18 +169,15 @@ class ChunkedFile(ABC):
             begin = stop
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
+        self._spaces, self._other_spaces = self._other_spaces, self._spaces
         if stop < len(data) and not cut:
             self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        if not len(self._rows):
-            self._rows = np.empty((MOST_ROWS, 5), np.int64)
-        count, stop = self._scan(data, begin, self._rows)
-        rows = self._rows[:count]
-        is_message = rows[:, 0] == self._message
-        if learn:
-            for row in rows[~is_message]:
-                self._learn(row, data)
-        _, *columns = rows[is_message].T
-        return with_possible_times(Block(data, *map(np.ascontiguousarray, columns)), self.problems), stop
+        most = min((len(data) - begin) // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+        messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
+        count, other, stop = self._scan(data, begin, messages, others)
+        for row in others[:, :other].T:
+            self._learn(row, data)
+        return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop

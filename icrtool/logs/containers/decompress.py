@@ -35,10 +35,11 @@ class Space:
     def __init__(self) -> None:
         self._bytes: Bytes = np.empty(0, np.uint8)
 
-    def of(self, size: int) -> Bytes:
-        """Return `size` bytes (size,), the same ones as before as far as they reach."""
+    def of(self, size: int, kept: int = 0) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before as far as they reach; the first `kept` ones stay."""
         if len(self._bytes) < size:
-            self._bytes = np.empty(size, np.uint8)
+            before, self._bytes = self._bytes, np.empty(max(size, 2 * kept), np.uint8)
+            self._bytes[:kept] = before[:kept]
         return self._bytes[:size]
 
     def free(self) -> None:
@@ -51,20 +52,20 @@ class Inflation:
 
     def __init__(self) -> None:
         self._left = FREE_BYTES
-        self._space = Space()
 
-    def decompress(self, data: bytes | memoryview, compression: str, size: int, *, partial: bool = False) -> Bytes:
+    def decompress(self, data: Bytes, compression: str, size: int, space: Space, *, partial: bool = False) -> Bytes:
         """Decompress a chunk.
 
         Parameters
         ----------
         compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
         size : decompressed size stated in the log [bytes]
+        space : for what is decompressed
         partial : the data is cut off, or `size` is only a part of it; return what can be decompressed
 
         Returns
         -------
-        uint8, valid until the next call.
+        uint8, not to be written to; in `space`, in `data`, or in memory of its own.
 
         Raises
         ------
@@ -76,9 +77,9 @@ class Inflation:
         try:
             match compression:
                 case "" | "none":
-                    out = np.frombuffer(data, np.uint8)
+                    out = data.view()
                 case "zstd":
-                    out = self._zstd(data, size, partial=partial)
+                    out = _zstd(data, size, space, partial=partial)
                 case "lz4":
                     import lz4.frame
 
@@ -93,21 +94,6 @@ class Inflation:
             raise DecompressionError(f"{len(out)} bytes instead of {size}")
         out.flags.writeable = False  # as that of a database: the kernels are compiled once
         return out
-
-    def free(self) -> None:
-        """Give the memory of chunks back."""
-        self._space.free()
-
-    def _zstd(self, data: bytes | memoryview, size: int, *, partial: bool) -> Bytes:
-        import zstandard
-
-        out = self._space.of(size + 1)
-        try:
-            # Where the space holds all of a frame, zstd decompresses straight into it.
-            with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data) as reader:
-                return out[: reader.readinto(out if not partial else out[:size])]
-        except zstandard.ZstdError as err:
-            raise DecompressionError(str(err)) from err
 
     def count(self, packed: int, unpacked: int) -> None:
         """Count what is decompressed [bytes].
@@ -127,14 +113,25 @@ class Inflation:
         self._left = left
 
 
-def _in_pieces(decoder: Any, data: bytes | memoryview, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
+def _zstd(data: Bytes, size: int, space: Space, *, partial: bool) -> Bytes:
+    import zstandard
+
+    out = space.of(size + 1)
+    try:
+        # Where the space holds all of a frame, zstd decompresses straight into it.
+        with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data.data) as reader:
+            return out[: reader.readinto(out if not partial else out[:size])]
+    except zstandard.ZstdError as err:
+        raise DecompressionError(str(err)) from err
+
+
+def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
     """Decompress up to `size` bytes and one more, a piece at a time."""
-    out = bytearray(decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES)))
-    while (
-        len(out) >= _PIECE_BYTES
-        and not decoder.eof
-        and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES)))
-    ):
+    piece = decoder.decompress(data, max_length=min(size + 1, _PIECE_BYTES))
+    if len(piece) < _PIECE_BYTES:
+        return np.frombuffer(piece, np.uint8)
+    out = bytearray(piece)
+    while not decoder.eof and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), _PIECE_BYTES))):
         out += piece
     return np.frombuffer(out, np.uint8)
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import BAG_CONNECTION, BAG_MESSAGE, ChunkedFile
+from icrtool.logs.containers.channel import Block, Channel, ros_type_name
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -45,15 +45,6 @@ class _Record(NamedTuple):
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
-class _Chunk(NamedTuple):
-    """File offset of a chunk record; by the index its connections, where listed, and its first and last log time."""
-
-    at: int
-    connections: frozenset[int] | None
-    begin_ns: int
-    end_ns: int
-
-
 class Ros1Bag(ChunkedFile):
     """One ROS 1 bag.
 
@@ -64,11 +55,11 @@ class Ros1Bag(ChunkedFile):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, BAG_MESSAGE)
+        super().__init__(path)
         self._connections: dict[int, Channel] = {}
         try:
             self._check_start()
-            self._chunks: list[_Chunk] | None = self._read_index()
+            self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
                 self.problems.add("has no index (not closed, or cut off); read from start to end")
                 self._learn_all()
@@ -77,10 +68,8 @@ class Ros1Bag(ChunkedFile):
             raise
         self.channels = list(self._connections.values())
 
-    def _indexed(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        for chunk in self._chunks or ():
-            if not cut.needs(chunk.connections, chunk.begin_ns, chunk.end_ns, wanted):
-                continue
+    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:  # noqa: ARG002 - whole chunks
+        for chunk in chunks:
             record = self._record(chunk.at)
             if record is None or record.op != _CHUNK:
                 self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
@@ -100,15 +89,14 @@ class Ros1Bag(ChunkedFile):
         """Return the record at a file offset with its header fields; None where there is no complete header."""
         if not 0 <= at < self._size:
             return None
-        self._stream.seek(at)
-        header_length = int.from_bytes(self._stream.read(4), "little")
+        header_length = int.from_bytes(self._bytes(at, 4), "little")
         if header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
             return None
         fields = _header_fields(self._stream.read(header_length))
         length = int.from_bytes(self._stream.read(4), "little")
         return _Record(fields, at + header_length + 8, length)
 
-    def _read_index(self) -> list[_Chunk] | None:
+    def _read_index(self) -> list[Chunk] | None:
         """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
         first = self._record(len(MAGIC))
         if first is None or first.op != _BAG_HEADER:
@@ -118,14 +106,13 @@ class Ros1Bag(ChunkedFile):
         at = first.number(b"index_pos", 8)
         if at <= 0:
             return None
-        chunks: dict[int, _Chunk] = {}
+        chunks: dict[int, Chunk] = {}
         counts: dict[int, int] = {}
         while at != self._size:
             record = self._record(at)
             if record is None or record.length > min(_LARGEST_CONTENT_BYTES, self._size - record.at):
                 return None
-            self._stream.seek(record.at)
-            content = self._stream.read(record.length)
+            content = self._bytes(record.at, record.length)
             if record.op == BAG_CONNECTION:
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             elif record.op == _CHUNK_INFO:
@@ -133,10 +120,8 @@ class Ros1Bag(ChunkedFile):
                 for connection, count in held:
                     counts[connection] = counts.get(connection, 0) + count
                 place = record.number(b"chunk_pos", 8)
-                chunks[place] = _Chunk(
-                    place, frozenset(connection for connection, _ in held) or None, record.time(b"start_time"),
-                    record.time(b"end_time"),
-                )  # fmt: skip
+                connections = frozenset(connection for connection, _ in held) or None
+                chunks[place] = Chunk(place, 0, connections, record.time(b"start_time"), record.time(b"end_time"))
             else:
                 return None
             at = record.at + record.length
@@ -157,26 +142,26 @@ class Ros1Bag(ChunkedFile):
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
-                self._stream.seek(record.at)
-                self._connect(record.number(b"conn"), record.text(b"topic"), self._stream.read(record.length))
+                content = self._bytes(record.at, record.length)
+                self._connect(record.number(b"conn"), record.text(b"topic"), content)
             at = record.at + record.length
         if at < self._size:
             self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        def unpack(content: memoryview) -> Bytes:
-            size = record.number(b"size")
-            return self._inflation.decompress(content, record.text(b"compression"), size, partial=cut)
+        def unpack(content: Bytes) -> Bytes:
+            size, compression = record.number(b"size"), record.text(b"compression")
+            return self._inflation.decompress(content, compression, size, self._spaces.records, partial=cut)
 
         return self._chunk(record.at, record.length, record.at, unpack, learn=learn, cut=cut)
 
-    def _scan(self, data: Bytes, begin: int, rows: Ints) -> tuple[int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_bag
 
-        return scan_bag(data, begin, rows)
+        return scan_bag(data, begin, messages, others)
 
     def _learn(self, row: Ints, data: Bytes) -> None:
-        _, number, header, start, end = row.tolist()
+        header, number, start, end = row.tolist()
         topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
         self._connect(number, topic, bytes(data[start:end]))
 

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from threading import Event
 from typing import NamedTuple
 
 _NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
@@ -93,9 +94,12 @@ def log_name(path: Path) -> str:
     return name if name.strip(".") else "log"
 
 
-def file_sha256(file: Path) -> str:
-    """Return the SHA-256 of a file (hex)."""
+def file_sha256(file: Path, ended: Event | None = None) -> str:
+    """Return the SHA-256 of a file (hex), of its beginning once `ended` is set."""
     import hashlib
 
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    digest, piece = hashlib.sha256(), bytearray(1 << 18)
+    with file.open("rb", buffering=0) as stream:
+        while not (ended and ended.is_set()) and (count := stream.readinto(piece)):
+            digest.update(memoryview(piece)[:count])
+    return digest.hexdigest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -102,7 +102,7 @@ class SqliteBag:
             return None
         return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Iterator[Block]:
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
         if not wanted:
             return

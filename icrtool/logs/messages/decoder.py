@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import cast
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.words import eight_bytes, read_word
+from icrtool.logs.containers.channel import Block
 from icrtool.logs.messages.schema import (
     BEGIN_LOOP,
     END_LOOP,
+    SIZES,
     SKIP,
     SKIP_STRING,
     TAKE,
@@ -22,57 +26,27 @@ from icrtool.logs.messages.schema import (
 
 _MAX_NESTING = 8
 _MOST_REMEMBERED = 512
-"""Ranges and columns remembered of a message's shape; messages with more are all decoded step by step."""
+"""Words and columns remembered of a message's shape; messages with more are all decoded step by step."""
 
 _STEPS_PER_BYTE, _LEAST_STEPS, MOST_STEPS = 4, 256, 1 << 24
 """Steps of the program that one message may take: per byte, and at most. Loops over elements of size zero would never
 end. The second limit keeps the time of one message below about 0.1 s."""
 
-_ZERO, _FOUR, _AS_BEFORE = (cast(int, np.int64(value)) for value in (0, 4, -1))
-"""Typed: numba compiles another copy of a function for every plain number that it is called with."""
+_MOST_BYTES_AT_ONCE = 1 << 24
+"""Of the messages of one compiled call, which cannot be interrupted."""
 
-_ITS_PLACE = _ZERO
-"""Special values of a size: `_AS_BEFORE` for a value that is the same in all messages of a shape, this one for the
-offset of a text."""
+ANY_LENGTH = 1 << 62
+"""Of sequences: more elements than a message can hold."""
+
+_ZERO, _ONE, _FOUR, _EIGHT = (cast(int, np.int64(value)) for value in (0, 1, 4, 8))
+"""Typed: numba compiles another copy of a function for every plain number that it is called with."""
 
 _CDR_LITTLE, _CDR_BIG = 1, 0
 _FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
-
-@njit
-def four_bytes(data: Bytes, at: np.uint64) -> np.uint64:
-    """Return four bytes as a little-endian unsigned number.
-
-    Notes
-    -----
-    The compiler makes one load of it: unsigned indices do not count from the end, and there is no loop.
-    """
-    return (
-        np.uint64(data[at])
-        | np.uint64(data[at + np.uint64(1)]) << np.uint64(8)
-        | np.uint64(data[at + np.uint64(2)]) << np.uint64(16)
-        | np.uint64(data[at + np.uint64(3)]) << np.uint64(24)
-    )
-
-
-@njit
-def eight_bytes(data: Bytes, at: np.uint64) -> np.uint64:
-    """Return eight bytes as a little-endian unsigned number."""
-    return four_bytes(data, at) | four_bytes(data, at + np.uint64(4)) << np.uint64(32)
-
-
-@njit
-def read_word(data: Bytes, at: int, size: int, big: int) -> np.uint64:
-    """Return `size` bytes as an unsigned number; `big` is 1 where the first of them is the most significant."""
-    place, value = np.uint64(at), np.uint64(0)
-    if size == 8 and not big:
-        return eight_bytes(data, place)
-    if size == 4 and not big:
-        return four_bytes(data, place)
-    for i in range(size):
-        byte = np.uint64(data[place + np.uint64(i)])
-        value = value << np.uint64(8) | byte if big else value | byte << np.uint64(8 * i)
-    return value
+_FILLED, _SHAPES, _UNREADABLE, _LONGEST, _WORDS, _COLUMNS, _LENGTH, _BIG = range(8)
+"""What `Decoded.state` counts: rows in use, shapes in use, unreadable messages, elements of the sequence that needs
+more columns; and of the last shape: words and columns remembered, bytes that its messages have at least, byte order."""
 
 
 @njit
@@ -91,105 +65,67 @@ def hash_text(data: Bytes, at: int, length: int) -> np.uint64:
 
 
 @njit
-def remember_same(same: Ints, used: int, first: int, stop: int) -> int:
-    """Add the bytes [first, stop) to those that make the shape of a message; return how many ranges are used now."""
-    if 0 < used <= len(same) and same[used - 1, 1] == first:
-        same[used - 1, 1] = stop
-        return used
-    if used < len(same):
-        same[used, 0], same[used, 1] = first, stop
-    return used + 1
+def remember_same(data: Bytes, begin: int, same: Ints, used: int, first: int, stop: int) -> int:
+    """Add the bytes [first, stop) of a message to the words of its shape; return how many words are used now."""
+    while first < stop and used <= len(same):
+        size = min(stop - first, _EIGHT)
+        if used < len(same):
+            same[used, 0], same[used, 1] = first, size
+            same[used, 2] = np.int64(read_word(data, begin + first, size, _ZERO))
+        used += 1
+        first += size
+    return used
 
 
 @njit
-def remember_column(taken: Ints, used: int, place: int, size: int, column: int) -> int:
-    """Add a column to those that a message of this shape fills; return how many are used now."""
-    if used < len(taken):
-        taken[used, 0], taken[used, 1], taken[used, 2] = place, size, column
-    return used + 1
-
-
-@njit
-def has_shape(data: Bytes, begin: int, model: int, same: Ints, ranges: int) -> bool:
-    """Return whether the message at `begin` equals the one at `model` in the ranges of bytes that make its shape."""
-    for k in range(ranges):
-        place, stop = same[k, 0], same[k, 1]
-        while place + 8 <= stop:
-            if eight_bytes(data, np.uint64(begin + place)) != eight_bytes(data, np.uint64(model + place)):
-                return False
-            place += 8
-        while place < stop:
-            if data[begin + place] != data[model + place]:
-                return False
-            place += 1
+def has_shape(data: Bytes, begin: int, same: Ints, words: int) -> bool:
+    """Return whether the message at `begin` has the words of a shape."""
+    for k in range(words):  # noqa: SIM110 - compiled without a generator
+        if read_word(data, begin + same[k, 0], same[k, 1], _ZERO) != np.uint64(same[k, 2]):
+            return False
     return True
 
 
 @njit
-def fill_row(
-    data: Bytes, begin: int, big: int, taken: Ints, columns: int, model: int, m: int, table: NDArray[np.uint64]
-) -> None:
-    """Fill row m of `table` from the message at `begin`, whose shape is that of the message of row `model`."""
-    for k in range(columns):
-        place, size, column = taken[k, 0], taken[k, 1], taken[k, 2]
-        if size == _AS_BEFORE:
-            table[m, column] = table[model, column]
-        elif size == _ITS_PLACE:
-            table[m, column] = np.uint64(begin + place)
-        else:
-            table[m, column] = read_word(data, begin + place, size, big)
-
-
-@njit
 def take_numbers(
-    data: Bytes, at: int, size: int, count: int, big: int, table: NDArray[np.uint64], m: int, column: int,
+    data: Bytes, at: int, size: int, count: int, big: int, table: NDArray[np.uint64], column: int, row: int,
     begin: int, taken: Ints, columns: int,
 ) -> int:  # fmt: skip
-    """Copy `count` numbers to row m, and remember their offsets; return how many columns are used now."""
+    """Copy `count` numbers to a row, and remember their offsets; return how many columns are used now."""
     for i in range(count):
-        table[m, column + i] = read_word(data, at + i * size, size, big)
-        columns = remember_column(taken, columns, at + i * size - begin, size, column + i)
+        table[column + i, row] = read_word(data, at + i * size, size, big)
+        if columns < len(taken):
+            taken[columns, 0], taken[columns, 1], taken[columns, 2] = at + i * size - begin, size, column + i
+        columns += 1
     return columns
 
 
 @njit
-def take_text(
-    data: Bytes, at: int, length: int, table: NDArray[np.uint64], m: int, column: int, begin: int, taken: Ints,
-    columns: int,
-) -> int:  # fmt: skip
-    """Put offset, length and hash of a text into row m, and remember them; return how many columns are used now."""
-    table[m, column], table[m, column + 1] = np.uint64(at), np.uint64(length)
-    table[m, column + 2] = hash_text(data, at, length)
-    columns = remember_column(taken, columns, at - begin, _ITS_PLACE, column)
-    columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + 1)
-    return remember_column(taken, columns, _ZERO, _AS_BEFORE, column + 2)
-
-
-@njit
 def run_program(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compiled as a whole
-    data: Bytes, begin: int, base: int, stop: int, program: Ints, cdr: bool, big: int,
-    table: NDArray[np.uint64], m: int, same: Ints, ranges: int, taken: Ints, loops: Ints,
-) -> tuple[bool, int, int]:  # fmt: skip
+    data: Bytes, begin: int, base: int, stop: int, program: Ints, cdr: bool, big: int, table: NDArray[np.uint64],
+    row: int, shapes: NDArray[np.uint64], shape: int, same: Ints, words: int, taken: Ints, loops: Ints,
+) -> tuple[bool, int, int, int, int]:  # fmt: skip
     """Run the program over one message.
 
     Parameters
     ----------
     begin, base, stop : where the message begins, where its fields do, and where it ends in `data`
-    table : of `decode_new_shapes`; row m is filled
-    same, ranges, taken : filled with the ranges of bytes that make the message's shape, and where its numbers are
+    table, shapes : of `Decoded`; column `row` of the one and column `shape` of the other are filled
+    same, words, taken : filled with the words that make the message's shape, and where its numbers are
     loops : (4, `_MAX_NESTING`) space for the loops around a field: first operation, elements left, column, element
 
     Returns
     -------
-    Whether the message fits the program; how many ranges and columns it uses.
+    Whether the message fits the program; how many words and columns of it are remembered; where its last field ends;
+    the elements of the longest sequence that is taken.
     """
     returns, left, column_base, iteration = loops
-    at, depth, shift, taking, step, columns = base, 0, 0, True, 0, _ZERO
+    at, depth, shift, taking, step, columns, longest = base, 0, 0, True, 0, _ZERO, _ZERO
     steps_left = min(_STEPS_PER_BYTE * (stop - at) + _LEAST_STEPS + 2 * len(program), MOST_STEPS)
     while step < len(program):
         steps_left -= 1
         if steps_left < 0:
-            return False, ranges, columns
+            return False, words, columns, at, longest
         operation, size, count, column = program[step, 0], program[step, 1], program[step, 2], program[step, 3]
         capacity, behind = program[step, 4], program[step, 6]
         step += 1
@@ -210,19 +146,19 @@ def run_program(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compile
         if operation >= SKIP_STRING and (operation != BEGIN_LOOP or count < 0):
             at += (base - at) & 3 if cdr else 0
             if at + 4 > stop:
-                return False, ranges, columns
+                return False, words, columns, at, longest
             count = np.int64(read_word(data, at, _FOUR, big))
-            ranges = remember_same(same, ranges, at - begin, at - begin + 4)
+            words = remember_same(data, begin, same, words, at - begin, at - begin + 4)
             at += 4
             if count > stop - at:
-                return False, ranges, columns
+                return False, words, columns, at, longest
             if operation in (TAKE_SEQUENCE, BEGIN_LOOP) and column >= 0 and taking:
-                table[m, column + shift] = np.uint64(count)
-                columns = remember_column(taken, columns, _ZERO, _AS_BEFORE, column + shift)
+                shapes[column + shift, shape] = np.uint64(count)
+                longest = max(longest, int(count))
         if operation == BEGIN_LOOP:
             # Count at least one byte for an element: a loop over elements without fields must end, too.
             if count > 0 and (depth >= _MAX_NESTING or count > stop - at):
-                return False, ranges, columns
+                return False, words, columns, at, longest
             if count > 0:
                 returns[depth], left[depth], column_base[depth], iteration[depth] = step - 1, count, shift, 0
                 depth += 1
@@ -231,95 +167,210 @@ def run_program(  # noqa: C901, PLR0912, PLR0915 - one interpreter loop, compile
         elif operation in (SKIP_STRING, TAKE_STRING):
             if operation == TAKE_STRING and taking:
                 length = count - 1 if cdr and count > 0 else count
-                columns = take_text(data, at, length, table, m, column + shift, begin, taken, columns)
-                ranges = remember_same(same, ranges, at - begin, at - begin + length)
+                place = column + shift
+                shapes[place, shape], shapes[place + 1, shape] = np.uint64(at), np.uint64(length)
+                shapes[place + 2, shape] = hash_text(data, at, length)
+                words = remember_same(data, begin, same, words, at - begin, at - begin + length)
             at += count
         else:
             if cdr and (count > 0 or operation in (SKIP, TAKE)):
                 at += (base - at) & (size - 1)
-            if at + size * count > stop:
-                return False, ranges, columns
+            if count > stop - at or at + size * count > stop:  # the product of a forged count may overflow
+                return False, words, columns, at, longest
             if operation == TAKE and taking:
-                columns = take_numbers(data, at, size, count, big, table, m, column + shift, begin, taken, columns)
+                columns = take_numbers(data, at, size, count, big, table, column + shift, row, begin, taken, columns)
             elif operation == TAKE_SEQUENCE and taking:
                 count_taken = min(count, capacity)
                 columns = take_numbers(
-                    data, at, size, count_taken, big, table, m, column + shift + 1, begin, taken, columns
+                    data, at, size, count_taken, big, table, column + shift + 1, row, begin, taken, columns
                 )
             at += size * count
-    return True, ranges, columns
+    return True, words, columns, at, longest
 
 
 @njit
-def decode_new_shapes(
-    data: Bytes, start: Ints, end: Ints, program: Ints, cdr: bool, table: NDArray[np.uint64], readable: Bools,
-    new_shape: Bools,
-) -> None:  # fmt: skip
-    """Fill a row of `table` (n, columns) per message, and `readable` (n,): whether the message fits the program.
+def decode_block(
+    data: Bytes, channel: Ints, log_time_ns: Ints, start: Ints, end: Ints, number: int, first: int, program: Ints,
+    cdr: bool, most_elements: int, table: NDArray[np.uint64], times: Ints, shape_of: Ints, shapes: NDArray[np.uint64],
+    state: Ints, same: Ints, taken: Ints, loops: Ints,
+) -> int:  # fmt: skip
+    """Decode the messages of one channel among those of a block, from message `first` on; arrays of `Decoded`.
 
     Nothing is read outside [start, end); a message that is shorter than its layout, or of an encapsulation that is
-    not plain CDR, is not readable. `new_shape` (n,) is set for the messages that the program was run over.
+    not plain CDR, is unreadable. The messages of a topic are alike: most have the same strings, and sequences of the
+    same lengths, as the message before. The words that hold them are remembered while the program runs over a
+    message. Where the next message has the same words there, its numbers are at the same offsets, and are copied.
 
-    The messages of a topic are alike: most have the same strings, and sequences of the same lengths, as the message
-    before. The bytes that hold them are remembered while the program runs over a message. Where the next message has
-    the same bytes there, its numbers are at the same offsets, and are copied from there.
+    Returns
+    -------
+    The first message that is left: where the table is full, a sequence has more than `most_elements` (in the state
+    then), or the call has to end.
     """
-    loops = np.zeros((4, _MAX_NESTING), np.int64)
-    same, taken = np.empty((_MOST_REMEMBERED, 2), np.int64), np.empty((_MOST_REMEMBERED, 3), np.int64)
-    ranges, columns, model, big = _ZERO, _ZERO, _AS_BEFORE, _ZERO
-    for m in range(len(start)):
-        begin, base, stop = start[m], start[m], end[m]
-        readable[m] = True
-        new_shape[m] = not (
-            model >= 0
-            and stop - begin >= end[model] - start[model]
-            and has_shape(data, begin, start[model], same, ranges)
-        )
-        if not new_shape[m]:
-            fill_row(data, begin, big, taken, columns, model, m, table)
+    bytes_left, m = _MOST_BYTES_AT_ONCE, first
+    filled, shape = state[_FILLED], state[_SHAPES] - 1
+    words, columns, reach, big = state[_WORDS], state[_COLUMNS], state[_LENGTH], state[_BIG]
+    while m < len(channel):
+        if channel[m] != number:
+            m += 1
             continue
-        ranges, columns, model, big = _ZERO, _ZERO, m, _ZERO
-        if cdr:
-            if stop - begin < 4 or data[begin] != 0 or data[begin + 1] > _CDR_LITTLE:
-                readable[m], model = False, -1
+        begin, stop = start[m], end[m]
+        if filled == len(times) or bytes_left < 0:
+            break
+        bytes_left -= stop - begin
+        if columns >= 0 and stop - begin >= reach and has_shape(data, begin, same, words):
+            for k in range(columns):
+                table[taken[k, 2], filled] = read_word(data, begin + taken[k, 0], taken[k, 1], big)
+        else:
+            words, columns, big, base, readable = _ZERO, -_ONE, _ZERO, begin, True
+            if cdr:
+                readable = stop - begin >= 4 and data[begin] == 0 and data[begin + 1] <= _CDR_LITTLE
+                if readable:
+                    big = _ZERO + (data[begin + 1] == _CDR_BIG)
+                    words = remember_same(data, begin, same, words, _ZERO, _FOUR)
+                    base += 4
+            longest = _ZERO
+            if readable:
+                readable, words, columns, reach, longest = run_program(
+                    data,
+                    begin,
+                    base,
+                    stop,
+                    program,
+                    cdr,
+                    big,
+                    table,
+                    filled,
+                    shapes,
+                    shape + 1,
+                    same,
+                    words,
+                    taken,
+                    loops,
+                )
+                reach -= begin
+                if not readable or longest > most_elements or words > len(same) or columns > len(taken):
+                    columns = -_ONE
+            if not readable:
+                state[_UNREADABLE] += 1
+                m += 1
                 continue
-            big = _ZERO + (data[begin + 1] == _CDR_BIG)
-            ranges = remember_same(same, ranges, _ZERO, _FOUR)
-            base += 4
-        readable[m], ranges, columns = run_program(
-            data, begin, base, stop, program, cdr, big, table, m, same, ranges, taken, loops
-        )
-        if not readable[m] or ranges > _MOST_REMEMBERED or columns > _MOST_REMEMBERED:
-            model = -1
+            if longest > most_elements:
+                state[_LONGEST] = longest
+                break
+            shape += 1
+        times[filled], shape_of[filled] = log_time_ns[m], shape
+        filled += 1
+        m += 1
+    state[_FILLED], state[_SHAPES] = filled, shape + 1
+    state[_WORDS], state[_COLUMNS], state[_LENGTH], state[_BIG] = words, columns, reach, big
+    return m
 
 
-def decode_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[NDArray[np.uint64], Bools]:
-    """Return the table (n, columns) of a layout's fields for messages in `data`, and which of them were readable."""
-    table = empty_table(layout, len(start))
-    readable, new_shape = np.empty((2, len(start)), np.bool_)
-    decode_into(layout, data, start, end, table, readable, new_shape)
-    return table, readable
+@dataclass(slots=True)
+class Decoded:
+    """Decoded messages of one topic as raw 64-bit words, up to so many rows.
 
-
-def empty_table(layout: Layout, rows: int) -> NDArray[np.uint64]:
-    """Return a table (rows, columns) for a layout, one column after the other in memory."""
-    return np.zeros((layout.columns, rows), np.uint64).T
-
-
-def decode_into(
-    layout: Layout, data: Bytes, start: Ints, end: Ints, table: NDArray[np.uint64], readable: Bools, new_shape: Bools
-) -> None:
-    """Fill `table` (n, columns) from messages in `data`, and mark which were readable and which had a new shape.
-
-    Parameters
+    Attributes
     ----------
-    readable : bool (n,), set where a message had the layout's shape
-    new_shape : bool (n,), not set where a message has the lengths and the texts of the one before
+    table : (columns, rows) the numbers of each message; other columns of the layout are not used
+    times_ns, shape_of : (rows,) log time, and the place of the message's shape among `shapes`; both in file order
+    shapes : (columns, rows + 1) what messages of one shape share: counts, and of texts offset, length and hash
+    state, same, taken, loops : see `decode_block`
     """
-    if layout.program[:, 2].max(initial=0) > len(data):
-        # A fixed array longer than all messages together: the definition is of another type. Its length times the size
-        # of an element may overflow an integer.
-        readable[:] = False
-        new_shape[:] = True
-    else:
-        decode_new_shapes(data, start, end, layout.program, layout.cdr, table, readable, new_shape)
+
+    layout: Layout
+    rows: int
+    table: NDArray[np.uint64] = field(init=False)
+    times_ns: Ints = field(init=False)
+    shape_of: Ints = field(init=False)
+    shapes: NDArray[np.uint64] = field(init=False)
+    state: Ints = field(init=False)
+    same: Ints = field(init=False)
+    taken: Ints = field(init=False)
+    loops: Ints = field(init=False)
+
+    def __post_init__(self) -> None:
+        # Memory of columns that are not used is not touched.
+        self.table = np.empty((self.layout.columns, self.rows), np.uint64)
+        self.shapes = np.empty((self.layout.columns, self.rows + 1), np.uint64)
+        self.times_ns, self.shape_of = np.empty((2, self.rows), np.int64)
+        self.state = np.array([0, 0, 0, 0, 0, -1, 0, 0])
+        self.same, self.taken = np.empty((2, min(_MOST_REMEMBERED, 32 * self.rows), 3), np.int64)
+        self.loops = np.zeros((4, _MAX_NESTING), np.int64)
+
+    @property
+    def filled(self) -> int:
+        """The rows in use."""
+        return int(self.state[_FILLED])
+
+    @property
+    def known_shapes(self) -> int:
+        """The shapes seen so far."""
+        return int(self.state[_SHAPES])
+
+    @property
+    def longest(self) -> int:
+        """The elements of the sequence for which decoding ended, 0 for none."""
+        return int(self.state[_LONGEST])
+
+    def decode(self, block: Block, number: int, first: int, most_elements: int) -> int:
+        """Decode messages of a channel as `decode_block` does, and return the first message that is left."""
+        return decode_block(
+            *block, number, first, self.layout.program, self.layout.cdr, most_elements, self.table, self.times_ns,
+            self.shape_of, self.shapes, self.state, self.same, self.taken, self.loops,
+        )  # fmt: skip
+
+    def clear(self) -> int:
+        """Free the rows, keep the last shape, and return how many messages were unreadable."""
+        self.shapes[:, 0] = self.shapes[:, max(self.known_shapes - 1, 0)]
+        unreadable = int(self.state[_UNREADABLE])
+        self.state[[_FILLED, _UNREADABLE]], self.state[_SHAPES] = 0, min(self.known_shapes, 1)
+        return unreadable
+
+    def used_shapes(self) -> tuple[NDArray[np.uint64], Ints]:
+        """Return the shapes of the rows (columns, k), and the place of each row's shape among them (n,)."""
+        shape_of = self.shape_of[: self.filled]
+        first, last = (shape_of[0], shape_of[-1]) if len(shape_of) else (0, -1)
+        return self.shapes[:, first : last + 1], shape_of - first
+
+    def numbers(self, path: str) -> NDArray[Any]:
+        """Return a numeric field, valid until the next call: (n,) or, for an array, (n, longest).
+
+        What a message lacks is NaN or 0.
+        """
+        slot = self.layout.slots[path]
+        if "[*]" not in path:
+            return _typed(self.table[slot.column, : self.filled], slot.kind)
+        shapes, shape_of = self.used_shapes()
+        counts = self.layout.counts(shapes, path)
+        repeat = min(slot.repeat, int(counts.max(initial=0)))
+        columns = slice(slot.column, slot.column + repeat * slot.stride, slot.stride)
+        values = _typed(self.table[columns, : self.filled].T, slot.kind)
+        if counts.min(initial=repeat) < repeat:
+            lacking = np.arange(repeat) >= counts[shape_of, None]
+            values = np.where(lacking, values.dtype.type(np.nan if values.dtype.kind == "f" else 0), values)
+        return values
+
+
+def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
+    """Return raw 64-bit words as float64 or int64."""
+    if kind == "float64":
+        return raw.view(np.float64)
+    if kind == "float32":
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
+            return raw.astype(np.uint32).view(np.float32).astype(np.float64)
+    if kind.startswith("int"):
+        width = SIZES[kind]
+        return raw.astype(f"u{width}").view(f"i{width}").astype(np.int64)
+    return raw.astype(np.int64)
+
+
+def decode_messages(layout: Layout, data: Bytes, start: Ints, end: Ints) -> tuple[Decoded, Bools]:
+    """Return the readable ones among some messages, and which they are (n,)."""
+    count, first = len(start), 0
+    decoded, readable = Decoded(layout, count), np.zeros(count, np.bool_)
+    block = Block(data, np.zeros(count, np.int64), np.arange(count), start, end)
+    while first < count:
+        first = decoded.decode(block, 0, first, ANY_LENGTH)
+    readable[decoded.times_ns[: decoded.filled]] = True
+    return decoded, readable

@@ -55,24 +55,23 @@ class DynamicJointCollector:
             self._unrolled(0), channel.message_type, (_JOINTS,), "cdr" if layout.cdr else "ros1"
         )
 
-    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
-        """Add the chosen messages of a block."""
-        places = np.flatnonzero(chosen)
+    def feed(self, block: Block, number: int) -> None:
+        """Add the messages of a block whose channel is `number`."""
+        places = np.flatnonzero(block.channel == number)
         self._times.append(block.log_time_ns[places])
-        table, readable = decode_messages(self._counter, block.data, block.start[places], block.end[places])
-        joints = self._counter.numbers(table, _JOINTS)
-        readable &= joints <= MOST_JOINTS
-        self._unreadable += len(readable) - int(np.count_nonzero(readable))
-        for number, count in zip(*np.unique(joints[readable], return_counts=True), strict=True):
-            if int(number) not in self._collectors and len(self._collectors) > MOST_LAYOUTS:
-                self._unreadable += int(count)
+        decoded, readable = decode_messages(self._counter, block.data, block.start[places], block.end[places])
+        joints = np.full(len(block.channel), -1)
+        joints[places[readable]] = decoded.numbers(_JOINTS)
+        joints[joints > MOST_JOINTS] = -1
+        self._unreadable += int(np.count_nonzero(joints[places] < 0))
+        for count, messages in zip(*np.unique(joints[joints >= 0], return_counts=True), strict=True):
+            if int(count) not in self._collectors and len(self._collectors) > MOST_LAYOUTS:
+                self._unreadable += int(messages)
                 continue
-            alike = np.zeros(len(chosen), np.bool_)
-            alike[places[readable & (joints == number)]] = True
-            collector = self._collector(int(number))
-            collector.feed(block, alike)
+            collector = self._collector(int(count))
+            collector.feed(block._replace(channel=joints), int(count))
             # Converted at once: the names of all interfaces of a long log take many times the memory of the result.
-            self._tables.append(_as_joint_state(collector.table(), int(number)))
+            self._tables.append(_as_joint_state(collector.table(), int(count)))
 
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time."""

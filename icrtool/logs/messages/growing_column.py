@@ -25,18 +25,19 @@ class GrowingColumn:
         self._values: NDArray[Any] = np.empty(0, np.int64)
 
     def add(self, part: NDArray[Any], expected: int) -> None:
-        """Add rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
+        """Add a copy of rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
         before, held = self._rows, self._values
         self._rows += len(part)
         one = _single_row(part)
-        if before == 0:
-            self._values = part if one is None else one
+        if before == 0 and one is not None:
+            self._values = one
         elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
             width = max(part.shape[1:], held.shape[1:])
-            if len(held) < self._rows or width > held.shape[1:]:
+            if before == 0 or len(held) < self._rows or width > held.shape[1:]:
                 likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
-                self._values = np.empty((*width, max(2 * before, self._rows, likely)), held.dtype).T
-                self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
+                self._values = np.empty((*width, max(2 * before, self._rows, likely)), part.dtype).T
+                if before:
+                    self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
             self._put(before, part)
 
     def _put(self, begin: int, part: NDArray[Any]) -> None:
@@ -55,6 +56,6 @@ class GrowingColumn:
 def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
     """Return the row (1,) or (1, k) that all rows equal bit by bit; None where they differ, or there is none."""
     bits = rows.view(np.int64)
-    if len(rows) == 0 or np.any(bits[-1] != bits[0]) or np.any(bits != bits[0]):
+    if len(rows) == 0 or (rows.strides[0] and ((bits[-1] != bits[0]).any() or (bits != bits[0]).any())):
         return None
     return rows[:1].copy()

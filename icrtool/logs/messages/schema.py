@@ -28,7 +28,7 @@ FieldDetail: TypeAlias = Any
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """Kinds of field types, the numbers of rosbags' Nodetype."""
-_SIZES = {
+SIZES = {
     "bool": 1, "byte": 1, "char": 1, "octet": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
@@ -74,43 +74,13 @@ class Layout:
     slots: dict[str, Slot]
     cdr: bool
 
-    @property
-    def count_columns(self) -> set[int]:
-        """The columns that hold the number of elements of a sequence."""
-        return {slot.count_column for slot in self.slots.values() if slot.count_column >= 0}
-
-    def numbers(self, table: NDArray[np.uint64], path: str) -> NDArray[Any]:
-        """Return a numeric field: (n,) or, for an array, (n, longest) with what a message lacks as NaN or 0."""
-        slot = self.slots[path]
-        if "[*]" not in path:
-            return _typed(table[:, slot.column], slot.kind)
-        counts = self.counts(table, path)
-        repeat = min(slot.repeat, int(counts.max(initial=0)))
-        values = _typed(table[:, slot.column : slot.column + repeat * slot.stride : slot.stride], slot.kind)
-        if counts.min(initial=repeat) < repeat:
-            lacking = np.arange(repeat) >= counts[:, None]
-            values[lacking] = np.nan if values.dtype.kind == "f" else 0
-        return values
-
-    def counts(self, table: NDArray[np.uint64], path: str) -> Ints:
-        """Return how many elements of an array each message holds (n,)."""
+    def counts(self, shapes: NDArray[np.uint64], path: str) -> Ints:
+        """Return how many elements of an array messages of some shapes (columns, k) hold (k,)."""
         slot = self.slots[path]
         if slot.count_column < 0:
-            return np.full(len(table), slot.repeat, np.int64)
-        return table[:, slot.count_column].astype(np.int64)
-
-
-def _typed(raw: NDArray[np.uint64], kind: str) -> NDArray[Any]:
-    """Return raw 64-bit words as a new array of float64 or int64."""
-    if kind == "float64":
-        return raw.copy("K").view(np.float64)
-    if kind == "float32":
-        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
-            return raw.astype(np.uint32).view(np.float32).astype(np.float64)
-    if kind.startswith("int"):
-        width = _SIZES[kind]
-        return raw.astype(f"u{width}").view(f"i{width}").astype(np.int64)
-    return raw.astype(np.int64)
+            return np.full(shapes.shape[1], slot.repeat, np.int64)
+        counts: Ints = shapes[slot.count_column].astype(np.int64)
+        return counts
 
 
 class _Compiler:
@@ -153,7 +123,7 @@ class _Compiler:
             fixed = count if node == ARRAY else None
             if fixed is not None and fixed > LONGEST_FIXED:
                 raise DefinitionError(path, "its definition has an array longer than a message can be")
-            if int(element) == BASE and inner[0] in _SIZES:
+            if int(element) == BASE and inner[0] in SIZES:
                 self._numbers(path, inner[0], fixed, loop)
             else:
                 self._loop(f"{path}[*]", int(element), inner, fixed, loop)
@@ -164,11 +134,11 @@ class _Compiler:
                 self._place(path, kind, loop, _STRING_COLUMNS, TAKE_STRING)
             else:
                 self._emit(SKIP_STRING)
-        elif kind in _SIZES:
+        elif kind in SIZES:
             if path in self._wanted:
-                self._place(path, kind, loop, 1, TAKE, size=_SIZES[kind])
+                self._place(path, kind, loop, 1, TAKE, size=SIZES[kind])
             else:
-                self._skip(_SIZES[kind], 1)
+                self._skip(SIZES[kind], 1)
         else:
             raise DefinitionError(path, f"field type {kind} is not read", "only its message type is affected")
 
@@ -183,7 +153,7 @@ class _Compiler:
 
     def _numbers(self, path: str, kind: str, fixed: int | None, loop: tuple[int, int, int]) -> None:
         """Write an array (fixed length) or sequence of numbers."""
-        size, starred = _SIZES[kind], f"{path}[*]"
+        size, starred = SIZES[kind], f"{path}[*]"
         elements = any(name.startswith(f"{path}[") for name in self._wanted)
         if fixed is not None and not elements:
             self._skip(size, fixed)
@@ -227,13 +197,12 @@ class _Compiler:
         else:
             self.message(inner, f"{path}.", loop)
         self._emit(END_LOOP)
-        stride = max(self.columns - first, 1) if takes else 0
-        self.slots |= {
-            name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
-        }
-        self.rows[begin][5] = stride
         self.rows[begin][6] = len(self.rows)
         if takes:
+            stride = self.rows[begin][5] = max(self.columns - first, 1)
+            self.slots |= {
+                name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
+            }
             self.columns = first + stride * repeat
             self._check_columns()
             self._last_take = len(self.rows)

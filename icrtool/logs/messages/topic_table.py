@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Ints
+from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import decode_into, empty_table
+from icrtool.logs.messages.decoder import ANY_LENGTH, Decoded
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
@@ -24,15 +23,14 @@ _LARGEST_CAPACITY = 256
 _ROWS_AT_ONCE = 16_384 + 8
 """Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
 
-_FIRST_ROWS, _FIRST_NUMBERS = 64, 4096
-"""Of a topic's first table, at most; the next ones have twice as many rows: a log may hold thousands of topics."""
+_FIRST_ROWS, _FIRST_NUMBERS = 32, 2048
+"""Of a topic's first table, at most; the next ones have eight times as many: a log may hold thousands of topics."""
 
 MOST_TEXTS = 1 << 16
 """Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
 
 _LARGEST_TABLE = 1 << 22
-_MOST_BYTES_AT_ONCE = 1 << 24
-"""Limits of one compiled call, which cannot be interrupted: numbers in its table, and bytes of messages."""
+"""Numbers in it."""
 
 
 class SetBack(NamedTuple):
@@ -131,30 +129,6 @@ class TopicTable:
 
 
 @dataclass(slots=True)
-class _Rows:
-    """Decoded messages of one layout that are not columns yet: several thousand at a time become columns.
-
-    Attributes
-    ----------
-    table : (rows, columns) as `decode` fills it; times_ns, readable, new_shape : (rows,)
-    filled : rows in use
-    """
-
-    table: NDArray[np.uint64] = field(default_factory=lambda: np.empty((0, 0), np.uint64))
-    times_ns: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    readable: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    new_shape: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    filled: int = 0
-
-    @classmethod
-    def empty(cls, layout: Layout, rows: int) -> _Rows:
-        """Return an empty table of so many rows."""
-        return cls(
-            empty_table(layout, rows), np.empty(rows, np.int64), np.empty(rows, np.bool_), np.empty(rows, np.bool_)
-        )
-
-
-@dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by.
 
@@ -169,8 +143,8 @@ class TopicCollector:
     definitions: Definitions | None = None
     largest_capacity: int = _LARGEST_CAPACITY
     _capacity: int = _FIRST_CAPACITY
-    _layout: Layout | None = None
-    _rows: _Rows = field(default_factory=_Rows)
+    _rows: Decoded = field(init=False)
+    _learned: int = 0
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
     _columns: dict[str, GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
@@ -184,110 +158,89 @@ class TopicCollector:
         encoding = self.channel.encoding
         if encoding not in ("cdr", "ros1"):
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
-        self._layout = compile_layout(
+        layout = compile_layout(
             definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity
         )
+        self._new_rows(layout, min(_FIRST_ROWS, _FIRST_NUMBERS // max(layout.columns, 1)))
+
+    def _new_rows(self, layout: Layout, rows: int) -> None:
+        most = min(_ROWS_AT_ONCE, _LARGEST_TABLE // max(layout.columns, 1))
+        self._rows, self._learned = Decoded(layout, max(min(rows, most), 1)), 0
 
     @property
     def layout(self) -> Layout:
         """The compiled layout."""
-        if self._layout is None:
-            raise ValueError("the layout is compiled when the collector is made")
-        return self._layout
+        return self._rows.layout
 
-    def feed(self, block: Block, chosen: NDArray[np.bool_]) -> None:
-        """Add the chosen messages of a block.
+    def feed(self, block: Block, number: int) -> None:
+        """Add the messages of a block whose channel is `number`.
 
         Raises
         ------
         DefinitionError
             They take too many columns, or have too many different texts.
         """
-        start, end, times = block.start[chosen], block.end[chosen], block.log_time_ns[chosen]
-        for rows in _pieces(end - start, max(_LARGEST_TABLE // max(self.layout.columns, 1), 1)):
-            self._feed(block, start[rows], end[rows], times[rows])
+        first = 0
+        while first < len(block.channel):
+            if self._rows.filled == self._rows.rows:
+                self._settle()
+                if self._rows.rows < _ROWS_AT_ONCE:
+                    self._new_rows(self.layout, 8 * self._rows.rows)
+            more = self._capacity < self.largest_capacity
+            first = self._rows.decode(block, number, first, self._capacity if more else ANY_LENGTH)
+            if self._rows.known_shapes > self._learned:
+                self._learn_texts(block.data)
+            if self._rows.longest:
+                self._capacity = min(self._rows.longest, self.largest_capacity)
+                self._settle()
+                self._compile()
 
-    def _feed(self, block: Block, start: Ints, end: Ints, times: Ints) -> None:
-        """Add some messages of a block."""
-        new = self._decode(block, start, end, times)
-        most = max((int(new[:, column].max(initial=0)) for column in self.layout.count_columns), default=0)
-        if self._capacity < min(most, self.largest_capacity):
-            self._settle()
-            self._rows, self._capacity = _Rows(), min(most, self.largest_capacity)
-            self._compile()
-            new = self._decode(block, start, end, times)
+    def _learn_texts(self, data: Bytes) -> None:
+        """Learn the texts of new shapes, which are in `data`."""
+        new = self._rows.shapes[:, self._learned : self._rows.known_shapes]
+        self._learned = self._rows.known_shapes
         for path, slot in self.layout.slots.items():
-            if slot.kind == "string":
-                self._learn_texts(path, new, block)
-        self._rows.filled += len(start)
-
-    def _decode(self, block: Block, start: Ints, end: Ints, times_ns: Ints) -> NDArray[np.uint64]:
-        """Decode messages into the rows behind the filled ones; return those of a new shape."""
-        if self._rows.filled + len(start) > len(self._rows.table):
-            self._settle()
-            if len(self._rows.table) < max(len(start), self._more_rows()):
-                self._rows = _Rows.empty(self.layout, max(len(start), self._more_rows()))
-        rows = slice(self._rows.filled, self._rows.filled + len(start))
-        table, readable, new_shape = self._rows.table[rows], self._rows.readable[rows], self._rows.new_shape[rows]
-        decode_into(self.layout, block.data, start, end, table, readable, new_shape)
-        self._rows.times_ns[rows] = times_ns
-        return table[readable & new_shape]
-
-    def _more_rows(self) -> int:
-        """Return the rows of the next table: twice those of the present one, within bounds."""
-        columns = max(self.layout.columns, 1)
-        most = min(_ROWS_AT_ONCE, max(_LARGEST_TABLE // columns, 1))
-        return min(max(2 * len(self._rows.table), min(_FIRST_ROWS, _FIRST_NUMBERS // columns), 1), most)
-
-    def _learn_texts(self, path: str, new: NDArray[np.uint64], block: Block) -> None:
-        """Learn the texts of a text field that are in some rows and were not seen before."""
-        slot, texts = self.layout.slots[path], self._texts.setdefault(path, {})
-        counts = self.layout.counts(new, path)
-        repeat = min(slot.repeat, int(counts.max(initial=0)))
-        held = np.arange(repeat)[:, None] < counts
-        fields = new[:, slot.column : slot.column + (repeat - 1) * slot.stride + 3].T
-        places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
-        _, first = np.unique(codes, return_index=True)
-        first.sort()
-        for i, code in zip(first.tolist(), codes[first].tolist(), strict=True):
-            if code not in texts:
-                raw = block.data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
-                texts[code] = LogText(raw.decode("utf-8", "replace"))
-        if len(texts) > MOST_TEXTS:
-            raise DefinitionError(self.channel.topic, f"its {path} has over {MOST_TEXTS} different texts", "not read")
+            if slot.kind != "string":
+                continue
+            texts, counts = self._texts.setdefault(path, {}), self.layout.counts(new, path)
+            repeat = min(slot.repeat, int(counts.max(initial=0)))
+            held = np.arange(repeat)[:, None] < counts
+            fields = new[slot.column : slot.column + (repeat - 1) * slot.stride + 3]
+            places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
+            _, first = np.unique(codes, return_index=True)
+            first.sort()
+            for i, code in zip(first.tolist(), codes[first].tolist(), strict=True):
+                if code not in texts:
+                    raw = data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
+                    texts[code] = LogText(raw.decode("utf-8", "replace"))
+            if len(texts) > MOST_TEXTS:
+                why = f"its {path} has over {MOST_TEXTS} different texts"
+                raise DefinitionError(self.channel.topic, why, "not read")
 
     def _settle(self) -> None:
         """Turn the filled rows into columns, and free the rows."""
-        rows, filled = self._rows, self._rows.filled
-        if not filled:
-            return
-        table, times_ns, readable = rows.table[:filled], rows.times_ns[:filled].copy(), rows.readable[:filled]
-        if not readable.all():
-            table, times_ns = table[readable], times_ns[readable]
-        self._unreadable += filled - len(table)
-        expected = self.channel.count or 0
-        self._times.add(times_ns, expected)
-        for path, slot in self.layout.slots.items():
-            is_text = slot.kind == "string"
-            values = (self._text_numbers if is_text else self.layout.numbers)(table, path)
-            self._columns.setdefault(path, GrowingColumn(-1 if is_text else 0)).add(values, expected)
-        rows.filled = 0
+        rows = self._rows
+        if rows.filled:
+            expected = self.channel.count or 0
+            self._times.add(rows.times_ns[: rows.filled], expected)
+            for path, slot in self.layout.slots.items():
+                is_text = slot.kind == "string"
+                values = self._text_numbers(path) if is_text else rows.numbers(path)
+                self._columns.setdefault(path, GrowingColumn(-1 if is_text else 0)).add(values, expected)
+        self._unreadable += rows.clear()
+        self._learned = rows.known_shapes
 
-    def _text_numbers(self, table: NDArray[np.uint64], path: str) -> Ints:
+    def _text_numbers(self, path: str) -> Ints:
         """Return the numbers of a text field's texts (n,) or (n, k), in the order they were learned; -1 for none."""
-        slot, counts = self.layout.slots[path], self.layout.counts(table, path)
+        shapes, shape_of = self._rows.used_shapes()
+        slot, counts = self.layout.slots[path], self.layout.counts(shapes, path)
         repeat = min(slot.repeat, int(counts.max(initial=0))) if "[*]" in path else 1
-        codes = table[:, slot.column + 2 :][:, : repeat * slot.stride : slot.stride]
-        lacking = np.arange(repeat) >= counts[:, None]
-        alike = bool((codes == codes[:1]).all() and (lacking == lacking[:1]).all())
-        if alike:
-            codes, lacking = codes[:1], lacking[:1]
+        codes = shapes[slot.column + 2 :][: repeat * slot.stride : slot.stride].T
         known = np.fromiter(self._texts[path], np.uint64)
         order = np.append(np.argsort(known), -1)
         numbers = order[np.searchsorted(known, codes, sorter=order[:-1])]
-        numbers[lacking] = -1
-        if alike:
-            numbers = np.broadcast_to(numbers, (len(table), repeat))
+        numbers[np.arange(repeat) >= counts[:, None]] = -1
+        numbers = numbers[shape_of] if len(numbers) > 1 else np.broadcast_to(numbers, (len(shape_of), repeat))
         return numbers if "[*]" in path else numbers[:, 0]
 
     def table(self) -> TopicTable:
@@ -326,16 +279,6 @@ def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
     stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
     return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1))), order
-
-
-def _pieces(sizes: Ints, most_rows: int) -> list[slice]:
-    """Return slices of messages of some sizes [bytes] (n,), each of bounded rows and, except single messages, bytes."""
-    if len(sizes) <= most_rows and int(sizes.sum()) <= _MOST_BYTES_AT_ONCE:
-        return [slice(0, len(sizes))]
-    whole = np.cumsum(sizes) // _MOST_BYTES_AT_ONCE
-    edges = np.flatnonzero(np.diff(whole, prepend=-1))
-    edges = np.unique(np.concatenate([edges, np.arange(0, len(sizes), most_rows), [len(sizes)]]))
-    return [slice(int(begin), int(end)) for begin, end in pairwise(edges)]
 
 
 def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:

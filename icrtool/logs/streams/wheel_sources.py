@@ -147,8 +147,9 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     wheel = np.full(len(texts) + 1, -1)
     wheel[left + right] = np.arange(lefts + rights)
     # All messages list the same joints in the same order: one row stands for them.
-    wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if codes.strides[0] == 0 else wheel[codes]
-    alike = _rows_alike(wheels, lefts, rights)
+    same = codes.strides[0] == 0
+    wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
+    alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
     if not alike.any():
         return WheelMotion(**of_topic(table), problem="left and right wheels come in different messages")
     if not alike.all():
@@ -198,7 +199,7 @@ def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats:
 def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
     """Yield rows, the wheel that they list (one, or one per row), and its position in the list."""
     for place, listed in enumerate(wheels.T):
-        if len(listed) and (listed == listed[0]).all():
+        if len(listed) and (listed.strides[0] == 0 or (listed == listed[0]).all()):
             if listed[0] >= 0:
                 yield slice(None), int(listed[0]), place
         else:

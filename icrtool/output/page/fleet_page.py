@@ -68,10 +68,8 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
 def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the error names of distances within a budget, of the best model that some log has."""
     names = dict.fromkeys(name for log in logs for name in log["errors"] if "_within_" in name)
-    for model in MODELS:
-        if found := [name for name in names if name.startswith(f"{model}_within_")]:
-            return found
-    return []
+    by_model = ([name for name in names if name.startswith(f"{model}_within_")] for model in MODELS)
+    return next(filter(None, by_model), [])
 
 
 def _columns(budgets: Sequence[str]) -> list[str]:

@@ -213,20 +213,14 @@ def _event_lines(report: DropoutReport) -> list[str]:
         return []
     if not cost.events:
         return ["slip events: none in this log; --without-events changes nothing"]
-    both = np.flatnonzero((icr.summary.trials > 0) & (cost.with_events["icr"].trials > 0))
-    number = counted(cost.events, "slip event")
+    left_out, before, after = f"{counted(cost.events, 'slip event')} left out", cost.with_events["icr"], icr.summary
+    both = np.flatnonzero((after.trials > 0) & (before.trials > 0))
     if not len(both):
-        return [f"{number}: no trial is left without them"]
+        return [f"{left_out}: no trial remains"]
     h = int(both[-1])
-    before, after = cost.with_events["icr"], icr.summary
-    errors = [
-        f"{name} {error_text(float(after_m[h]))} instead of {error_text(float(before_m[h]))}"
-        for name, after_m, before_m in (
-            ("95 %", after.p95, before.p95), ("expected", after.expected, before.expected),
-        )
-    ]  # fmt: skip
-    text = f"{number} left out: ICR after {report.horizons_m[h]:g} m {', '.join(errors)}"
-    return [f"{text} ({int(cost.trials[h]):,} trials cross one)"]
+    errors = f"{error_text(float(after.p95[h]))} instead of {error_text(float(before.p95[h]))}"
+    what = f"ICR after {report.horizons_m[h]:g} m 95 % {errors}"
+    return [f"{left_out}: {what} ({int(cost.trials[h]):,} trials cross one)"]
 
 
 def why_no_trial(report: DropoutReport, h: int) -> str | None:

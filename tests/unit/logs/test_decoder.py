@@ -17,7 +17,7 @@ from icrtool.logs.containers import chunked_file
 from icrtool.logs.containers import record_table as records
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.messages import decoder
-from icrtool.logs.messages.decoder import decode_messages
+from icrtool.logs.messages.decoder import Decoded, decode_messages
 from icrtool.logs.messages.schema import (
     BEGIN_LOOP,
     END_LOOP,
@@ -51,6 +51,10 @@ class Guarded:
 
     def __len__(self) -> int:
         return len(self.array)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.array.shape
 
     def _check(self, index: object) -> None:
         for place, length in zip(index if isinstance(index, tuple) else (index,), self.array.shape, strict=False):
@@ -155,22 +159,23 @@ def test_decoding_of_damaged_messages_stays_inside_them(message_type, cdr):
     assert whole.all()
     damaged = [mutated(rng, messages[row % len(messages)]) for row in range(MUTATIONS)]
     damaged += [mutated(rng, message) for message in damaged]
-    python = as_python(decoder.decode_new_shapes)
+    python = as_python(decoder.decode_block)
     for message in damaged:
         data, start, end = joined([message])
-        table, readable = decode_messages(layout, data, start, end)
-        plain, plain_readable = np.zeros_like(table), np.zeros_like(readable)
+        found, readable = decode_messages(layout, data, start, end)
         # Only the message is there: a read before or behind it is a read outside.
-        only = Guarded(data[start[0] : end[0]])
+        plain, only = Decoded(layout, 1), data[start[0] : end[0]]
+        block = map(Guarded, (only, np.zeros(1, np.int64), np.zeros(1, np.int64), start - start, end - start))
+        kept = [plain.table, plain.times_ns, plain.shape_of, plain.shapes, plain.state, plain.same, plain.taken]
         with np.errstate(over="ignore"):
-            python(
-                only, start - start[0], end - start[0], layout.program, cdr, Guarded(plain), Guarded(plain_readable),
-                Guarded(np.zeros(1, np.bool_)),
-            )  # fmt: skip
-        np.testing.assert_array_equal(plain_readable, readable)
-        texts = [slot.column for slot in layout.slots.values() if slot.kind == "string"]
-        if readable[0] and not texts:
-            np.testing.assert_array_equal(plain, table)
+            python(*block, 0, 0, layout.program, cdr, 1 << 62, *map(Guarded, kept), plain.loops)
+        assert plain.filled == readable.sum()
+        assert found.filled == readable.sum()
+        if readable[0]:
+            for path, slot in layout.slots.items():
+                np.testing.assert_array_equal(*(layout.counts(one.used_shapes()[0], path) for one in (plain, found)))
+                if slot.kind != "string":
+                    np.testing.assert_array_equal(plain.numbers(path), found.numbers(path))
 
 
 def test_decoding_of_an_array_longer_than_all_messages_reads_nothing():
@@ -204,18 +209,18 @@ def test_decoding_of_elements_without_fields_ends():
 @pytest.mark.parametrize("messages", [[], [b""], [b"\0"], [b"\0\1\0"], [b"\0\1\0\0"]], ids=str)
 def test_decoding_of_no_bytes_reads_nothing(messages):
     layout = compile_layout(STORE.fielddefs, "std_msgs/Float64", ("data",), "cdr")
-    table, readable = decode_messages(layout, *joined(messages))
-    assert table.shape == (len(messages), 1)
-    assert not readable.any()
+    found, readable = decode_messages(layout, *joined(messages))
+    assert found.table.shape == (1, len(messages))
+    assert readable.tolist() == [False] * len(messages)
 
 
 def test_decoding_reads_big_endian_messages():
     layout = compile_layout(STORE.fielddefs, "std_msgs/Float64", ("data",), "cdr")
     value = np.array([12.625])
     messages = [b"\0\0\0\0" + value.astype(">f8").tobytes(), b"\0\1\0\0" + value.astype("<f8").tobytes()]
-    table, readable = decode_messages(layout, *joined(messages))
+    found, readable = decode_messages(layout, *joined(messages))
     assert readable.all()
-    np.testing.assert_array_equal(layout.numbers(table, "data"), [12.625, 12.625])
+    np.testing.assert_array_equal(found.numbers("data"), [12.625, 12.625])
 
 
 def mcap_chunk(rng, count=12):
@@ -251,15 +256,18 @@ def test_scan_of_damaged_records_stays_inside_them(kind):
         chunk = make(rng)
         for _ in range(turn % 4):
             chunk = mutated(rng, chunk)
-        data, rows, plain = np.frombuffer(chunk, np.uint8), np.zeros((20, 5), np.int64), np.zeros((20, 5), np.int64)
-        found = scan(data, 0, rows)
+        data = np.frombuffer(chunk, np.uint8)
+        tables, plain = np.zeros((2, 4, 20), np.int64), np.zeros((2, 4, 20), np.int64)
+        found = scan(data, 0, *tables)
         with np.errstate(over="ignore"):
-            assert python(Guarded(data), 0, Guarded(plain)) == found
-        np.testing.assert_array_equal(plain[: found[0]], rows[: found[0]])
-        start, end = rows[: found[0], 3], rows[: found[0], 4]
-        assert ((start >= 0) & (start <= end) & (end <= len(data))).all()
+            assert python(Guarded(data), 0, *map(Guarded, plain)) == found
+        np.testing.assert_array_equal(plain, tables)
+        for table, count in zip(tables, found[:2], strict=True):
+            start, end = table[2:, :count]
+            assert ((start >= 0) & (start <= end) & (end <= len(data))).all()
         if turn % 4 == 0:
-            assert found == (12, len(data))
+            assert (sum(found[:2]), found[2]) == (12, len(data))
+            assert scan(data, 0, tables[0], tables[1][:, :0]) == (found[0], 0, len(data))
 
 
 @pytest.mark.parametrize("kind", SCANS)
@@ -269,11 +277,11 @@ def test_scan_refuses_a_length_that_the_chunk_does_not_have(kind, number):
     chunk = make(np.random.default_rng(1))
     size, at = (8, 1) if kind == "mcap" else (4, 0)
     chunk = chunk[:at] + (number % (1 << 8 * size)).to_bytes(size, "little") + chunk[at + size :]
-    rows = np.zeros((20, 5), np.int64)
-    count, stop = scan(np.frombuffer(chunk, np.uint8), 0, rows)
-    assert 0 <= count <= 12
+    tables = np.zeros((2, 4, 20), np.int64)
+    *counts, stop = scan(np.frombuffer(chunk, np.uint8), 0, *tables)
+    assert 0 <= sum(counts) <= 12
     assert 0 <= stop <= len(chunk)
-    assert (rows[:count, 4] <= len(chunk)).all()
+    assert (tables[:, 3] <= len(chunk)).all()
 
 
 def test_a_chunk_of_more_records_than_the_table_has_rows_is_scanned_in_pieces(tmp_path, monkeypatch):
