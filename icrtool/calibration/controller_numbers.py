@@ -101,7 +101,7 @@ def _fold_errors(
     s, e = windows.start[some], windows.end[some]
     begin, finish = windows.knot_t[s], windows.knot_t[e]
     path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
-    (theta, place), (turned, moved) = path(begin), path(finish)
+    (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, finish)))
     error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
     turn = windows.turned[some]
     columns = error.real, error.imag, turned - theta - turn, finish - begin, turn, windows.length_m[some]

@@ -29,7 +29,6 @@ from icrtool.motion.models import (
     controller_model,
     track_geometry,
     typical_drive,
-    wheel_motion,
 )
 from icrtool.motion.recording import Recording, Steps, cut_windows, totals_of
 from icrtool.motion.trials import Trials, cut_trials, predicted_path, trial_errors
@@ -160,14 +159,14 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
 
 def errors_without(
     recording: Recording, trials: Trials, folds: Sequence[Fold], i: int, without: Callable[[Fold], Prediction | None],
-    steps: Steps,
+    steps: Steps | None = None,
 ) -> Floats:  # fmt: skip
     """Return the errors (k, h) [m] of trials of recording i, each predicted without its fold; NaN where that is none.
 
     Parameters
     ----------
     without : gives the model for a fold, None where too little is left to fit it
-    steps : the wheel samples, joined or single
+    steps : the wheel samples joined; default single samples
     """
     distance = recording.drive.distance
     errors: Floats = np.full(trials.ends.T.shape, np.nan).T
@@ -178,7 +177,8 @@ def errors_without(
     for fold, some in left_out(folds, i, distance[start], distance[end]):
         if (found := without(fold)) is not None:
             s, e = start[some], end[some]
-            path = predicted_path(recording, *found, steps.around(t[s.min()], t[e.max()]))
+            near = (steps if steps is not None else recording).around(t[s.min()], t[e.max()])
+            path = predicted_path(recording, *found, near)
             errors[row[some], column[some]] = trial_errors(recording, s, e, path)
     return errors
 
@@ -283,9 +283,7 @@ class _Tester:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
         self._trials = [cut_trials(one, horizons_m) for one in recordings] if len(horizons_m) else []
-        self.typical = typical_drive(
-            [(wheel_motion(one.drive.v_left, one.drive.v_right, one.width_m), one.held_s) for one in recordings]
-        )
+        self.typical = typical_drive(motion for one in recordings for motion in one.motions())
 
     def errors(self, without: Callable[[Fold], Prediction | None]) -> Floats:
         """Return the errors (k, h) [m] of the trials of all recordings, one behind the other."""

@@ -216,12 +216,12 @@ def _turned_scores(
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
     held, last = recording.held_s, len(recording.t_s) - 1
-    psi = np.concatenate([[0.0], np.cumsum(held * scaled_gyro(recording))[:-1]])
-    moved = held * (run.table.v_left_mps + run.table.v_right_mps) / 2.0
-    place = np.zeros(last + 1, np.complex128)
+    psi, place = np.zeros(last + 1), np.zeros(last + 1, np.complex128)
+    np.cumsum((held * scaled_gyro(recording))[:-1], out=psi[1:])
     for lo in range(0, last, ROWS_AT_ONCE):
         hi = min(lo + ROWS_AT_ONCE, last)
-        place[lo + 1 : hi + 1] = moved[lo:hi] * np.exp(0.5j * (psi[lo:hi] + psi[lo + 1 : hi + 1]))
+        moved = held[lo:hi] * (run.table.v_left_mps[lo:hi] + run.table.v_right_mps[lo:hi]) / 2.0
+        place[lo + 1 : hi + 1] = moved * np.exp(0.5j * (psi[lo:hi] + psi[lo + 1 : hi + 1]))
     return psi, np.cumsum(place, out=place)
 
 

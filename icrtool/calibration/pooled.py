@@ -22,7 +22,7 @@ from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Fold, Prediction, own_constants
 from icrtool.motion.models import FittedModel
-from icrtool.motion.recording import Recording, cut_windows, joined_steps
+from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, drive_of
@@ -119,11 +119,12 @@ def scaled_gyro(recording: Recording) -> Floats:
 
 def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]:
     """Return scale, bias [rad/s] and lead [s] with which a turn rate (n,) makes the reference's turns over seconds."""
-    t, held = recording.t_s, recording.held_s
+    t = recording.t_s
     every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan"), 0.0
-    sums = np.concatenate([[0.0], np.cumsum(held * rate)[:-1]])
+    sums = np.zeros(len(t))
+    np.cumsum((recording.held_s * rate)[:-1], out=sums[1:])
     turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:
@@ -220,9 +221,9 @@ ErrorsOf = Callable[[Trials], Floats]
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
     """Return what gives the errors of a calibration in any trials of a recording; see `calibrated`."""
-    found, steps = calibrated(calibration, recording, with_gyro=with_gyro), joined_steps(recording, 1)
+    found = calibrated(calibration, recording, with_gyro=with_gyro)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
-    return lambda trials: errors_without(recording, trials, folds, 0, lambda _: found, steps)
+    return lambda trials: errors_without(recording, trials, folds, 0, lambda _: found)
 
 
 def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Prediction:
@@ -267,5 +268,4 @@ def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) 
     """
     # Models of the wheels alone: a long log's gyro need not be kept for them.
     recording = replace(recordings[i], gyro_radps=None)
-    steps = joined_steps(recording, 1)
-    return lambda trials: errors_without(recording, trials, table.folds, i, table.without, steps)
+    return lambda trials: errors_without(recording, trials, table.folds, i, table.without)

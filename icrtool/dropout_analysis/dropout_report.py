@@ -89,6 +89,7 @@ def dropout_report(
 
     horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
     report = dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink)
+    give_back_freed()
     if without_events:
         report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
     report = replace(report, comparison=found.table if found is not None else None, calibrations=used)

@@ -7,7 +7,7 @@ import numpy as np
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop.direct import SHORT, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import ExampleTrial
@@ -32,12 +32,12 @@ def worst_trials(
     if starts == "moving":
         leave_out_standing(ends, standing_states(drive))
     errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
-    ends, states = ends[:, 0], np.arange(len(errors))
-    left = np.nan_to_num(errors, nan=-1.0)
+    ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
         chosen.append(worst)
-        left[(states <= ends[worst]) & (ends >= worst)] = -1.0
+        before_its_end = slice(ends[worst] + 1)
+        left[before_its_end][ends[before_its_end] >= worst] = -1.0
     return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
 
 
@@ -52,9 +52,8 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     """
     drive, models = drive_of(run), models_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
-    starts = np.flatnonzero(ends >= 0)
     # A parked start repeats the same path many times: the last state of each stop stands for it.
-    moving = starts[~standing_states(drive)[starts]]
+    moving = np.flatnonzero((ends >= 0) & ~standing_states(drive))
     if not len(moving):
         return ()
     last = ends[moving]
@@ -70,9 +69,7 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
 def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
     """Return the start with the median error of a group, or of evenly spaced ones where it is large."""
     sample = group[:: -(-len(group) // TYPICAL_OF)]
-    tried = np.full((len(ends), 1), SHORT)
-    tried[sample, 0] = ends[sample]
-    errors = open_loop_errors_direct(drive, model.icrs, tried)[sample, 0]
+    errors = [open_loop_errors_direct(drive, model.icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
     return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
 
 

@@ -42,8 +42,6 @@ def reference_error(run: Run, drive: Drive, ends: NDArray[np.int32], seed: int) 
     """
     position, heading = _spread(run)
     table = run.table
-    std_north, std_east = np.sqrt(position) * table.std_north_m, np.sqrt(position) * table.std_east_m
-    std_heading = np.sqrt(heading) * table.std_heading_rad
     result = np.full((3, len(ends)), np.nan)
     rng = np.random.default_rng(seed)
     for h, column in enumerate(ends):
@@ -53,13 +51,16 @@ def reference_error(run: Run, drive: Drive, ends: NDArray[np.int32], seed: int) 
         start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
         end = column[start]
         north, east = drive.north[end] - drive.north[start], drive.east[end] - drive.east[start]
+        north_std = [np.sqrt(position) * table.std_north_m[rows] for rows in (start, end)]
+        east_std = [np.sqrt(position) * table.std_east_m[rows] for rows in (start, end)]
+        std_heading = np.sqrt(heading) * table.std_heading_rad[start]
         drawn = rng.standard_normal((5, DRAWS))
-        turned = std_heading[start] * drawn[0]
-        off_north = std_north[start] * drawn[1] - std_north[end] * drawn[2] - turned * east
-        off_east = std_east[start] * drawn[3] - std_east[end] * drawn[4] + turned * north
+        turned = std_heading * drawn[0]
+        off_north = north_std[0] * drawn[1] - north_std[1] * drawn[2] - turned * east
+        off_east = east_std[0] * drawn[3] - east_std[1] * drawn[4] + turned * north
         error = np.hypot(off_north, off_east)
-        square = sum(std[rows] ** 2 for std in (std_north, std_east) for rows in (start, end))
-        square = square + std_heading[start] ** 2 * (north**2 + east**2)
+        square = sum(std**2 for std in (*north_std, *east_std))
+        square = square + std_heading**2 * (north**2 + east**2)
         result[:, h] = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
     return ReferenceErrors(*result)
 

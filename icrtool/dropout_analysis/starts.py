@@ -28,7 +28,7 @@ LEAST_FALL = 0.5
 
 def standing_states(drive: Drive) -> Bools:
     """Return the states (n,) after which the robot stands; the last state, which has no interval, is none of them."""
-    standing: Bools = np.maximum(np.abs(drive.v_left), np.abs(drive.v_right)) < STANDING_MPS
+    standing: Bools = (np.abs(drive.v_left) < STANDING_MPS) & (np.abs(drive.v_right) < STANDING_MPS)
     standing[-1:] = False
     return standing
 

@@ -10,6 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.equal_steps import rows_of_cells
 from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive
@@ -55,14 +56,14 @@ def heading_range(drive: Drive, horizon_m: float) -> Floats:
     """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
     size = horizon_m / CELLS
     # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
-    steps = np.diff(np.floor((drive.distance - drive.distance[0]) / size), prepend=0.0)
+    distance = drive.distance
+    first = rows_of_cells(distance, lambda part: np.floor((part - distance[0]) / size))
+    steps = np.diff(np.floor((distance[first] - distance[0]) / size), prepend=0.0)
     cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
-    first = np.flatnonzero(np.diff(cell, prepend=-1))
     cells = np.arange(cell[-1] + CELLS + 1)
     # In a cell without a state the heading lies between those around it.
     highest, lowest = (
-        sliding_window_view(np.interp(cells, cell[first], extreme.reduceat(drive.heading, first)), CELLS + 1)
+        sliding_window_view(np.interp(cells, cell, extreme.reduceat(drive.heading, first)), CELLS + 1)
         for extreme in (np.maximum, np.minimum)
     )
-    heading_range: Floats = (highest.max(axis=1) - lowest.min(axis=1))[cell]
-    return heading_range
+    return np.repeat((highest.max(axis=1) - lowest.min(axis=1))[cell], np.diff(first, append=len(distance)))

@@ -30,6 +30,7 @@ from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, drive_of, straight_drive
 
 BOOTSTRAP_RESAMPLES = 300
@@ -175,6 +176,7 @@ class _Part(NamedTuple):
 
 def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     """Return the errors of all models at some horizons."""
+    give_back_freed()
     drive, learned, by_learning = asked.drive, asked.learned, None
     ends, counts = _ends(drive, horizons, asked.left_out, pool)
     blocks = _blocks(drive, horizons, ends, pool)
@@ -188,8 +190,9 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
             asked.sink(model.name, horizons, errors)
         results.append(_result_of(model, errors, tested, asked.seed, pool))
         if model.name == "icr":
-            after = errors[learned:] if learned is not None else errors[:0]
-            by_learning = error_summary(errors[:learned]), error_summary(after)
+            first = len(errors) if learned is None else learned
+            by_learning = error_summary(errors[:first]), error_summary(errors[first:])
+        del errors  # before those of the next model are made
     return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
@@ -73,12 +73,9 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     rows = rows_at_steps(distance, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
-    fixed, axes, columns = model_columns(MODELS["full_linear"], wheel_motion(drive.v_left, drive.v_right, WIDTH_M))
-    knots, terms = len(rows), len(parameters)
-    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-    none = np.zeros(len(dt))
-    sums_at_knots(fixed, columns, axes, parameters, dt, none, rows, np.zeros(knots), rate, sums, by)
-    place, heading = (table.north_m + 1j * table.east_m)[rows], table.heading_rad[rows]
+    terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
+    rate, sums, by = _sums(drive, dt, rows, parameters)
+    place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
     missed, jacobian = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
     window_residuals(
@@ -99,14 +96,28 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     return DriveWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
-        length_m=np.diff(distance[rows]),
+        length_m=np.diff(distance),
         turned_rad=turned,
         end_s=table.t_s[rows[1:]],
-        stretch=(distance[rows[:-1]] // STRETCH_M).astype(np.int64),
-        distance_m=float(distance[-1]),
+        stretch=(distance[:-1] // STRETCH_M).astype(np.int64),
+        distance_m=whole_m,
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
         heading_std_rad=float(np.median(table.std_heading_rad)),
     )
+
+
+def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return `rate`, `sums` and `by` of `sums_at_knots` at some rows (m,), by the wheels of a drive."""
+    knots, terms = len(rows), len(parameters)
+    fixed, columns, none = np.zeros((3, len(dt))), np.empty((terms, len(dt))), np.zeros(len(dt))
+    axes = np.empty(terms, np.int64)
+    for lo in range(0, len(dt), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
+        _, axes, columns[:, some] = model_columns(MODELS["full_linear"], motion)  # each of its terms is free
+    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
+    sums_at_knots(fixed, columns, axes, parameters, dt, none, rows, np.zeros(knots), rate, sums, by)
+    return rate, sums, by
 
 
 def prior_std(width_m: float) -> Floats:

@@ -48,7 +48,10 @@ def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
 def _integrate(gyro_ns: Ints, rate: Floats, states_ns: Ints) -> Floats:
     """Return the turn [rad] up to each state: trapezoids, the first and last rate held beyond the samples."""
     t, at = _since(gyro_ns, states_ns), _since(states_ns, states_ns)
-    turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2.0)])
-    inside: Floats = np.interp(at, t, turned)
-    whole: Floats = inside + np.minimum(at - t[0], 0.0) * rate[0] + np.maximum(at - t[-1], 0.0) * rate[-1]
+    turned = np.zeros(len(t))
+    np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2.0, out=turned[1:])
+    whole: Floats = np.interp(at, t, turned)
+    del turned
+    whole += np.minimum(at - t[0], 0.0) * rate[0]
+    whole += np.maximum(at - t[-1], 0.0) * rate[-1]
     return whole

@@ -31,29 +31,36 @@ class OdometryPath:
 
 @dataclass(frozen=True, slots=True)
 class WheelPaths:
-    """Both paths of a run: with the ICRs it ended with, and without slip (None where the track width is not known)."""
+    """Both paths of a run, each driven when it is asked for: of a long log one takes as much memory as its positions.
 
-    icr: OdometryPath
-    no_slip: OdometryPath | None
-
-
-def odometry(run: Run) -> WheelPaths:
-    """Return the wheels-only paths of a run; run.json holds their end errors as ``odometry``."""
-    return drive_odometry(run.table, run.in_gap, run.track_width_m)
-
-
-def drive_odometry(table: States, in_gap: Bools, track_width_m: float | None) -> WheelPaths:
-    """Return the path with the final ICRs, and that of the no-slip model (Eqs. 38-39).
-
-    Parameters
+    Attributes
     ----------
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     track_width_m : b, None where not known
     """
-    icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    b = track_width_m
-    return WheelPaths(_path(table, in_gap, *icrs), _path(table, in_gap, b / 2, -b / 2, 0.0) if b is not None else None)
+
+    table: States
+    in_gap: Bools
+    track_width_m: float | None
+
+    @property
+    def icr(self) -> OdometryPath:
+        """The path with the final ICRs."""
+        table = self.table
+        icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
+        return _path(table, self.in_gap, *icrs)
+
+    @property
+    def no_slip(self) -> OdometryPath | None:
+        """The path of the no-slip model (Eqs. 38-39), None where the track width is not known."""
+        b = self.track_width_m
+        return _path(self.table, self.in_gap, b / 2, -b / 2, 0.0) if b is not None else None
+
+
+def odometry(run: Run) -> WheelPaths:
+    """Return the wheels-only paths of a run; run.json holds their end errors as ``odometry``."""
+    return WheelPaths(run.table, run.in_gap, run.track_width_m)
 
 
 def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:

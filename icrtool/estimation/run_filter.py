@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -103,18 +102,21 @@ def run_filter(
     heading = MeasurementOutcome(
         headings_ns, headings_s, output.heading_nis, output.heading_code, output.heading_innovation
     )
-    table = carry_headings(table, sensors, heading.used)
+    in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
+    start_std_m, least_icr_m = np.sqrt(np.diag(setup.P0)[3:]), setup.parameters.least_icr
+    del setup  # of a long log, a quarter of what is alive
+    carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
         table=table,
-        in_gap=np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False),
+        in_gap=in_gap,
         outages_ns=_outages(table, gnss, sensors.losses_ns),
         gnss=gnss,
         heading=heading,
         covariance=output.P[PLACES],
         noise=noise,
-        start_std_m=np.sqrt(np.diag(setup.P0)[3:]),
-        least_icr_m=setup.parameters.least_icr,
+        start_std_m=start_std_m,
+        least_icr_m=least_icr_m,
         began_with=warm_start,
         changes_s=changes_s,
     )
@@ -175,13 +177,13 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
     )
 
 
-def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
-    """Return states with the headings (h,), where they are estimated and `used` (h,), carried on by the wheels' turn.
+def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
+    """Carry the headings (h,), where they are estimated and `used` (h,), on by the wheels' turn; changes the states.
 
     The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
     """
     if not (sensors.heading_is_estimated and used.any()):
-        return table
+        return
     headings = sensors.headings
     stamps, psi = headings.stamp_ns[used], table.heading_rad
     t, seen = ((one - table.stamp_ns[0]) / 1e9 for one in (table.stamp_ns, stamps))
@@ -191,11 +193,8 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> States:
     off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
     std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
     clear = recent & (CLEARLY * std < table.std_heading_rad)
-    return replace(
-        table,
-        heading_rad=psi + np.where(clear, off[last], 0.0),
-        std_heading_rad=np.where(clear, std, table.std_heading_rad),
-    )
+    np.add(psi, off[last], out=psi, where=clear)
+    np.copyto(table.std_heading_rad, std, where=clear)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

@@ -40,7 +40,8 @@ def smooth(run: Run) -> States:
         columns[f"std_{name}"] = np.ascontiguousarray(std[:, i])
     kept = {field.name: getattr(run.table, field.name) for field in fields(States) if field.name not in columns}
     table = States(**(kept | columns | {"distance_m": _distance(run, smoothed.x)}))
-    return carry_headings(table, run.sensors, run.heading.used)
+    carry_headings(table, run.sensors, run.heading.used)
+    return table
 
 
 def _distance(run: Run, x: Floats) -> Floats:

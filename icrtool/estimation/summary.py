@@ -14,7 +14,7 @@ from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import WheelPaths, drive_odometry
+from icrtool.estimation.odometry import WheelPaths
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -89,7 +89,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": _end_errors(drive_odometry(table, filtered.in_gap, width)),
+            "odometry": _end_errors(WheelPaths(table, filtered.in_gap, width)),
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
@@ -206,8 +206,8 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
 
 def _end_errors(found: WheelPaths) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
-    paths = {"icr": found.icr, "no_slip": found.no_slip}
-    return {name: {"end_error_m": path.end_error_m} if path is not None else None for name, path in paths.items()}
+    ends = {"icr": found.icr.end_error_m, "no_slip": path.end_error_m if (path := found.no_slip) is not None else None}
+    return {name: {"end_error_m": end} if end is not None else None for name, end in ends.items()}
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
+
+ROWS_AT_ONCE = 1 << 16
+"""Bounds memory."""
 
 
 def rows_at_steps(progress: Floats, step: float) -> Ints:
@@ -19,6 +24,16 @@ def rows_at_steps(progress: Floats, step: float) -> Ints:
     -----
     Time and memory grow with n, not with the values: a damaged speed over a long interval makes a distance of 1e12 m.
     """
-    cell = np.floor(progress / step)
-    before = np.concatenate([[-1.0], cell[:-1]])[: len(cell)]
-    return np.flatnonzero((cell > before) & ((before + 1.0) * step < progress[-1:]))
+    rows = rows_of_cells(progress, lambda part: np.floor(part / step))
+    before = np.where(rows > 0, np.floor(progress[rows - 1] / step), -1.0)
+    return rows[(before + 1.0) * step < progress[-1:]]
+
+
+def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Ints:
+    """Return the first row of each cell (from 0 on) of what never decreases; `cells_of` is called for parts of it."""
+    found, last = [np.empty(0, np.int64)], -1.0
+    for lo in range(0, len(progress), ROWS_AT_ONCE):
+        cell = cells_of(progress[lo : lo + ROWS_AT_ONCE])
+        found.append(lo + np.flatnonzero(cell > np.append(last, cell[:-1])))
+        last = cell[-1]
+    return np.concatenate(found)

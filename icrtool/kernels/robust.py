@@ -66,9 +66,9 @@ def soft_l1_weights(z: Floats) -> Floats:
     return weights
 
 
-def huber_weights(z: Floats, sigmas: float = LOSS_SIGMAS) -> Floats:
+def huber_weights(z: Floats) -> Floats:
     """Return Huber's weights (m,) of squared residuals; `z` (m,) in standard deviations (Huber 1964)."""
-    weights: Floats = 1.0 / np.maximum(np.abs(z) / sigmas, 1.0)
+    weights: Floats = 1.0 / np.maximum(np.abs(z) / LOSS_SIGMAS, 1.0)
     return weights
 
 
@@ -85,7 +85,6 @@ class RobustFit(NamedTuple):
     residuals : (m,), jacobian : (m, k), at `x`, to first order of the last step; own parameters follow the shared ones
     scale : (m,) robust standard deviation of each residual, that of its kind
     groups : independent groups of residuals
-    converged : whether the last step was short enough
     """
 
     x: Floats
@@ -97,7 +96,6 @@ class RobustFit(NamedTuple):
     jacobian: Floats
     scale: Floats
     groups: int
-    converged: bool
 
     @property
     def std(self) -> Floats:
@@ -145,14 +143,13 @@ def robust_least_squares(
     x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
     residuals, jacobian = evaluate(x)
     parts = Parts(np.array([0, len(residuals)])) if parts is None else parts
-    converged = False
     for _ in range(most_steps):
         scale = scale_by_kind(residuals, kind)
         weights = robust_weights(residuals, scale, overlap)
         step, decrease, _ = eliminate(residuals, jacobian, weights, parts, pull, x - prior_mean)
         if decrease < settled**2:
             # too short to evaluate for: residuals follow it to first order
-            x, residuals, converged = x + step, residuals + parts.change(jacobian, step), True
+            x, residuals = x + step, residuals + parts.change(jacobian, step)
             break
         before = _cost(residuals / scale, overlap, pull, x - prior_mean)
         tried = evaluate(x + step)
@@ -167,7 +164,6 @@ def robust_least_squares(
             break
         x, (residuals, jacobian) = x + step, tried
         if before - after < settled**2:
-            converged = True
             break
     scale = scale_by_kind(residuals, kind)
     found = eliminate(residuals, jacobian, robust_weights(residuals, scale, overlap), parts, pull, x - prior_mean)
@@ -179,7 +175,7 @@ def robust_least_squares(
     groups = np.arange(len(residuals)) if group is None else group
     prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
     covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, prior, overlap)
-    return RobustFit(x, covariance, information, own_prior, own_pull, residuals, jacobian, scale, count, converged)
+    return RobustFit(x, covariance, information, own_prior, own_pull, residuals, jacobian, scale, count)
 
 
 def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:

@@ -11,7 +11,7 @@ without free terms.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -231,13 +231,14 @@ class TypicalDrive(NamedTuple):
     speed_abs_mps: float = 0.0
 
 
-def typical_drive(motions: Sequence[tuple[WheelMotion, Floats]]) -> TypicalDrive:
+def typical_drive(motions: Iterable[tuple[WheelMotion, Floats]]) -> TypicalDrive:
     """Return where robots turned; `motions` are wheel motions with how long each sample holds [s]."""
-    weight = np.concatenate([held * m.w**2 for m, held in motions])
-    if not weight.sum() > 0.0:
-        return TypicalDrive()
-    spin, v = np.concatenate([m.spin for m, _ in motions]), np.concatenate([m.v for m, _ in motions])
-    return TypicalDrive(*(float(weight @ column / weight.sum()) for column in (spin, v, np.abs(v))))
+    total, sums = 0.0, np.zeros(3)
+    for motion, held in motions:
+        weight = held * motion.w**2
+        total += float(weight.sum())
+        sums += [weight @ column for column in (motion.spin, motion.v, np.abs(motion.v))]
+    return TypicalDrive(*(sums / total).tolist()) if total > 0.0 else TypicalDrive()
 
 
 def track_geometry(

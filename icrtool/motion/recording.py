@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
 from icrtool.kernels.open_loop.direct import ends_from
 from icrtool.kernels.open_loop.trials import Drive
+from icrtool.motion.models import WheelMotion, wheel_motion
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
@@ -76,6 +77,18 @@ class Recording:
         held[-1] = 0.0
         return held
 
+    def motions(self) -> Iterator[tuple[WheelMotion, Floats]]:
+        """Yield the motion of the wheels and how long each sample holds [s], some samples at a time."""
+        drive, held = self.drive, self.held_s
+        for lo in range(0, len(held), ROWS_AT_ONCE):
+            some = slice(lo, lo + ROWS_AT_ONCE)
+            yield wheel_motion(drive.v_left[some], drive.v_right[some], self.width_m), held[some]
+
+    def around(self, begin_s: float, end_s: float) -> Steps:
+        """Return single wheel samples as `Steps.around` does; of a long log, columns of all would take much memory."""
+        near = rows_around(self.t_s, begin_s, end_s)
+        return joined_steps(self.part(near.start, near.stop + 1), 1)
+
     def part(self, first: int, stop: int) -> Recording:
         """Return the states [first, stop) as a recording."""
         rows = slice(first, stop)
@@ -125,26 +138,30 @@ class Steps(NamedTuple):
 
     def around(self, begin_s: float, end_s: float) -> Steps:
         """Return the steps of the time between the first begin and the last end of trials, and a little for delays."""
-        span = begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S
-        first, stop = np.searchsorted(self.t, span, side="right").tolist()
-        return Steps._make(column[max(first - 1, 0) : stop] for column in self)
+        near = rows_around(self.t, begin_s, end_s)
+        return Steps._make(column[near] for column in self)
 
     def locate(self, at: Floats) -> tuple[Ints, Floats]:
         """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
-        # the end of the last step, or a delayed time would find no sample
-        t = np.append(self.t, self.t[-1] + max(float(self.held[-1]), 1e-9))
-        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(self.t) - 1)
+        row = np.maximum(np.searchsorted(self.t, at, side="right") - 1, 0)
         held = self.held[row]
-        passed = np.clip(at - t[row], 0.0, held)
+        passed = np.clip(at - self.t[row], 0.0, held)
         return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
 
-    def gyro_change(self) -> Floats:
-        """Return the derivative of the gyro's turn rate by time (n,) [rad/s^2]; 0 where it cannot be formed."""
-        middle = self.t + self.held / 2.0
-        apart = np.append(middle[1:], middle[-1]) - np.append(middle[:1], middle[:-1])
-        risen = np.append(self.gyro[1:], self.gyro[-1]) - np.append(self.gyro[:1], self.gyro[:-1])
+    def gyro_change(self, some: slice = slice(None)) -> Floats:
+        """Return the change of the gyro's turn rate by time (n,) [rad/s^2], of some steps; 0 where it has none."""
+        rows = np.arange(len(self.t))[some]
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.t) - 1)
+        apart = (self.t[after] + self.held[after] / 2.0) - (self.t[before] + self.held[before] / 2.0)
+        risen = self.gyro[after] - self.gyro[before]
         change: Floats = np.divide(risen, apart, out=np.zeros(len(risen)), where=apart > 0.0)
         return change
+
+
+def rows_around(t_s: Floats, begin_s: float, end_s: float) -> slice:
+    """Return the rows of times (n,) from a begin to an end, and of a little more for delays."""
+    first, stop = np.searchsorted(t_s, [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S], side="right").tolist()
+    return slice(max(first - 1, 0), stop)
 
 
 class Windows(NamedTuple):
@@ -200,7 +217,6 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
         There are fewer than `FEWEST_WINDOWS`.
     """
     drive = recording.drive
-    place = drive.north + 1j * drive.east
     pooled = pooled or totals_of(recording)
     every = min(max(EVERY_M, pooled.metres / MOST_STARTS), LEAST_OFTEN_M)
     begins = rows_at_steps(drive.distance, every)
@@ -215,6 +231,7 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
         why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"
         raise DataError(recording.name, why, "a calibration needs a longer drive")
     start, end = begins[row], ends[row, column]
+    begin_place, end_place = (drive.north[rows] + 1j * drive.east[rows] for rows in (start, end))
     knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
     return Windows(
         joined_steps(recording, samples_a_step(recording, pooled.seconds)),
@@ -224,9 +241,9 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
         start_m=drive.distance[start],
         end_m=drive.distance[end],
         length_m=np.asarray(lengths_m, np.float64)[column],
-        reference=np.exp(-1j * drive.heading[start]) * (place[end] - place[start]),
+        reference=np.exp(-1j * drive.heading[start]) * (end_place - begin_place),
         turned=drive.heading[end] - drive.heading[start],
-        moving=np.add.reduceat(moving_states(drive).astype(np.int64), begins)[row],
+        moving=np.add.reduceat(moving_states(drive), begins, dtype=np.int64)[row],
     )
 
 

@@ -48,12 +48,13 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts:
     starts = np.arange(len(drive.distance))
     if not all_starts:
         moving = np.flatnonzero(moving_states(drive))
-        starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)]
+        starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)].copy()
     return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
 
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
-"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]."""
+"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]: each
+call drives all of it."""
 
 
 def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> Floats:
@@ -94,25 +95,31 @@ def predicted_path(
     Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
     of = steps if steps is not None else joined_steps(recording, 1)
-    gyro = of.gyro + own.gyro_later_s * of.gyro_change() if own.gyro_later_s else of.gyro
-    count = len(of.t)
-    turned, heading = np.empty(count), np.zeros(count + 1)
-    moved, place = np.empty(count, np.complex128), np.zeros(count + 1, np.complex128)
-    # Some at a time: of a long drive, the columns between would take several times what is kept.
-    for lo in range(0, count, ROWS_AT_ONCE):
-        some, sums = slice(lo, lo + ROWS_AT_ONCE), slice(lo, lo + ROWS_AT_ONCE + 1)
-        held = of.held[some]
-        v_x, v_y, omega = fitted.twist(wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro[some]))
-        omega += own.gyro_bias_radps
-        turned[some] = held * omega
-        heading[sums] = np.cumsum(np.append(heading[lo], turned[some]))
-        angle = heading[:-1][some] + of.into[some] * omega
-        cos, sin = np.cos(angle), np.sin(angle)
-        moved.real[some], moved.imag[some] = held * (v_x * cos - v_y * sin), held * (v_x * sin + v_y * cos)
-        place[sums] = np.cumsum(np.append(place[lo], moved[some]))
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
         row, share = of.locate(at + own.wheels_later_s)
-        return heading[row] + share * turned[row] - own.heading_offset_rad, place[row] + share * moved[row]
+        headings, places = np.empty(len(at)), np.empty(len(at), np.complex128)
+        heading, place = np.zeros(1), np.zeros(1, np.complex128)
+        # Some at a time: of a long drive, all of its path would take as much memory as its positions.
+        for lo in range(0, len(of.t), ROWS_AT_ONCE):
+            some = slice(lo, lo + ROWS_AT_ONCE)
+            held, gyro = of.held[some], of.gyro[some]
+            if own.gyro_later_s:
+                gyro = gyro + own.gyro_later_s * of.gyro_change(some)
+            motion = wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro)
+            v_x, v_y, omega = fitted.twist(motion)
+            omega += own.gyro_bias_radps
+            turned = held * omega
+            heading = np.cumsum(np.append(heading[-1], turned))
+            angle = heading[:-1] + of.into[some] * omega
+            cos, sin = np.cos(angle), np.sin(angle)
+            moved = np.empty(len(held), np.complex128)
+            moved.real, moved.imag = held * (v_x * cos - v_y * sin), held * (v_x * sin + v_y * cos)
+            place = np.cumsum(np.append(place[-1], moved))
+            here = np.flatnonzero((row >= lo) & (row < lo + len(held))) if len(of.t) > ROWS_AT_ONCE else slice(None)
+            k, part = row[here] - lo, share[here]
+            headings[here] = heading[k] + part * turned[k] - own.heading_offset_rad
+            places[here] = place[k] + part * moved[k]
+        return headings, places
 
     return at_times

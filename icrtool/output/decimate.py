@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 
 LINE_POINTS = 2400
 """Points of a drawn line: some three per pixel column of every figure."""
@@ -32,12 +33,11 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
     bins = max(points // (2 * len(columns)), 1)
     width = -(-rows // bins)
     begin = np.arange(0, rows, width)
-    chosen = [np.array([0, rows - 1])]
+    chosen, padded = [np.array([0, rows - 1])], np.full(len(begin) * width, np.inf)
     for column in columns:
         missing = np.isnan(column)
         chosen.append(np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]])))
         for sign in (1.0, -1.0):
-            padded = np.full(len(begin) * width, np.inf)
             np.multiply(column, sign, out=padded[:rows])
             padded[:rows][missing] = np.inf
             chosen.append(begin + padded.reshape(-1, width).argmin(axis=1))
@@ -64,5 +64,9 @@ def places(north: Floats, east: Floats, cell_m: float) -> Ints:
     """
     if len(north) == 0:
         return np.empty(0, np.int64)
-    moved = (np.diff(np.floor(north / cell_m)) != 0) | (np.diff(np.floor(east / cell_m)) != 0)
-    return np.unique(np.concatenate([[0], np.flatnonzero(moved) + 1, [len(north) - 1]]))
+    found = [np.array([0, len(north) - 1])]
+    for lo in range(0, len(north), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE + 1)
+        moved = (np.diff(np.floor(north[some] / cell_m)) != 0) | (np.diff(np.floor(east[some] / cell_m)) != 0)
+        found.append(lo + 1 + np.flatnonzero(moved))
+    return np.unique(np.concatenate(found))

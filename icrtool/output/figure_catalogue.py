@@ -10,6 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from icrtool.records.memory import give_back_freed
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -161,6 +163,7 @@ def draw_figures(of: Subject, subject: object, directory: Path, formats: tuple[s
 
     for name, figure in figures_of(of, subject):
         save(figure, directory / name, formats)
+        give_back_freed()
 
 
 def entry_of(file: str) -> tuple[Entry, str] | None:

@@ -24,6 +24,7 @@ from icrtool.output.run_directory import (
     STATES_FILES,
     is_run_directory,
 )
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
@@ -56,8 +57,6 @@ def open_run(path: str | Path) -> Run:
     RunError
         Not a run directory, one of another version, or one that was edited or cut short since it was written.
     """
-    import pyarrow as pa
-
     directory = Path(path)
     document = _read_document(directory)
     sums = _read_sums(directory)
@@ -96,8 +95,7 @@ def open_run(path: str | Path) -> Run:
         raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
     except (OSError, StatesFileError, ValueError, OverflowError) as err:
         raise RunError(directory, f"cannot be read ({err})", FIT_AGAIN) from err
-    # What reading took beyond the columns goes back to the system.
-    pa.default_memory_pool().release_unused()
+    give_back_freed()
     return run
 
 

@@ -43,6 +43,11 @@ class Samples:
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
+def thin(column: Floats) -> Floats:
+    """Return a column that takes no memory where all its values are the same."""
+    return np.broadcast_to(column[:1], column.shape) if len(column) and (column == column[0]).all() else column
+
+
 WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]
 
 

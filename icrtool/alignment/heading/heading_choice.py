@@ -16,7 +16,7 @@ from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading,
 from icrtool.alignment.heading.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
-from icrtool.records.samples import GyroAxes, GyroSamples, HeadingSamples, StreamChoice
+from icrtool.records.samples import GyroAxes, GyroSamples, HeadingSamples, StreamChoice, thin
 from icrtool.records.tables import RobotLog
 
 Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
@@ -180,7 +180,7 @@ def _derived(
         offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
         attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
-        attitude = replace(stated, stamp_ns=stated.stamp_ns - lag, heading_rad=stated.heading_rad - attitude_offset[0])
+        attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
     std = math.degrees(estimate.median_std)
     causal, smoothed = _samples(estimate, turn, epoch)
     gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None

@@ -118,8 +118,7 @@ class Windows(NamedTuple):
 
     def rows(self, kept: Bools) -> Windows:
         """Return the windows marked in `kept` (w,)."""
-        columns: dict[str, Any] = {name: column[kept] for name, column in self._asdict().items()}
-        return self._replace(**columns)
+        return Windows._make(column[kept] for column in self)
 
     def residual_of(self, rows: slice) -> Floats:
         """Return the residual of some windows (k, 3) [m]."""

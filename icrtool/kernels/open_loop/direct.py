@@ -224,13 +224,11 @@ def open_loop_path(
     integrate_path(compiled_drive(drive), float(y_icr_right), float(y_icr_left), float(x_icr), start, local)
     ahead, aside, turned = local
     cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
-    # In place: paths of whole drives are as long as a column of the run.
-    aside_north = aside * sin_psi
-    aside *= cos_psi
-    aside += ahead * sin_psi
-    aside += drive.east[start]
-    ahead *= cos_psi
-    ahead -= aside_north
-    ahead += drive.north[start]
+    for lo in range(0, len(turned), ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        ahead[some], aside[some] = (
+            ahead[some] * cos_psi - aside[some] * sin_psi + drive.north[start],
+            aside[some] * cos_psi + ahead[some] * sin_psi + drive.east[start],
+        )
     turned += drive.heading[start]
     return OpenLoopPath(*local)

@@ -14,6 +14,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.equal_steps import rows_of_cells
 from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, Blocks, quantile
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, Summary
 
@@ -102,15 +103,13 @@ def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
     -------
     None where there are fewer than `MIN_BLOCKS` blocks.
     """
-    trials = np.flatnonzero(tried)
-    if not len(trials):
+    if not (count := int(np.count_nonzero(tried))):
         return None
-    rows: slice | Ints = trials
-    if trials[-1] - trials[0] + 1 == len(trials):
-        rows = slice(int(trials[0]), int(trials[-1]) + 1)  # the usual case, and a slice copies nothing
-    path, count = path_m[rows], len(trials)
-    segment = np.floor((path - path[0]) * (BLOCK_PARTS / block_m))
-    first = np.flatnonzero(np.diff(segment, prepend=-1.0))
+    begin, end = int(np.argmax(tried)), len(tried) - int(np.argmax(tried[::-1]))
+    # the usual case is one stretch, and a slice copies nothing
+    rows = slice(begin, end) if end - begin == count else np.flatnonzero(tried)
+    path = path_m[rows]
+    first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / block_m)))
     if len(first) < MIN_BLOCKS * BLOCK_PARTS:
         return None
     wanted = max(MIN_KEPT_TRIALS, TRIALS_PER_BLOCK * (len(first) // BLOCK_PARTS))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from icrtool.kernels.arrays import Ints
-    from icrtool.logs.writing.records import WriteOptions
+    from icrtool.logs.writing.records import WheelMessages, WriteOptions
     from icrtool.records.sensor_columns import SensorColumns
 
 GRAVITY_MPS2 = 9.81
@@ -90,29 +90,13 @@ def serialise_topics(columns: SensorColumns, options: WriteOptions, store: Types
 
     Messages with equal stamps are written in this order.
     """
-    plans = (*_plan_wheels(columns, options), _plan_position(columns), _plan_heading(columns, options))
+    plans = (*WHEEL_PLANS[options.wheels](columns, options), _plan_position(columns), _plan_heading(columns, options))
     prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
     ros1 = options.container == "bag"
     return tuple(serialise_topic(plan, store, prefix=prefix, ros1=ros1) for plan in plans if len(plan.stamp_ns))
 
 
-def _plan_wheels(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
-    match options.wheels:
-        case "joint_states":
-            return (_plan_joint_states(columns, options),)
-        case "odometry":
-            return (_plan_odometry(columns, options),)
-        case "twist_stamped":
-            return (_plan_twist_stamped(columns, options),)
-        case "jackal_feedback":
-            return (_plan_jackal_feedback(columns, options),)
-        case "ticks":
-            return _plan_ticks(columns, options)
-        case "float64_pair":
-            return _plan_float64_pair(columns)
-
-
-def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     radius = options.wheel_radius_m
     changing = header_stamps(columns.wheel_stamp_ns)
     for joint, name in enumerate(FRONT_AND_REAR_JOINTS):
@@ -122,7 +106,7 @@ def _plan_joint_states(columns: SensorColumns, options: WriteOptions) -> TopicPl
         changing[f"position.{joint}"] = travel / radius
         changing[f"velocity.{joint}"] = speed / radius
     fixed: dict[str, object] = {"name": list(FRONT_AND_REAR_JOINTS), "position": np.zeros(4), "velocity": np.zeros(4)}
-    return TopicPlan("/joint_states", "sensor_msgs/msg/JointState", columns.wheel_stamp_ns, fixed, changing)
+    return (TopicPlan("/joint_states", "sensor_msgs/msg/JointState", columns.wheel_stamp_ns, fixed, changing),)
 
 
 def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where: str) -> dict[str, NDArray[Any]]:
@@ -134,41 +118,40 @@ def _wheel_controller_twist(columns: SensorColumns, options: WriteOptions, where
     }
 
 
-def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+def _plan_odometry(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     changing = _wheel_controller_twist(columns, options, "twist.twist")
     fixed: dict[str, object] = {
         "header.frame_id": "odom",
         "child_frame_id": "base_link",
         "pose.pose.orientation.w": 1.0,
     }
-    return TopicPlan("/wheel_controller/odom", "nav_msgs/msg/Odometry", columns.wheel_stamp_ns, fixed, changing)
+    return (TopicPlan("/wheel_controller/odom", "nav_msgs/msg/Odometry", columns.wheel_stamp_ns, fixed, changing),)
 
 
-def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+def _plan_twist_stamped(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     changing = _wheel_controller_twist(columns, options, "twist")
     topic, message_type = "/wheel_controller/twist", "geometry_msgs/msg/TwistStamped"
-    return TopicPlan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing)
+    return (TopicPlan(topic, message_type, columns.wheel_stamp_ns, {"header.frame_id": "base_link"}, changing),)
 
 
-def _plan_float64_pair(columns: SensorColumns) -> tuple[TopicPlan, ...]:
-    sides = (("/left_drive/velocity", columns.wheel_v_left_mps), ("/right_drive/velocity", columns.wheel_v_right_mps))
-    return tuple(
-        TopicPlan(topic, "std_msgs/msg/Float64", columns.wheel_stamp_ns, {}, {"data": v}) for topic, v in sides
-    )
+def _plan_float64_pair(columns: SensorColumns, _: WriteOptions) -> tuple[TopicPlan, ...]:
+    sides = {"/left_drive/velocity": columns.wheel_v_left_mps, "/right_drive/velocity": columns.wheel_v_right_mps}
+    return _plan_pair("std_msgs/msg/Float64", columns.wheel_stamp_ns, sides)
+
+
+def _plan_pair(message_type: str, stamp_ns: Ints, sides: dict[str, NDArray[Any]]) -> tuple[TopicPlan, ...]:
+    return tuple(TopicPlan(topic, message_type, stamp_ns, {}, {"data": values}) for topic, values in sides.items())
 
 
 def _plan_ticks(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     per_metre = options.counts_per_rev / (2 * np.pi * options.wheel_radius_m)
-    sides = (("/lwheel_ticks", columns.wheel_position_left_m), ("/rwheel_ticks", columns.wheel_position_right_m))
-    plans = []
-    for topic, travel in sides:
-        # An Int32 counter wraps around, as numpy's narrowing cast of an integer does.
-        counts = np.rint(travel * per_metre).astype(np.int64).astype(np.int32)
-        plans.append(TopicPlan(topic, "std_msgs/msg/Int32", columns.wheel_stamp_ns, {}, {"data": counts}))
-    return tuple(plans)
+    sides = {"/lwheel_ticks": columns.wheel_position_left_m, "/rwheel_ticks": columns.wheel_position_right_m}
+    # An Int32 counter wraps around, as numpy's narrowing cast of an integer does.
+    counts = {topic: np.rint(side * per_metre).astype(np.int64).astype(np.int32) for topic, side in sides.items()}
+    return _plan_pair("std_msgs/msg/Int32", columns.wheel_stamp_ns, counts)
 
 
-def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> TopicPlan:
+def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
     changing = header_stamps(columns.wheel_stamp_ns)
     sides = (
         (columns.wheel_position_left_m, columns.wheel_v_left_mps),
@@ -177,7 +160,17 @@ def _plan_jackal_feedback(columns: SensorColumns, options: WriteOptions) -> Topi
     for driver, (travel, speed) in enumerate(sides):
         changing[f"drivers.{driver}.measured_travel"] = (travel / options.wheel_radius_m).astype(np.float32)
         changing[f"drivers.{driver}.measured_velocity"] = (speed / options.wheel_radius_m).astype(np.float32)
-    return TopicPlan("/feedback", "jackal_msgs/msg/Feedback", columns.wheel_stamp_ns, {}, changing)
+    return (TopicPlan("/feedback", "jackal_msgs/msg/Feedback", columns.wheel_stamp_ns, {}, changing),)
+
+
+WHEEL_PLANS: dict[WheelMessages, Callable[[SensorColumns, WriteOptions], tuple[TopicPlan, ...]]] = {
+    "joint_states": _plan_joint_states,
+    "odometry": _plan_odometry,
+    "twist_stamped": _plan_twist_stamped,
+    "jackal_feedback": _plan_jackal_feedback,
+    "ticks": _plan_ticks,
+    "float64_pair": _plan_float64_pair,
+}
 
 
 def _plan_position(columns: SensorColumns) -> TopicPlan:

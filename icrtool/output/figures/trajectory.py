@@ -20,6 +20,7 @@ from icrtool.output.figures.style import (
     LABEL_BOX,
     NO_SLIP,
     WIDTH_IN,
+    Pen,
     add_legend,
     new_figure,
     spot,
@@ -45,6 +46,9 @@ MOST_TIMES = 12
 TIME_CLEARANCE = 0.06
 """At most so many times are written beside the path, none closer to another than this share of the view."""
 
+Corners = tuple[Floats, Floats]
+"""Least and greatest (north, east) [m]."""
+
 _DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
 FIX_LOOKS: dict[int, dict[str, Any]] = {
     REFERENCE: _DOT,
@@ -69,7 +73,7 @@ def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     found = odometry(run)
     table, drive = run.table, run.summary["drive"]
-    lowest, highest = _extent(run, found.icr, found.no_slip)
+    lowest, highest = _extent(_corners(table), _corners(found.icr), _corners(found.no_slip))
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
@@ -83,14 +87,8 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
-    for path, pen, name, order in (
-        (found.icr, ICR, "ICR odometry", 3),
-        (found.no_slip, NO_SLIP, "no-slip odometry", 2),
-    ):
-        if path is not None:
-            label = f"{name}, ends {distance_text(path.end_error_m)} off{_leaves(path, lowest, highest)}"
-            draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
-            axes.plot(path.east_m[-1:], path.north_m[-1:], marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    _draw_odometry(axes, found.icr, cell, ICR, "ICR odometry", 3)
+    _draw_odometry(axes, found.no_slip, cell, NO_SLIP, "no-slip odometry", 2)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
@@ -101,23 +99,32 @@ def trajectory(run: Run) -> Figure:
     return figure
 
 
-def _extent(run: Run, *paths: OdometryPath | None) -> tuple[Floats, Floats]:
-    """Return the least and the greatest (north, east) to show [m]."""
-    lowest, highest = _corners(run.table)
+def _extent(drive: Corners, *paths: Corners) -> Corners:
+    """Return the least and the greatest (north, east) to show [m], of those of the drive and of other paths."""
+    lowest, highest = drive
     detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
-    lows, highs = zip(*(_corners(path) for path in (run.table, *paths) if path is not None), strict=True)
-    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
+    lows, highs = zip(drive, *paths, strict=True)
+    return np.maximum(np.fmin.reduce(lows), lowest - detour), np.minimum(np.fmax.reduce(highs), highest + detour)
 
 
-def _corners(path: States | OdometryPath) -> tuple[Floats, Floats]:
-    """Return the least and the greatest (north, east) of a path [m]."""
-    place = np.array([path.north_m, path.east_m])
-    return place.min(axis=1), place.max(axis=1)
+def _corners(path: States | OdometryPath | None) -> Corners:
+    """Return the least and the greatest (north, east) of a path [m]; NaN without one."""
+    if path is None:
+        return np.full(2, np.nan), np.full(2, np.nan)
+    north, east = path.north_m, path.east_m
+    return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
-def _leaves(path: OdometryPath, lowest: Floats, highest: Floats) -> str:
-    low, high = _corners(path)
-    return " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+def _draw_odometry(axes: Axes, path: OdometryPath | None, cell_m: float, pen: Pen, name: str, order: int) -> None:
+    """Draw a wheels-only path and its end; the label states where it leaves the view."""
+    if path is not None:
+        low, high = _corners(path)
+        lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
+        leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+        label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
+        draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
+        ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
+        axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:

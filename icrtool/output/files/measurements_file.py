@@ -19,7 +19,7 @@ from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
-from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
 from icrtool.records.tables import LARGEST, States
 
 MEASUREMENTS_FILE = "measurements.npz"
@@ -107,9 +107,7 @@ def read_measurements(
             events=tuple(SlipEvent(*(event[name] for name in SlipEvent._fields)) for event in events),
             icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
             heading_is_estimated=facts["heading_is_estimated"],
-            attitude=HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
-            if "attitude_stamp_ns" in columns
-            else None,
+            attitude=_attitude(columns) if "attitude_stamp_ns" in columns else None,
         )
         outcomes = [
             _outcome(columns, group, stamps_ns, table)
@@ -156,6 +154,11 @@ def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[A
     if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST).any():
         raise ValueError(f"{key} holds a number beyond {LARGEST:g}")
     return column
+
+
+def _attitude(columns: dict[str, NDArray[Any]]) -> HeadingSamples:
+    found = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
+    return replace(found, var_rad2=thin(found.var_rad2))
 
 
 def _gyro(columns: dict[str, NDArray[Any]]) -> GyroSamples:

@@ -108,6 +108,7 @@ def read_states(path: Path, states: StatesFormat) -> States:
     """
     import pyarrow as pa
 
+    pa.set_memory_pool(pa.system_memory_pool())  # what it frees is given back with the rest
     types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
     try:
         if states == "parquet":
@@ -186,6 +187,7 @@ def _arrow(columns: dict[str, Floats | Ints]) -> pa.Table:
     """Return columns as an Arrow table that shares their memory; to convert them pyarrow would import pandas."""
     import pyarrow as pa
 
+    pa.set_memory_pool(pa.system_memory_pool())
     arrays = {
         name: pa.Array.from_buffers(
             pa.int64() if name in INTEGER_COLUMNS else pa.float64(),

@@ -109,11 +109,11 @@ def _steps_data(run: Run, steps: Steps, origin: tuple[float, float]) -> dict[str
     held = np.where(drive.gap, 0.0, drive.dt_s)
     held[-1] = 0.0
     columns = {
-        "left": np.concatenate([[0.0], np.cumsum(held * drive.v_left)[:-1]]),
-        "right": np.concatenate([[0.0], np.cumsum(held * drive.v_right)[:-1]]),
-        "distance": drive.distance,
-        "north": drive.north,
-        "east": drive.east,
+        "left": np.append(0.0, np.cumsum(held * drive.v_left)[:-1])[rows],
+        "right": np.append(0.0, np.cumsum(held * drive.v_right)[:-1])[rows],
+        "distance": drive.distance[rows],
+        "north": drive.north[rows],
+        "east": drive.east[rows],
     }
     gaps = np.searchsorted(rows, np.flatnonzero(drive.gap), side="right") - 1
     return {
@@ -122,7 +122,7 @@ def _steps_data(run: Run, steps: Steps, origin: tuple[float, float]) -> dict[str
         "first_east": float(drive.east[0]) - origin[1],
         "gaps": np.unique(gaps).tolist(),
         "without_reference": _spans(drive.in_outage[rows]),
-    } | {name: packed_sums(column[rows]) for name, column in columns.items()}
+    } | {name: packed_sums(column) for name, column in columns.items()}
 
 
 def _series_data(run: Run, steps: Steps) -> dict[str, Any]:

