@@ -176,6 +176,7 @@ def wanted_ranges(places: Ints, size: int, ranges: Ints) -> tuple[int, int]:
 def copy_ranges(source: Bytes, first: int, ranges: Ints, count: int, target: Bytes, at: int) -> None:
     """Copy some ranges to the target, one behind the other from `at` on; `first` is the place of the source's begin."""
     for k in range(count):
-        begin, end = ranges[0, k] - first, ranges[1, k] - first
-        target[at : at + end - begin] = source[begin:end]
-        at += end - begin
+        begin, size = np.uint64(ranges[0, k] - first), np.uint64(ranges[1, k] - ranges[0, k])
+        for i in range(size):  # an assignment of slices takes seconds to compile
+            target[np.uint64(at) + i] = source[begin + i]
+        at += int(size)
