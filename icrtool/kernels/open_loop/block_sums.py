@@ -111,7 +111,8 @@ def block_sums(
     first = blocks.first[-(-np.arange(k) * segments // k)]
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
-    above = [np.add.reduceat(errors > limit, first, dtype=np.int64) for limit in (p50_m, p95_m)]
+    beyond = [np.flatnonzero(errors > limit) for limit in (p50_m, p95_m)]
+    above = [np.diff(np.searchsorted(rows, first), append=len(rows)) for rows in beyond]
     growth = [
         _slope(ordered, share, np.asarray((count - (1.0 - share) * trials) / len(errors)))
         for share, count in zip(SHARES.values(), above, strict=True)

@@ -24,6 +24,8 @@ MIN_BLOCKS = 3
 """With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
+RESAMPLES_AT_ONCE = 50
+"""Bounds memory: a long log has thousands of blocks."""
 MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
 
@@ -152,9 +154,10 @@ def bootstrap_interval(
     per_segment = np.column_stack([np.add.reduceat(errors, blocks.first), blocks.per_segment])
     n_starts = len(per_segment) - BLOCK_PARTS + 1
     sums = np.sum([per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)], axis=0)
-    starts = rng.integers(0, n_starts, size=(resamples, len(per_segment) // BLOCK_PARTS))
-    replicates = np.empty((resamples, 2))
-    resample_blocks(sums, starts, blocks.segments[order], kept[order], replicates)
+    replicates, segments, ordered = np.empty((resamples, 2)), blocks.segments[order], kept[order]
+    for some in np.split(replicates, range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)):
+        starts = rng.integers(0, n_starts, size=(len(some), len(per_segment) // BLOCK_PARTS))
+        resample_blocks(sums, starts, segments, ordered, some)
     low, high = np.quantile(replicates, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
