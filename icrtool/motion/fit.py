@@ -125,8 +125,9 @@ class PooledFit(FittedModel):
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
             others = pool.without(i)
             found = others.fit(self.model, self.wheels and others.fit(self.wheels.model))
-            covariance = self._covariance(self.curvature, found.curvature)
-            fitted = replace(found.fitted, covariance=covariance)
+            # of a single recording its constants are parameters, too
+            marginal = np.linalg.inv(np.linalg.inv(found.curvature)[:k, :k])
+            fitted = replace(found.fitted, covariance=self._covariance(self.curvature, marginal))
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
