@@ -23,8 +23,9 @@ from icrtool.estimation.fit import fit
 from icrtool.fleet.recordings import find_recordings
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
+from icrtool.motion.fit import Pool
 from icrtool.motion.models import MODELS
-from icrtool.motion.recording import Recording
+from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import cut_trials
 from icrtool.output.run_directory import RUN_FILE, is_run_directory
 from icrtool.output.stored_run import open_run
@@ -79,6 +80,9 @@ def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
         yield "\nShare of trials within the 95 % forecast of the calibration by the other logs:"
         for words, share in forecast_shares(recordings).items():
             yield f"{words} " + ", ".join(f"{one:.2f} after {h:g} m" for h, one in zip(HORIZONS_M, share, strict=True))
+        shares = [parameter_share(recordings, gyro=gyro) for gyro in (False, True)]
+        yield "\nShare of parameters of one log within the combined 2 sigma of those by the other logs:"
+        yield f"wheels: {shares[0]:.2f}, with gyro: {shares[1]:.2f}"
 
 
 def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
@@ -93,6 +97,21 @@ def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
             share = np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0)
             inside.setdefault("with gyro:" if with_gyro else "wheels:", []).append(share)
     return {words: np.mean(shares, axis=0) for words, shares in inside.items()}
+
+
+def parameter_share(recordings: list[Recording], *, gyro: bool) -> float:
+    """Return how many parameters of all models, fitted to one log, are within 2 sigma of a fit to the others."""
+    off: list[Floats] = []
+    windows, widths = [cut_windows(one) for one in recordings], [one.width_m for one in recordings]
+    for i in range(len(recordings)):
+        one, others = Pool([windows[i]], [widths[i]]), Pool(windows, widths).without(i)
+        for model in (model for model in MODELS.values() if model.terms):
+            pair = [pool.fit(model) for pool in (one, others)]
+            if gyro:
+                pair = [pool.fit(model.with_gyro(), fit) for pool, fit in zip((one, others), pair, strict=True)]
+            robot = [term != "wheels_weight" for term in pair[0].model.terms]
+            off.append(((pair[0].parameters - pair[1].parameters) / np.hypot(pair[0].std, pair[1].std))[robot])
+    return float(np.mean(np.abs(np.concatenate(off)) < 2.0))
 
 
 def cells(table: HeldOut | None, name: str) -> list[str]:

@@ -7,7 +7,7 @@ distance of one log), not from single ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -283,29 +283,30 @@ def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: fl
     return np.asarray(fit.covariance * np.outer(size, size), np.float64)
 
 
-def student_covariance(fit: RobustFit, group: Ints, overlap: float = 1.0) -> Floats:
+def student_covariance(fit: RobustFit, levels: Sequence[Ints], overlap: float = 1.0) -> Floats:
     """Return the covariance (k, k) of a robust fit, so that two standard deviations hold 95.4 % with few groups, too.
 
     Parameters
     ----------
-    group : (m,) independent groups of residuals
+    levels : (m,) independent groups of residuals; then larger groups of those groups, each level with two or more
 
     Notes
     -----
-    The spread between groups, and that of residuals which are independent but for their overlap, an expectation that
-    counts as one group. Their variance is estimated too: Student's t (1908), expanded about the normal quantile 2
-    (Abramowitz and Stegun 1964, 26.7.5).
+    The variance of the gradient is that of residuals which are independent but for their overlap, then, level by level,
+    the spread between groups, with the variance that the level below expects counted as one group more. The spread is
+    an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964, 26.7.5).
     """
     weights = robust_weights(fit.residuals, fit.scale, overlap)
-    gradients, expected = (
-        _gradients(fit.residuals, fit.jacobian, weights, group),
-        (fit.jacobian.T * weights) @ fit.jacobian,
-    )
-    count = len(gradients)
-    spread = (gradients.T @ gradients * (count**2 / max(count - 1, 1)) + expected) / (count + 1)
-    student = 1.0 + 1.25 / count + 1.53 / count**2
+    expected = (fit.jacobian.T * weights) @ fit.jacobian
+    variance = expected
+    for group in levels:
+        gradients = _gradients(fit.residuals, fit.jacobian, weights, group)
+        count = len(gradients)
+        spread = gradients.T @ gradients * (count**2 / max(count - 1, 1))
+        student = 1.0 + 1.25 / count + 1.53 / count**2
+        variance = (spread + variance) / (count + 1) * student**2
     inverse = np.linalg.solve(fit.information, np.eye(len(expected)))
-    return np.asarray(inverse @ (spread * student**2 + fit.information - expected) @ inverse, np.float64)
+    return np.asarray(inverse @ (variance + fit.information - expected) @ inverse, np.float64)
 
 
 def long_run_factor(series: Floats) -> Floats:

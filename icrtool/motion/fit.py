@@ -11,7 +11,7 @@ Of several recordings they are eliminated from the normal equations of each (`ic
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -124,13 +124,16 @@ class PooledFit(FittedModel):
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
             others = pool.without(i)
-            fitted = others.fit(self.model, self.wheels and others.fit(self.wheels.model)).fitted
+            found = others.fit(self.model, self.wheels and others.fit(self.wheels.model))
+            # of a single recording its constants are parameters, too
+            marginal = np.linalg.inv(np.linalg.inv(found.curvature)[:k, :k])
+            fitted = replace(found.fitted, covariance=self._covariance(self.curvature, marginal))
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
-            covariance = self._covariance(self._curvature, self._curvature - curvature)
+            covariance = self._covariance(self.curvature, self.curvature - curvature)
             fitted = FittedModel(self.model, self.parameters + self._steps(gradient, curvature), covariance, wheels)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         x, covariance = self._reweighted(clear)
@@ -191,7 +194,7 @@ class PooledFit(FittedModel):
         A Newton step of the loss. At the minimum the gradients of all residuals and of the prior sum to zero, so what
         is left without some is minus theirs.
         """
-        return np.asarray(np.linalg.solve(self._curvature - curvature, gradient[..., None])[..., 0], np.float64)
+        return np.asarray(np.linalg.solve(self.curvature - curvature, gradient[..., None])[..., 0], np.float64)
 
     @cached_property
     def _by_recording(self) -> tuple[Floats, Floats]:
@@ -202,7 +205,7 @@ class PooledFit(FittedModel):
         return gradients + at.own_pull, curvatures + at.own_prior
 
     @cached_property
-    def _curvature(self) -> Floats:
+    def curvature(self) -> Floats:
         """Second derivatives of the loss and the prior together (k, k)."""
         prior = self.pool.prior(self.model)[1][: len(self.solution.information)] ** -2.0
         return np.asarray(self._by_recording[1].sum(axis=0) + np.diag(prior), np.float64)
@@ -365,7 +368,8 @@ class Pool:
             evaluate, mean, mean, std, group=self.group, parts=Parts(self.first, own if count > 1 else 0),
             overlap=self.overlap, settled=SETTLED,
         )  # fmt: skip
-        found = found._replace(covariance=student_covariance(found, self.group, self.overlap))
+        levels = [self.group, *([self.recording] if count > 1 else [])]
+        found = found._replace(covariance=student_covariance(found, levels, self.overlap))
         return PooledFit(
             model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found
         )  # fmt: skip

@@ -211,5 +211,5 @@ def test_two_standard_deviations_of_few_groups_hold(count: int, together: float)
         found = robust_least_squares(
             lambda x, values=values, ones=ones: (x - values, ones), zero, zero, np.array([1e3]), group=groups
         )
-        inside += abs(found.x[0]) < 2.0 * np.sqrt(student_covariance(found, groups)[0, 0])
+        inside += abs(found.x[0]) < 2.0 * np.sqrt(student_covariance(found, [groups])[0, 0])
     assert 0.90 < inside / draws < 0.985
