@@ -49,9 +49,8 @@ def messages(options: WriteOptions, container: str) -> tuple[TopicMessages, ...]
     """The messages of a short drive with hostile names in all texts; a string topic, and a second receiver."""
     columns, ros1 = drive(20.0), container == "bag"
     store = load_typestore(ros1=ros1)
-    wheels, position, heading = (
-        _plan_joint_states(columns, options), _plan_position(columns), _plan_heading(columns, options)
-    )  # fmt: skip
+    (wheels,) = _plan_joint_states(columns, options)
+    position, heading = _plan_position(columns), _plan_heading(columns, options)
     joints = [f"{name}{HOSTILE}" for name in wheels.fixed["name"]]
     joints[0] += LONG
     frames = {"header.frame_id": f"base_link{HOSTILE}"}
