@@ -37,6 +37,9 @@ LONGEST_DETAILS = 4000
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg"}
 """One thread a log: the logs are what runs at the same time."""
 
+NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
+"""Dask sets it for its workers: memory then goes back to the system again and again, which doubles system time."""
+
 
 COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.worker")
 
@@ -115,11 +118,12 @@ class Worker:
         errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         home = str(Path(__file__).resolve().parents[2])
         paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
+        inherited = {name: value for name, value in os.environ.items() if name != NOT_INHERITED}
         # In a session of its own: Ctrl-C reaches the command, which ends its workers.
         process = subprocess.Popen(  # noqa: S603 - our own command
             COMMAND,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
-            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
+            env={**inherited, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
         )  # fmt: skip
         self._process, self._errors, self._lines = process, errors, queue.SimpleQueue()
         threading.Thread(target=_forward, args=(process.stdout, self._lines), daemon=True).start()
