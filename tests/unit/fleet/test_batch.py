@@ -107,6 +107,7 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
         rows = list(run_batch(requests, executor, BatchOptions(timeout_s=4.0)))
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
+    assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
     assert any("longer than 4 s" in row.reason for row in rows)
 
 
