@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 ICRTOOL = (sys.executable, "-P", "-m", "icrtool")
@@ -42,9 +43,10 @@ def run(logs: Path, output: Path, *options: str, fresh: bool = True) -> dict[str
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begun = time.monotonic()
     process, most_mb = subprocess.Popen([*ICRTOOL, "batch", logs, "-o", output, "-q", *ROBOT, *options]), 0.0
-    while process.poll() is None:
+    while process.returncode is None:
         most_mb = max(most_mb, memory_mb(process.pid))
-        time.sleep(0.1)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=0.1)
     wall = time.monotonic() - begun
     if process.returncode:
         raise SystemExit(f"batch ended with {process.returncode}")

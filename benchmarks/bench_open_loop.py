@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
@@ -21,7 +22,6 @@ from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)
-ROWS_AT_ONCE = 65_536
 NO_SLIP = FrozenIcrs.constant(0.305, -0.305, 0.0)
 
 

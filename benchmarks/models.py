@@ -80,9 +80,8 @@ def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
         yield "\nShare of trials within the 95 % forecast of the calibration by the other logs:"
         for words, share in forecast_shares(recordings).items():
             yield f"{words} " + ", ".join(f"{one:.2f} after {h:g} m" for h, one in zip(HORIZONS_M, share, strict=True))
-        shares = [parameter_share(recordings, gyro=gyro) for gyro in (False, True)]
         yield "\nShare of parameters of one log within the combined 2 sigma of those by the other logs:"
-        yield f"wheels: {shares[0]:.2f}, with gyro: {shares[1]:.2f}"
+        yield "wheels: {:.2f}, with gyro: {:.2f}".format(*parameter_shares(recordings))
 
 
 def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
@@ -99,19 +98,19 @@ def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
     return {words: np.mean(shares, axis=0) for words, shares in inside.items()}
 
 
-def parameter_share(recordings: list[Recording], *, gyro: bool) -> float:
-    """Return how many parameters of all models, fitted to one log, are within 2 sigma of a fit to the others."""
-    off: list[Floats] = []
-    windows, widths = [cut_windows(one) for one in recordings], [one.width_m for one in recordings]
-    for i in range(len(recordings)):
-        one, others = Pool([windows[i]], [widths[i]]), Pool(windows, widths).without(i)
+def parameter_shares(recordings: list[Recording]) -> list[float]:
+    """Return how many parameters of one log are within 2 sigma of those by the others: by wheels, and with the gyro."""
+    pool = Pool([cut_windows(one) for one in recordings], [one.width_m for one in recordings])
+    off: tuple[list[Floats], list[Floats]] = [], []
+    for i, recording in enumerate(recordings):
+        pools = Pool([pool.windows[i]], [recording.width_m]), pool.without(i)
         for model in (model for model in MODELS.values() if model.terms):
-            pair = [pool.fit(model) for pool in (one, others)]
-            if gyro:
-                pair = [pool.fit(model.with_gyro(), fit) for pool, fit in zip((one, others), pair, strict=True)]
-            robot = [term != "wheels_weight" for term in pair[0].model.terms]
-            off.append(((pair[0].parameters - pair[1].parameters) / np.hypot(pair[0].std, pair[1].std))[robot])
-    return float(np.mean(np.abs(np.concatenate(off)) < 2.0))
+            wheels = [one.fit(model) for one in pools]
+            gyro = [one.fit(model.with_gyro(), of_wheels) for one, of_wheels in zip(pools, wheels, strict=True)]
+            for found, (alone, others) in zip(off, (wheels, gyro), strict=True):
+                robot = [term != "wheels_weight" for term in alone.model.terms]
+                found.append(((alone.parameters - others.parameters) / np.hypot(alone.std, others.std))[robot])
+    return [float(np.mean(np.abs(np.concatenate(found)) < 2.0)) for found in off]
 
 
 def cells(table: HeldOut | None, name: str) -> list[str]:

@@ -24,7 +24,7 @@ from icrtool.calibration.pooled import (
 )
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.error_statistics import error_summary
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Summary

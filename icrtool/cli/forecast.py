@@ -12,6 +12,8 @@ from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
+LARGEST_PLAN_BYTES = 50_000_000
+
 if TYPE_CHECKING:
     from icrtool.calibration.forecast import Forecast
     from icrtool.calibration.record import Calibration
@@ -79,6 +81,6 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
     else:
         from icrtool.output.files.csv_file import read_numbers
 
-        plan = read_numbers(path, ("east_m", "north_m"), ("speed_mps",))
+        plan = read_numbers(path, ("east_m", "north_m"), ("speed_mps",), most_bytes=LARGEST_PLAN_BYTES)
         forecast = partial(forecast_plan, calibration, plan["east_m"], plan["north_m"], plan.get("speed_mps"))
     return forecast(), forecast(with_gyro=True) if with_gyro else None

@@ -46,11 +46,15 @@ class _NewFile(click.Path):
         self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
     ) -> Path:  # fmt: skip
         """Return the path."""
-        from icrtool.output.files.atomic_file import check_place
-        from icrtool.output.files.picture_file import check_picture
-
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]  # as path_type asks
-        (check_picture if self._picture else check_place)(path)
+        if self._picture:
+            from icrtool.output.files.picture_file import check_picture
+
+            check_picture(path)
+        else:
+            from icrtool.output.files.atomic_file import check_place
+
+            check_place(path)
         return path
 
 

@@ -12,11 +12,10 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.block_sums import BlockSums, variance_of_sum
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
+from icrtool.records.text import listed
 
 LEVEL = 0.95
 """The interval of a difference holds the true one with this probability."""
-
-KEYS_SHOWN = 5
 
 
 class BaselineRow(NamedTuple):
@@ -66,8 +65,7 @@ class BaselineReport:
             found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
         keys = sorted(_different_keys(self.config, run_summary["config"]))
         if keys:
-            more = f" and {len(keys) - KEYS_SHOWN} more" if len(keys) > KEYS_SHOWN else ""
-            found.append(f"another configuration than in the baseline: {', '.join(keys[:KEYS_SHOWN])}{more}")
+            found.append(f"another configuration than in the baseline: {listed(keys)}")
         if self.tool_version != __version__:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)

@@ -57,8 +57,12 @@ def heading_range(drive: Drive, horizon_m: float) -> Floats:
     size = horizon_m / CELLS
     # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
     distance = drive.distance
-    first = rows_of_cells(distance, lambda part: np.floor((part - distance[0]) / size))
-    steps = np.diff(np.floor((distance[first] - distance[0]) / size), prepend=0.0)
+
+    def cells_of(part: Floats) -> Floats:
+        return np.asarray(np.floor((part - distance[0]) / size))
+
+    first = rows_of_cells(distance, cells_of)
+    steps = np.diff(cells_of(distance[first]), prepend=0.0)
     cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
     cells = np.arange(cell[-1] + CELLS + 1)
     # In a cell without a state the heading lies between those around it.

@@ -50,7 +50,7 @@ MOST_BULKS = 10.0
 SHORTEST_HORIZON_M = 1e-3
 """Less than what a state is known to."""
 
-ROWS_AT_ONCE = 1 << 14
+STARTS_AT_ONCE = 1 << 14
 """Starts tried by a thread at a time."""
 
 THREADS = 2
@@ -267,13 +267,13 @@ def _ends(drive: Drive, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     ends = np.empty((len(horizons), states), np.int32)
 
     def fill(lo: int) -> TrialCounts:
-        hi = min(lo + ROWS_AT_ONCE, states)
+        hi = min(lo + STARTS_AT_ONCE, states)
         found = trial_ends(drive, horizons, lo, hi)
         leave_out_standing(found, left_out[lo:hi])
         ends[:, lo:hi] = found.T
         return count_trials(found)
 
-    counts = pool.map(fill, range(0, states, ROWS_AT_ONCE))
+    counts = pool.map(fill, range(0, states, STARTS_AT_ONCE))
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
 
 
@@ -308,7 +308,7 @@ def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32],
     states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
-        hi = min(lo + ROWS_AT_ONCE, states)
+        hi = min(lo + STARTS_AT_ONCE, states)
         tried = ends[:, lo:hi].T.astype(np.int64)
         if isinstance(model, ConstantModel):
             found = model.errors_of(Trials(np.arange(lo, hi), tried))
@@ -316,7 +316,7 @@ def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32],
             found = open_loop_errors(drive, model.icrs, tried, lo)
         errors[:, lo:hi] = found.T
 
-    list(pool.map(fill, range(0, states, ROWS_AT_ONCE)))
+    list(pool.map(fill, range(0, states, STARTS_AT_ONCE)))
     return errors.T
 
 

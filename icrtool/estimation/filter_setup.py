@@ -297,6 +297,12 @@ def configured_noise(config: Config) -> ProcessNoise:
     )
 
 
+def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float, float, float, float, float]:
+    """Return the diagonal of Q (Eq. 30), in the units of `FilterParameters`."""
+    position, icr = noise.position_mps**2, config.filter.process_icr_mps**2
+    return position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr
+
+
 def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
     """Return 2 tau / interval, at least 1: the number of samples with as much information as one independent sample.
 
@@ -332,9 +338,8 @@ def _parameters(
 ) -> FilterParameters:
     settings = config.filter
     paper = settings.preset == "paper"
-    position, icr = noise.position_mps**2, settings.process_icr_mps**2
     return FilterParameters(
-        process_variance=(position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr),
+        process_variance=process_variance(config, noise),
         rate_invariant=not paper,
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),

@@ -31,7 +31,7 @@ class OdometryPath:
 
 @dataclass(frozen=True, slots=True)
 class WheelPaths:
-    """Both paths of a run, each driven when it is asked for: of a long log one takes as much memory as its positions.
+    """Both paths of a run, each driven at every call: of a long log one takes as much memory as its positions.
 
     Attributes
     ----------
@@ -44,16 +44,14 @@ class WheelPaths:
     in_gap: Bools
     track_width_m: float | None
 
-    @property
-    def icr(self) -> OdometryPath:
-        """The path with the final ICRs."""
+    def drive_icr(self) -> OdometryPath:
+        """Return the path with the final ICRs."""
         table = self.table
         icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
         return _path(table, self.in_gap, *icrs)
 
-    @property
-    def no_slip(self) -> OdometryPath | None:
-        """The path of the no-slip model (Eqs. 38-39), None where the track width is not known."""
+    def drive_no_slip(self) -> OdometryPath | None:
+        """Return the path of the no-slip model (Eqs. 38-39), None where the track width is not known."""
         b = self.track_width_m
         return _path(self.table, self.in_gap, b / 2, -b / 2, 0.0) if b is not None else None
 

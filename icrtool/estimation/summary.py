@@ -206,7 +206,8 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
 
 def _end_errors(found: WheelPaths) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
-    ends = {"icr": found.icr.end_error_m, "no_slip": path.end_error_m if (path := found.no_slip) is not None else None}
+    no_slip_m = path.end_error_m if (path := found.drive_no_slip()) is not None else None
+    ends = {"icr": found.drive_icr().end_error_m, "no_slip": no_slip_m}
     return {name: {"end_error_m": end} if end is not None else None for name, end in ends.items()}
 
 

@@ -187,7 +187,10 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
                 "baseline": baseline, "strict": report.strict}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
-    row = Row(one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot, group=known.group, tags=known.tags, key=key)
+    row = Row(
+        one.log, f"{RUNS}/{one.name}", "failed", usable=False, robot=known.robot, group=known.group, tags=known.tags,
+        key=key,
+    )  # fmt: skip
     place = blake2b(os.fsencode(one.name), digest_size=16).hexdigest()
     # Workers of a cluster may have another working directory.
     folder = output.absolute()

@@ -223,16 +223,15 @@ def sandwich_covariance(
     weights = robust_weights(residuals, scale, overlap)
     information = normal_equations(residuals, jacobian, weights)[0] + prior
     gradients = _gradients(residuals, jacobian, weights, group)
-    count = len(gradients)
-    meat = gradients.T @ gradients * (count / max(count - 1, 1))
+    expected = None
     if group_std is not None:
         order, first = _grouped(group)
         of_groups = [
             normal_equations(residuals[one], jacobian[one], weights[one])[0] * group_std
             for one in np.split(order, first[1:])
         ]
-        meat = (count * meat + sum(one @ one.T for one in of_groups)) / (count + 1)
-    meat = meat + prior
+        expected = np.sum([one @ one.T for one in of_groups], axis=0)
+    meat = _spread(gradients, expected) + prior
     inverse = np.linalg.solve(information, np.eye(len(prior)))
     sandwich = inverse @ meat @ inverse
     if not (np.diag(sandwich) > 0.0).all():
@@ -242,7 +241,14 @@ def sandwich_covariance(
     with np.errstate(over="ignore", invalid="ignore"):
         grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
         covariance: Floats = sandwich * np.outer(grown, grown)
-    return (covariance + covariance.T) / 2.0, information, count
+    return (covariance + covariance.T) / 2.0, information, len(gradients)
+
+
+def _spread(gradients: Floats, expected: Floats | None) -> Floats:
+    """Return the variance (k, k) of the sum of independent gradients (g, k); an expected one counts as one more."""
+    count = len(gradients)
+    shown: Floats = gradients.T @ gradients * (count / max(count - 1, 1))
+    return shown if expected is None else (count * shown + expected) / (count + 1)
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:
@@ -297,14 +303,13 @@ def student_covariance(fit: RobustFit, levels: Sequence[Ints], overlap: float = 
     an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964, 26.7.5).
     """
     weights = robust_weights(fit.residuals, fit.scale, overlap)
-    expected = (fit.jacobian.T * weights) @ fit.jacobian
+    expected = normal_equations(fit.residuals, fit.jacobian, weights)[0]
     variance = expected
     for group in levels:
         gradients = _gradients(fit.residuals, fit.jacobian, weights, group)
         count = len(gradients)
-        spread = gradients.T @ gradients * (count**2 / max(count - 1, 1))
         student = 1.0 + 1.25 / count + 1.53 / count**2
-        variance = (spread + variance) / (count + 1) * student**2
+        variance = _spread(gradients, variance) * student**2
     inverse = np.linalg.solve(fit.information, np.eye(len(expected)))
     return np.asarray(inverse @ (variance + fit.information - expected) @ inverse, np.float64)
 

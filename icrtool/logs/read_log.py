@@ -275,10 +275,7 @@ def _collect(
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
-            left = block.channel
-            while len(left):
-                number = int(left[0])
-                left = left[left != number]
+            for number in np.unique(block.channel).tolist():
                 if number not in wanted:
                     continue
                 try:

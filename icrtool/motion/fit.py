@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.elimination import Parts, normal_equations
@@ -89,6 +90,7 @@ class PooledFit(FittedModel):
     wheels: PooledFit | None = None
     pool: Pool
     solution: RobustFit
+    _refits: dict[int, PooledFit] = field(default_factory=dict, repr=False, compare=False)
     _left_out: dict[Fold, Prediction | None] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -123,21 +125,27 @@ class PooledFit(FittedModel):
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
-            others = pool.without(i)
-            found = others.fit(self.model, self.wheels and others.fit(self.wheels.model))
+            found = self.refit_without(i)
             # of a single recording its constants are parameters, too
-            marginal = np.linalg.inv(np.linalg.inv(found.curvature)[:k, :k])
-            fitted = replace(found.fitted, covariance=self._covariance(self.curvature, marginal))
+            inverse = np.linalg.inv(found.curvature)[:k, :k]
+            fitted = replace(found.fitted, covariance=self._covariance(self.curvature, inverse))
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
-            covariance = self._covariance(self.curvature, self.curvature - curvature)
+            covariance = self._covariance(self.curvature, np.linalg.inv(self.curvature - curvature))
             fitted = FittedModel(self.model, self.parameters + self._steps(gradient, curvature), covariance, wheels)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         x, covariance = self._reweighted(clear)
         return FittedModel(self.model, x[:k], covariance[:k, :k], wheels), self._constants(x, i)
+
+    def refit_without(self, recording: int) -> PooledFit:
+        """Return a fit of the model to the other recordings."""
+        if recording not in self._refits:
+            wheels = None if self.wheels is None else self.wheels.refit_without(recording)
+            self._refits[recording] = self.pool.without(recording).fit(self.model, wheels)
+        return self._refits[recording]
 
     def _reweighted(self, clear: Bools) -> tuple[Floats, Floats]:
         """Return all parameters of a single recording as fitted to some residuals (m,), and their covariance.
@@ -156,17 +164,17 @@ class PooledFit(FittedModel):
             information, gradient = normal_equations(left, jacobian, weights)
             information += np.diag(pull)
             x = x - np.linalg.solve(information, gradient + pull * (x - mean))
-        return x, self._covariance(at.information, information)
+        return x, self._covariance(at.information, np.linalg.inv(information))
 
-    def _covariance(self, whole: Floats, left: Floats) -> Floats:
-        """Return the covariance without a fold, from information matrices with it and without it.
+    def _covariance(self, whole: Floats, inverse: NDArray[Any]) -> Floats:
+        """Return the covariance without a fold, from the information with it, and the inverse of that without it.
 
         Notes
         -----
         A parameter's variance exceeds that of independent residuals by as much as with the fold.
         """
         grown = np.sqrt(np.diag(self.solution.covariance) / np.diag(np.linalg.inv(whole)))
-        return np.asarray(np.linalg.inv(left) * np.outer(grown, grown), np.float64)
+        return np.asarray(inverse * np.outer(grown, grown), np.float64)
 
     def residuals_without(self, fold: Fold, others: Sequence[Fold]) -> Floats:
         """Return the residuals (f, m) of a fold's recording, as fitted without the fold and without each of others.

@@ -150,7 +150,7 @@ class Steps(NamedTuple):
 
     def gyro_change(self, some: slice = slice(None)) -> Floats:
         """Return the change of the gyro's turn rate by time (n,) [rad/s^2], of some steps; 0 where it has none."""
-        rows = np.arange(len(self.t))[some]
+        rows = np.arange(*some.indices(len(self.t)))
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.t) - 1)
         apart = (self.t[after] + self.held[after] / 2.0) - (self.t[before] + self.held[before] / 2.0)
         risen = self.gyro[after] - self.gyro[before]

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ROWS_AT_ONCE, ends_from, fill_path_errors
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
+from icrtool.kernels.open_loop.direct import ends_from, fill_path_errors
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,

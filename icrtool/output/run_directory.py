@@ -61,8 +61,8 @@ def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = 
 def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
     files = [file for file in files_of_log(log) if file.is_file()]
-    inputs = _inputs_of(directory)
-    if any(os.path.realpath(file) in made_from(directory) for file in files):
+    inputs, sources = _inputs_of(directory), made_from(directory)
+    if any(os.path.realpath(file) in sources for file in files):
         return True
     return bool(inputs) and all(
         any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
+from icrtool.estimation.filter_setup import configured_noise, process_variance, set_up_filter
 from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.ekf import run_ekf
@@ -140,7 +140,8 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
     simulate = _simulate if scenario.model_icr_std_m is None else _simulate_model
     readings, truth, motion = simulate(scenario, np.random.default_rng((seed, run)))
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
-    setup = _set_up(readings, scenario, changes)
+    sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
+    setup = set_up_filter(sensors, scenario.config, changes_s=changes)
     parameters = setup.parameters
     if scenario.guard != GUARDED:
         parameters = parameters._replace(guard=scenario.guard, step_heading=0.0)
@@ -162,11 +163,6 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
     )
 
 
-def _set_up(readings: Readings, scenario: Scenario, changes_s: tuple[float, ...] = ()) -> FilterSetup:
-    sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
-    return set_up_filter(sensors, scenario.config, changes_s=changes_s)
-
-
 def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, Truth]:
     """Return the measurements of a drive, its true states at the wheel stamps (n, 6), and its motion."""
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
@@ -183,12 +179,11 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     plan, sensors = scenario.plan, scenario.sensors
     t = sample_times(sensors.wheel_rate_hz, plan.duration_s)
     speeds = track_speeds(*plan_body(cast(PathPlan, plan.path), t, plan.icrs_m), plan.icrs_m)
-    blank = _readings(np.zeros((len(t), 6)), t, speeds, sensors, np.random.default_rng(0))
-    parameters = _set_up(blank, scenario).parameters
     icrs = np.array(plan.icrs_m) + rng.normal(0.0, scenario.model_icr_std_m or 0.0, 3)
     x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
-    std, noise = np.sqrt(np.array(parameters.process_variance)), rng.normal(0.0, 1.0, (len(t), 6))
-    states = model_states(x0, t, *speeds, std, parameters.rate_invariant, noise)
+    variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
+    noise, rate_invariant = rng.normal(0.0, 1.0, (len(t), 6)), scenario.config.filter.preset != "paper"
+    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant, noise)
     return _readings(states, t, speeds, sensors, rng), states, None
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.kinematics import euler_step
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
 
@@ -22,9 +23,6 @@ GAP = -2
 """No trial: the trial spans a gap in the wheel data."""
 OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
-ROWS_AT_ONCE = 1 << 16
-"""States whose trials are cut or driven, or which a path is made of, at a time: bounds memory."""
-
 STANDING = -4
 """No trial: the robot stands at the start, and another start counts for this standstill."""
 

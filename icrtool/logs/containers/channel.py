@@ -152,7 +152,7 @@ class Problems(list[str]):
 
 
 def with_possible_times(block: Block, problems: Problems) -> Block:
-    """Return a block without the messages whose log time is negative or beyond `LAST_TIME_NS`."""
+    """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
     # Negative ones are above all others as unsigned numbers.
     possible = block.log_time_ns.view(np.uint64) < LATEST_NS
     if possible.all():

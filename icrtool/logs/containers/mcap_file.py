@@ -100,7 +100,7 @@ class McapFile(ChunkedFile):
         """Add a chunk's wanted records, by its index, to the joined ones; return how many bytes they have.
 
         They are not added where most of the chunk is wanted, or the index cannot be right. What is compressed is read
-        up to the last of them, of other chunks nothing else is read.
+        up to the last of them, what is not from the first to the last.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import decode_messages
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
-from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, merge_tables, time_order
+from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, merge_tables, time_order
 from icrtool.records.text import LogText
 
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
@@ -33,7 +33,6 @@ MOST_LAYOUTS = 16
 _LISTS = "interface_values"
 _JOINTS = "number of joints"
 _NAMES = "joint_names[*]"
-_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 
 
 class DynamicJointCollector:
@@ -84,7 +83,7 @@ class DynamicJointCollector:
         if joints not in self._collectors:
             lists = [f"joint {j}.{what}[*]" for j in range(joints) for what in ("interface_names", "values")]
             self._collectors[joints] = TopicCollector(
-                self._channel, (*_HEADER, _NAMES, *lists), self._unrolled(joints), MOST_INTERFACES
+                self._channel, (*HEADER, _NAMES, *lists), self._unrolled(joints), MOST_INTERFACES
             )
         return self._collectors[joints]
 
@@ -125,8 +124,8 @@ def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
 
 def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:
     """Return the table with the columns of a JointState; NaN where a joint has no such interface."""
-    columns = {path: values for path, values in table.columns.items() if path in _HEADER}
-    texts = {path: texts for path, texts in table.texts.items() if path in _HEADER}
+    columns = {path: values for path, values in table.columns.items() if path in HEADER}
+    texts = {path: texts for path, texts in table.texts.items() if path in HEADER}
     if not len(table):
         return table
     names, texts["name[*]"] = table.words(_NAMES)

@@ -49,6 +49,9 @@ class SetBack(NamedTuple):
 
 NOT_SET_BACK = SetBack(0, 0.0)
 
+HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+"""Fields of a message's header."""
+
 NEAR_NS = 2_000_000_000
 """Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
 
@@ -164,8 +167,7 @@ class TopicCollector:
         self._new_rows(layout, min(_FIRST_ROWS, _FIRST_NUMBERS // max(layout.columns, 1)))
 
     def _new_rows(self, layout: Layout, rows: int) -> None:
-        most = min(_ROWS_AT_ONCE, _LARGEST_TABLE // max(layout.columns, 1))
-        self._rows, self._learned = Decoded(layout, max(min(rows, most), 1)), 0
+        self._rows, self._learned = Decoded(layout, max(min(rows, _most_rows(layout)), 1)), 0
 
     @property
     def layout(self) -> Layout:
@@ -184,7 +186,7 @@ class TopicCollector:
         while first < len(block.channel):
             if self._rows.filled == self._rows.rows:
                 self._settle()
-                if self._rows.rows < _ROWS_AT_ONCE:
+                if self._rows.rows < _most_rows(self.layout):
                     self._new_rows(self.layout, 8 * self._rows.rows)
             more = self._capacity < self.largest_capacity
             first = self._rows.decode(block, number, first, self._capacity if more else ANY_LENGTH)
@@ -265,6 +267,10 @@ class TopicCollector:
             unreadable,
             back,
         )
+
+
+def _most_rows(layout: Layout) -> int:
+    return min(_ROWS_AT_ONCE, _LARGEST_TABLE // max(layout.columns, 1))
 
 
 def time_order(times: Ints) -> tuple[SetBack, Ints | None]:

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.heading_sources import frame_convention
-from icrtool.logs.streams.source import HEADER
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
 from icrtool.records.samples import GyroAxes, GyroSamples
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.orientation import nose_yaw
 from icrtool.logs.streams.position_sources import (
     GOAL_WORDS,
@@ -22,7 +22,7 @@ from icrtool.logs.streams.position_sources import (
     SOLVED_CODES,
     solved,
 )
-from icrtool.logs.streams.source import HEADER, NO_ROWS, Source, of_topic
+from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
 
 Convention = Literal["enu", "ned"]
 

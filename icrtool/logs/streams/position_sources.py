@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.fix_class import (
     GPSFIX_STATUS,
     class_by_carrier,
@@ -18,7 +18,7 @@ from icrtool.logs.streams.fix_class import (
     class_by_status,
     class_by_type,
 )
-from icrtool.logs.streams.source import HEADER, NO_ROWS, Source, of_topic
+from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"

@@ -294,7 +294,7 @@ def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Se
         if topic is None:
             continue
         key, needed = f"topics.wheel_{side}", f"a side's topic is one of {', '.join(sorted(PAIR_TYPES))}"
-        if (kind := _type_in(log, channels, key, topic)) not in PAIR_TYPES:
+        if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
         if topic in found.unread:
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
@@ -311,7 +311,7 @@ def _check_configured(
     if configured is None:
         return
     key, needed, sources = f"topics.{role}", f"it needs {NEEDS[role]}", found.by_role()[role]
-    kind = _type_in(log, channels, key, configured)
+    kind = _type_in(log, channels, found.unread, key, configured)
     if not sources:
         if role == "wheels" and kind in PAIR_TYPES:
             needed = "name both sides in topics.wheel_left and topics.wheel_right"
@@ -320,7 +320,7 @@ def _check_configured(
         raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
 
 
-def _type_in(log: str, channels: Sequence[Channel], key: str, topic: str) -> str:
+def _type_in(log: str, channels: Sequence[Channel], unread: Mapping[str, str], key: str, topic: str) -> str:
     """Return the message type of a configured topic.
 
     Raises
@@ -330,7 +330,7 @@ def _type_in(log: str, channels: Sequence[Channel], key: str, topic: str) -> str
     """
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     if topic not in types:
-        listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, {}))}"
+        listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, unread))}"
         raise ConfigError(key, f"{topic} is not in {log}", listed)
     return types[topic]
 

@@ -13,9 +13,6 @@ from icrtool.logs.streams.stamps import StampedRows, stamp_rows
 
 NO_ROWS: Bools = np.zeros(0, np.bool_)
 
-HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
-"""Fields of a message's header."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:

@@ -15,9 +15,9 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.position_sources import REFERENCE_WORDS
-from icrtool.logs.streams.source import HEADER, Source, of_topic
+from icrtool.logs.streams.source import Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
@@ -92,8 +92,9 @@ def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides 
 
 def _of_both(sides: Sides) -> Pair | None:
     left, right = sides
-    known = left is not None and right is not None and bool(np.isfinite(left).any() and np.isfinite(right).any())
-    return (left, right) if known and left is not None and right is not None else None
+    if left is None or right is None or not (np.isfinite(left).any() and np.isfinite(right).any()):
+        return None
+    return left, right
 
 
 def _nonzero(values: Floats) -> bool:

@@ -87,9 +87,9 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
     paths = [_of_states("filter", table, momentary)]
     if run.smoothed is not None:
         paths.append(_of_states("smoothed", run.smoothed, momentary))
-    paths.append(_of_odometry("icr", table, driven.icr, final))
-    if driven.no_slip is not None and width is not None:
-        paths.append(_of_odometry("no_slip", table, driven.no_slip, FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
+    paths.append(_of_odometry("icr", table, driven.drive_icr(), final))
+    if width is not None and (no_slip := driven.drive_no_slip()) is not None:
+        paths.append(_of_odometry("no_slip", table, no_slip, FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
     return tuple(paths)
 
 

@@ -73,7 +73,8 @@ def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     found = odometry(run)
     table, drive = run.table, run.summary["drive"]
-    lowest, highest = _extent(_corners(table), _corners(found.icr), _corners(found.no_slip))
+    # Each path is driven twice, here for its corners only: both at once would be in memory beside the picture.
+    lowest, highest = _extent(_corners(table), _corners(found.drive_icr()), _corners(found.drive_no_slip()))
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
@@ -87,8 +88,8 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
-    _draw_odometry(axes, found.icr, cell, ICR, "ICR odometry", 3)
-    _draw_odometry(axes, found.no_slip, cell, NO_SLIP, "no-slip odometry", 2)
+    _draw_odometry(axes, found.drive_icr(), cell, ICR, "ICR odometry", 3)
+    _draw_odometry(axes, found.drive_no_slip(), cell, NO_SLIP, "no-slip odometry", 2)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
@@ -123,6 +124,7 @@ def _draw_odometry(axes: Axes, path: OdometryPath | None, cell_m: float, pen: Pe
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
         label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
         draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
+        # copies: views would keep the whole path in memory with the picture
         ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
         axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
 

@@ -14,8 +14,6 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.records.text import table_cell
 
-LARGEST_BYTES = 50_000_000
-
 
 def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
     """Return a table as CSV: numbers in their shortest exact form, empty where there is none, text as `table_cell`."""
@@ -32,17 +30,19 @@ def _cell(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def read_numbers(path: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Floats]:
+def read_numbers(
+    path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, most_bytes: int | None = None
+) -> dict[str, Floats]:
     """Read columns of numbers (n,) by name; an empty cell is NaN, other columns are passed over.
 
     Raises
     ------
     DataError
-        The file cannot be read, lacks a column that is needed, or has fewer than two rows.
+        The file cannot be read, is larger than `most_bytes`, lacks a column that is needed, or has fewer than two rows.
     """
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise DataError(path, f"larger than {LARGEST_BYTES / 1e6:g} MB", "leave out some of its rows")
+        if most_bytes is not None and path.stat().st_size > most_bytes:
+            raise DataError(path, f"larger than {most_bytes / 1e6:g} MB", "leave out some of its rows")
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             found = tuple(reader.fieldnames or ())

@@ -186,7 +186,7 @@ def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> 
         north, east = one.north_m[rows] - origin[0], one.east_m[rows] - origin[1]
         return {"north": packed(north, "f32"), "east": packed(east, "f32"), "t": packed(table.t_s[rows], "f32")}
 
-    return {"icr": path(found.icr), "no_slip": path(found.no_slip)}
+    return {"icr": path(found.drive_icr()), "no_slip": path(found.drive_no_slip())}
 
 
 class Path(NamedTuple):

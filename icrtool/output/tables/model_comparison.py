@@ -59,7 +59,7 @@ def error_columns(summary: Summary) -> dict[str, Any]:
 
 
 def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
-    """Return plain data for report.json."""
+    """Return what report.json holds, with numbers of numpy."""
     return {
         "horizons_m": list(comparison.horizons_m),
         "blocks": comparison.blocks,

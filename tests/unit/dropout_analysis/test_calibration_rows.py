@@ -66,7 +66,7 @@ def test_ranges_of_starts_without_a_trial_have_no_errors(
     drive: Run, own: Calibration, report: DropoutReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the last metres of a drive no trial starts."""
-    monkeypatch.setattr(trials, "ROWS_AT_ONCE", 100)
+    monkeypatch.setattr(trials, "STARTS_AT_ONCE", 100)
     pieces = dropout_report(drive, horizons_m=HORIZONS, calibrations=[replace(own, name="own")], starts="all")
     for name, known in (("recommended", "recommended"), ("calibration", "calibration:own")):
         ours, theirs = pieces.result(name), report.result(known)

@@ -149,7 +149,7 @@ def test_neither_order_nor_company_of_horizons_matters(run: Run) -> None:
 def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     report = dropout(run, HORIZONS_M)
     monkeypatch.setattr(module, "LARGEST_TABLE_BYTES", 1)
-    monkeypatch.setattr(module, "ROWS_AT_ONCE", 333)
+    monkeypatch.setattr(module, "STARTS_AT_ONCE", 333)
     pieces = dropout(run, HORIZONS_M)
     np.testing.assert_array_equal(np.array(pieces.counts), np.array(report.counts))
     for ours, theirs in zip(pieces.results, report.results, strict=True):

@@ -41,7 +41,7 @@ def test_odometry_is_the_plain_integration_gaps_included(run: Run, gaps: tuple[i
     gappy = replace(run, in_gap=in_gap)
     table = run.table
     expected = plain_path(gappy, table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
-    found = odometry(gappy).icr
+    found = odometry(gappy).drive_icr()
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
     end = np.hypot(expected[0, -1] - table.north_m[-1], expected[1, -1] - table.east_m[-1])
@@ -50,25 +50,26 @@ def test_odometry_is_the_plain_integration_gaps_included(run: Run, gaps: tuple[i
 
 def test_no_slip_drives_with_half_the_width_on_either_side(run: Run) -> None:
     expected = plain_path(run, 0.3, -0.3, 0.0)
-    found = odometry(run).no_slip
+    found = odometry(run).drive_no_slip()
     assert found is not None
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
 
 
 def test_learned_icrs_lead_closer_than_no_slip(run: Run) -> None:
-    no_slip = odometry(run).no_slip
+    no_slip = odometry(run).drive_no_slip()
     assert no_slip is not None
-    assert odometry(run).icr.end_error_m < 0.5 * no_slip.end_error_m
+    assert odometry(run).drive_icr().end_error_m < 0.5 * no_slip.end_error_m
 
 
 def test_without_width_there_is_no_no_slip_path(make_run: Callable[..., Run]) -> None:
-    assert odometry(make_run(track_width_m=None, duration_s=20.0)).no_slip is None
+    assert odometry(make_run(track_width_m=None, duration_s=20.0)).drive_no_slip() is None
 
 
 def test_the_summary_holds_the_end_errors(run: Run) -> None:
     paths = odometry(run)
-    assert paths.no_slip is not None
+    no_slip = paths.drive_no_slip()
+    assert no_slip is not None
     stored = run.summary["odometry"]
-    assert stored["icr"]["end_error_m"] == paths.icr.end_error_m
-    assert stored["no_slip"]["end_error_m"] == paths.no_slip.end_error_m
+    assert stored["icr"]["end_error_m"] == paths.drive_icr().end_error_m
+    assert stored["no_slip"]["end_error_m"] == no_slip.end_error_m

@@ -52,7 +52,7 @@ def results(request, stage):
     (directory / "run.json").write_text("{}")
     if request.report.page:
         (directory / "report.html").touch()
-    return replace(request.row, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
+    return replace(request.row, status="done", usable=True, distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
 
 one_log._results = results
@@ -107,6 +107,7 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
         rows = list(run_batch(requests, executor, BatchOptions(timeout_s=4.0)))
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
+    assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
     assert any("longer than 4 s" in row.reason for row in rows)
 
 

@@ -21,7 +21,7 @@ from icrtool.dropout_analysis.trials import models_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import odometry
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.output.exports.foxglove import write_foxglove
+from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, write_foxglove
 from icrtool.output.exports.foxglove_layout import foxglove_layout
 from icrtool.output.exports.geojson import format_geojson
 from icrtool.output.exports.kml import GX, KML, format_kml
@@ -177,7 +177,7 @@ def test_the_geojson_holds_states_fixes_events_and_outages(slipping: Run) -> Non
         layers.setdefault(feature["properties"]["layer"], []).append(feature)
     assert [line["properties"]["path"] for line in layers["path"]] == ["filter", "icr", "no_slip"]
     ends = [line["properties"]["end_error_m"] for line in layers["path"]]
-    assert ends[1] == pytest.approx(odometry(slipping).icr.end_error_m)
+    assert ends[1] == pytest.approx(odometry(slipping).drive_icr().end_error_m)
     (outage,) = layers["outage"]
     assert outage["properties"]["duration_s"] == pytest.approx(OUTAGE_S[1] - OUTAGE_S[0], abs=0.2)
     (event,) = layers["event"]
@@ -306,6 +306,9 @@ def test_every_path_of_the_layout_is_a_field_of_a_topic(slipping: Run, mcap_file
     # This run has no smoothed states; Foxglove passes over topics that a file lacks.
     assert set(panels["3D!paths"]["topics"]) - {"/smoothed/path"} <= set(messages)
     assert set(panels["map!place"]["topicColors"]) <= set(messages)
+    assert set(panels["3D!paths"]["transforms"]) == {f"frame:{body}" for body in BODIES.values()}
+    assert panels["3D!paths"]["followTf"] == WORLD
+    assert f"{ERROR_HORIZON_M:g} m" in panels["Plot!error"]["foxglovePanelTitle"]
     shown = json.dumps(layout["layout"])
     assert all(f'"{panel}"' in shown for panel in panels)
     assert {panel.partition("!")[0] for panel in panels} == {"3D", "Plot", "StateTransitions", "map"}
