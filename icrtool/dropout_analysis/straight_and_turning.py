@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
-from icrtool.dropout_analysis.trials import models_of
+from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_of_cells
 from icrtool.kernels.open_loop.direct import trial_ends
@@ -38,17 +38,16 @@ def split_by_turning(
         leave_out_standing(ends, standing_states(drive))
     tried = np.flatnonzero(ends[:, 0] >= 0)
     straight = heading_range(drive, horizon_m)[tried] < STRAIGHT_RAD
-    errors = {
-        model.name: open_loop_errors(drive, model.icrs, ends)[tried, 0]
-        for model in models_of(run)
-        if model.name in SPLIT_MODELS
-    }
+    parts = {kind: part for kind, part in ((True, straight), (False, ~straight)) if part.any()}
+
+    def mean_errors(model: Model) -> dict[bool, float]:
+        errors = open_loop_errors(drive, model.icrs, ends)[tried, 0]
+        return {kind: float(errors[part].mean()) for kind, part in parts.items()}
+
+    means = {model.name: mean_errors(model) for model in models_of(run) if model.name in SPLIT_MODELS}
     return tuple(
-        TurningSplit(
-            kind, horizon_m, int(np.count_nonzero(part)), {name: float(e[part].mean()) for name, e in errors.items()}
-        )
-        for kind, part in ((True, straight), (False, ~straight))
-        if part.any()
+        TurningSplit(kind, horizon_m, int(np.count_nonzero(part)), {name: mean[kind] for name, mean in means.items()})
+        for kind, part in parts.items()
     )
 
 

@@ -14,7 +14,7 @@ from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import WheelPaths
+from icrtool.estimation.odometry import OdometryPath, WheelPaths
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -65,6 +65,7 @@ def summarise(
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
+    end_errors = _end_errors(WheelPaths(table, filtered.in_gap, width))
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
@@ -89,7 +90,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": _end_errors(WheelPaths(table, filtered.in_gap, width)),
+            "odometry": end_errors,
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
@@ -206,9 +207,11 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
 
 def _end_errors(found: WheelPaths) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
-    no_slip_m = path.end_error_m if (path := found.drive_no_slip()) is not None else None
-    ends = {"icr": found.drive_icr().end_error_m, "no_slip": no_slip_m}
-    return {name: {"end_error_m": end} if end is not None else None for name, end in ends.items()}
+
+    def end(path: OdometryPath | None) -> dict[str, float] | None:
+        return {"end_error_m": path.end_error_m} if path is not None else None
+
+    return {"icr": end(found.drive_icr()), "no_slip": end(found.drive_no_slip())}
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
