@@ -209,10 +209,9 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
+    warnings += [f"{name}: {one.topic}: {one.note}" for one in (motion, source) if one is not None and one.note]
     if source is None:
         warnings += [f"{name}: {one.topic} gives no heading: {one.problem}" for one in found.heading]
-    elif source.note:
-        warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
     quantity = "position" if samples.from_position else "speed"
     streams: tuple[StreamChoice, ...] = (

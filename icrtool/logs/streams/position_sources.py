@@ -119,9 +119,12 @@ def _geodetic(
     if std > GOOD_STD_M:
         score -= 35.0
     stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
+    problem = (
+        "" if usable.any() else f"no usable fix ({', '.join(f'{why} {count}' for why, count in rejected.items())})"
+    )
     return PositionSource(
         **of_topic(table), geodetic=np.column_stack([latitude, longitude, filled]), variance=variance, usable=usable,
-        rejected=rejected, score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix",
+        rejected=rejected, score=score, why=f"{what}{stated}", problem=problem,
         stated_class=stated_class,
     )  # fmt: skip
 
