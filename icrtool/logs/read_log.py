@@ -319,9 +319,7 @@ def _fixes(
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
     """Return positions in the local plane about the datum: `given`, else the configured one, else the first fix."""
     if not source.usable.any():
-        raise DataError(
-            name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
-        )
+        raise DataError(name, f"{source.topic}: {source.problem}", "name another position in topics.gnss")
     stamps = source.stamps.on(clock)
     rows = np.flatnonzero(source.usable)
     rows = rows[np.argsort(stamps[rows], kind="stable")]
