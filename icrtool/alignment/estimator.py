@@ -106,7 +106,7 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
-class WindowResiduals(NamedTuple):
+class ResidualsByEstimate(NamedTuple):
     """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
 
     Attributes
@@ -199,7 +199,7 @@ class AlignmentFit(NamedTuple):
         return Geometry(values, covariance)
 
 
-def window_residuals(found: AlignmentFit) -> WindowResiduals:
+def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
     model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
@@ -209,7 +209,7 @@ def window_residuals(found: AlignmentFit) -> WindowResiduals:
         residual, _ = model.evaluate(x)
         parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
     (before, turn_before), (after, turn_after) = parts
-    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
+    return ResidualsByEstimate(before, after, turn_before, turn_after, model.turned)
 
 
 def _clock_std_s(drive: DriveArrays, width_m: float) -> float:

@@ -21,7 +21,6 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.fit import Fold, Prediction, own_constants
-from icrtool.motion.models import FittedModel
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading
@@ -98,12 +97,7 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
 
 
-def gyro_recording_of(run: Run) -> Recording:
-    """Return a run as `recording_of`, with its gyro where it has one."""
-    return heading_recording_of(run, "gyro")
-
-
-def heading_recording_of(run: Run, kind: str, *, width_m: float | None = None) -> Recording:
+def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
     """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
     return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
 
@@ -136,7 +130,7 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]
     return tuple(robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
 
 
-def calibrate(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
+def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
     """Fit every model to all recordings, test each on what it was not fitted to, recommend one.
 
     Parameters
@@ -249,13 +243,7 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
     if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
-    return in_recording(
-        calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted, recording
-    )
-
-
-def in_recording(fitted: FittedModel, recording: Recording) -> Prediction:
-    """Return a model for a recording, and the recording's constants; raises DataError as `calibrated`."""
+    fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
 
 

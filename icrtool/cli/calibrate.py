@@ -124,7 +124,7 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
 def _draw(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
     from icrtool.alignment.corrections import align_streams
-    from icrtool.alignment.estimator import window_residuals
+    from icrtool.alignment.estimator import residuals_by_estimate
     from icrtool.alignment.position.reference_choice import choose_reference
     from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
@@ -135,4 +135,4 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     log = read_log(source if run.directory is None else log_of(run), run.config)
     fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit
     if fit is not None:
-        save_picture(residuals_figure(run.name, window_residuals(fit)), plot)
+        save_picture(residuals_figure(run.name, residuals_by_estimate(fit)), plot)

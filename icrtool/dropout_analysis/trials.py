@@ -29,13 +29,16 @@ from icrtool.kernels.open_loop.error_statistics import (
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.motion.trials import Trials
-from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
+from icrtool.records.dropout import (
+    BOOTSTRAP_LEVEL,
+    BOOTSTRAP_RESAMPLES,
+    DEFAULT_SEED,
+    LearnedSplit,
+    ModelResult,
+    ReferenceErrors,
+)
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, drive_of, straight_drive
-
-BOOTSTRAP_RESAMPLES = 300
-BOOTSTRAP_LEVEL = 0.95
-"""Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -250,8 +253,7 @@ def models_of(run: Run) -> tuple[Model, ...]:
     width = run.track_width_m
     if width is not None:
         models.append(Model("no_slip", "no slip", FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
-    final = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*final)))
+    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*table.icrs_at(-1))))
     return tuple(models)
 
 

@@ -16,7 +16,7 @@ from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
 from icrtool.records.events import SlipEvent, intervals_in
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
-from icrtool.records.run import WarmStart, half_width_m
+from icrtool.records.run import WarmStart, width_or_usual_m
 
 
 class ProcessNoise(NamedTuple):
@@ -257,7 +257,7 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
-    settings, half = config.filter, half_width_m(config.robot.track_width_m)
+    settings, half = config.filter, width_or_usual_m(config.robot.track_width_m) / 2
     paper = settings.preset == "paper"
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     std = settings.initial_icr_std_m
@@ -276,9 +276,7 @@ def _terrain_icr_std_m(config: Config) -> float:
     given = config.filter.terrain_icr_std_m
     if given is not None:
         return given
-    return (
-        PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config.robot.track_width_m)
-    )
+    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else width_or_usual_m(config.robot.track_width_m)
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
@@ -358,5 +356,5 @@ def _parameters(
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config.robot.track_width_m),
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_or_usual_m(config.robot.track_width_m) / 2,
     )

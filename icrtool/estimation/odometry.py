@@ -46,9 +46,7 @@ class WheelPaths:
 
     def drive_icr(self) -> OdometryPath:
         """Return the path with the final ICRs."""
-        table = self.table
-        icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-        return _path(table, self.in_gap, *icrs)
+        return _path(self.table, self.in_gap, *self.table.icrs_at(-1))
 
     def drive_no_slip(self) -> OdometryPath | None:
         """Return the path of the no-slip model (Eqs. 38-39), None where the track width is not known."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
+from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
@@ -27,7 +27,7 @@ from icrtool.output.tables.model_comparison import (
     comparison_rows,
     error_columns,
 )
-from icrtool.records.dropout import ExampleTrial, ModelResult
+from icrtool.records.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ExampleTrial, ModelResult
 from icrtool.records.plain_data import rows_of
 
 REPORT_FILE = "report.json"

@@ -143,6 +143,10 @@ class States:
         """Return the columns by name, in the order of states.csv."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def icrs_at(self, row: int) -> tuple[float, float, float]:
+        """Return y_icr_right, y_icr_left and x_icr [m] at a state."""
+        return float(self.y_icr_right_m[row]), float(self.y_icr_left_m[row]), float(self.x_icr_m[row])
+
     def frame(self) -> pd.DataFrame:
         """Return the columns as a DataFrame equal to states.csv."""
         import pandas as pd

@@ -83,7 +83,7 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
     """Return the paths of a run: filter, smoother where it has one, ICR odometry, no slip where b is known."""
     table, driven, width = run.table, odometry(run), run.track_width_m
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    final = FrozenIcrs.constant(*(float(column[-1]) for column in momentary))
+    final = FrozenIcrs.constant(*table.icrs_at(-1))
     paths = [_of_states("filter", table, momentary)]
     if run.smoothed is not None:
         paths.append(_of_states("smoothed", run.smoothed, momentary))

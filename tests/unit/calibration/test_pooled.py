@@ -14,7 +14,7 @@ from icrtool.calibration.held_out import hold_out, left_out, plan_folds
 from icrtool.calibration.model_choice import choose
 from icrtool.calibration.pooled import (
     CalibrationResult,
-    calibrate,
+    calibrate_recordings,
     held_out_predictor,
     predictor,
     recording_of,
@@ -45,7 +45,7 @@ def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def result() -> CalibrationResult:
-    return calibrate(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
+    return calibrate_recordings(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
 
 
 def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) -> None:
@@ -207,11 +207,11 @@ def test_a_trial_that_leaves_too_little_has_no_error_in_any_row() -> None:
 def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:
     one, two = logs(2)
     with pytest.raises(ConfigError, match="given twice"):
-        calibrate([one, two, one])
+        calibrate_recordings([one, two, one])
     with pytest.raises(ConfigError, match="one robot at a time"):
-        calibrate([one, replace(two, width_m=1.0)])
+        calibrate_recordings([one, replace(two, width_m=1.0)])
     with pytest.raises(DataError):
-        calibrate([make_recording(SIX, TRUTH, 0, 12.0)])
+        calibrate_recordings([make_recording(SIX, TRUTH, 0, 12.0)])
 
 
 @pytest.mark.parametrize("scales", [(0.95, 0.95), (0.96, 1.03)])
