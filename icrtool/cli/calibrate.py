@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import runs_of
+from icrtool.cli.fit import check_run_config, runs_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -87,14 +87,11 @@ def command(
 
 def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:
     """Read runs, and fit logs."""
-    from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
     finished = all(is_run_directory(source) for source in sources)
-    if config.given_sections and finished:
-        section = min(config.given_sections)
-        advice = "name the logs instead"
-        raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
+    if finished:
+        check_run_config(config)
     with ThreadPoolExecutor(1) as other:
         if finished:
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter

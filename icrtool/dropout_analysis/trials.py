@@ -38,7 +38,7 @@ from icrtool.records.dropout import (
     ReferenceErrors,
 )
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run, drive_of, straight_drive
+from icrtool.records.run import Run, drive_of, no_slip_icrs, straight_drive
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -252,7 +252,7 @@ def models_of(run: Run) -> tuple[Model, ...]:
     models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
     width = run.track_width_m
     if width is not None:
-        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
+        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width))))
     models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*table.icrs_at(-1))))
     return tuple(models)
 

@@ -16,7 +16,7 @@ from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.events import intervals_in
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
-from icrtool.records.tables import States
+from icrtool.records.tables import Icrs, States
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -227,6 +227,11 @@ def icr_text(icr: IcrDocument, column: IcrColumn) -> str:
 def width_or_usual_m(track_width_m: float | None) -> float:
     """Return the track width b [m], `USUAL_WIDTH_M` where it is not known."""
     return track_width_m if track_width_m is not None else USUAL_WIDTH_M
+
+
+def no_slip_icrs(track_width_m: float) -> Icrs:
+    """Return the ICRs of a robot that does not slip (Pentzer 2014, Eqs. 38-39): in the middle of its tracks."""
+    return track_width_m / 2, -track_width_m / 2, 0.0
 
 
 def drive_of(run: Run) -> Drive:

@@ -25,6 +25,9 @@ from icrtool.records.text import LogText
 if TYPE_CHECKING:
     import pandas as pd
 
+Icrs = tuple[float, float, float]
+"""y_icr_right, y_icr_left, x_icr [m]."""
+
 LARGEST = 1e30
 """Of a state or a measurement: squares of larger numbers overflow."""
 
@@ -143,8 +146,8 @@ class States:
         """Return the columns by name, in the order of states.csv."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def icrs_at(self, row: int) -> tuple[float, float, float]:
-        """Return y_icr_right, y_icr_left and x_icr [m] at a state."""
+    def icrs_at(self, row: int) -> Icrs:
+        """Return the ICRs at a state."""
         return float(self.y_icr_right_m[row]), float(self.y_icr_left_m[row]), float(self.x_icr_m[row])
 
     def frame(self) -> pd.DataFrame:

@@ -19,10 +19,9 @@ from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
-from icrtool.records.tables import RobotLog
+from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import (
     DrivePlan,
-    Icrs,
     Readings,
     Sensors,
     Truth,

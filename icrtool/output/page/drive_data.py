@@ -18,7 +18,7 @@ from icrtool.calibration.model_comparison import FAMILY, ROWS, turned_path
 from icrtool.calibration.pooled import calibrated, turning_recording_of
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import MODELS, FittedModel, MotionModel
@@ -26,7 +26,8 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
-from icrtool.records.run import Run, drive_of, width_or_usual_m
+from icrtool.records.run import Run, drive_of, no_slip_icrs, width_or_usual_m
+from icrtool.records.tables import Icrs
 
 MOST_STEPS = 150_000
 """Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""
@@ -76,7 +77,7 @@ def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dic
         "series": _series_data(run, steps),
         "fixes": _fixes_data(run, origin),
         "headings": _headings_data(run),
-        "odometry": _odometry_data(odometry(run), run, origin),
+        "odometry": _odometry_data(run, origin),
         "models": _models(run, report, steps),
         "events": _events_data(run, origin),
         "outages": [
@@ -175,18 +176,17 @@ def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:
     return rows[extremes(difference[rows], points=FIX_POINTS)]
 
 
-def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
-    table = run.table
+def _odometry_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+    table, b = run.table, run.track_width_m
     extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
 
-    def path(one: OdometryPath | None) -> dict[str, Any] | None:
-        if one is None:
-            return None
+    def path(icrs: Icrs) -> dict[str, Any]:
+        one = drive_wheels(table, run.in_gap, icrs)
         rows = places(one.north_m, one.east_m, extent / PATH_CELLS)
         north, east = one.north_m[rows] - origin[0], one.east_m[rows] - origin[1]
         return {"north": packed(north, "f32"), "east": packed(east, "f32"), "t": packed(table.t_s[rows], "f32")}
 
-    return {"icr": path(found.drive_icr()), "no_slip": path(found.drive_no_slip())}
+    return {"icr": path(table.icrs_at(-1)), "no_slip": None if b is None else path(no_slip_icrs(b))}
 
 
 class ModelPath(NamedTuple):
@@ -209,7 +209,7 @@ def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[
     """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
     labels = {one["name"]: one["label"] for one in report["models"]}
     b = run.track_width_m
-    icrs = {"icr": None, "no_slip": None if b is None else (b / 2, -b / 2, 0.0), "icr_final": run.table.icrs_at(-1)}
+    icrs = {"icr": None, "no_slip": None if b is None else no_slip_icrs(b), "icr_final": run.table.icrs_at(-1)}
     models: list[dict[str, Any]] = [
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
