@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
-from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.records.measurements import RESPONSE_S
 
@@ -275,7 +275,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
 
 def _smooth(t: Floats, angle: Floats) -> Floats:
     """Return the mean of an angle (h,) over `SMOOTH_S` to either side of its times t (h,): noise is no turn."""
-    area = np.concatenate([[0.0], np.cumsum(np.diff(t) * (angle[1:] + angle[:-1]) / 2)])
+    area = trapezoids(t, angle)
     begin, end = np.maximum(t - SMOOTH_S, t[0]), np.minimum(t + SMOOTH_S, t[-1])
     reach = np.minimum(t - begin, end - t)
     size = np.maximum(2.0 * reach, 1e-9)

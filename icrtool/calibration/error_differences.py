@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.block_sums import LEVEL
+from icrtool.kernels.open_loop.error_statistics import RESAMPLES, error_summary
 from icrtool.kernels.open_loop.trials import Drive
-from icrtool.records.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES
 
 SHORTEST_BLOCK_M = 10.0
 
@@ -58,14 +58,14 @@ def compare_errors(
         return ErrorEstimate(p95, np.nan, np.nan, mean, np.nan, np.nan)
     rng = np.random.default_rng(seed)
     lists = [list(side.values()) for side in sides]
-    found = np.empty((BOOTSTRAP_RESAMPLES, 2))
+    found = np.empty((RESAMPLES, 2))
     for resample in found:
         drawn = [rng.integers(len(side), size=len(side)) for side in lists]
         drawn[1] = drawn[0] if paired else drawn[1]
         resample[:] = _difference(
             [np.concatenate([side[i] for i in rows]) for side, rows in zip(lists, drawn, strict=True)]
         )
-    low, high = np.percentile(found, [50.0 * (1.0 - BOOTSTRAP_LEVEL), 50.0 * (1.0 + BOOTSTRAP_LEVEL)], axis=0)
+    low, high = np.percentile(found, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)], axis=0)
     return ErrorEstimate(p95, float(low[0]), float(high[0]), mean, float(low[1]), float(high[1]))
 
 

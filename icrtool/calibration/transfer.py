@@ -25,7 +25,7 @@ from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_
 from icrtool.motion.models import TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
-from icrtool.records.dropout import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, CHOICE_HORIZON_M, DEFAULT_SEED
+from icrtool.records.dropout import CHOICE_HORIZON_M, DEFAULT_SEED
 from icrtool.records.run import Run
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
@@ -193,7 +193,7 @@ def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], see
     errors, path = tested[row, column]
     summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
-    interval = bootstrap_intervals(errors, blocks, seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
+    interval = bootstrap_intervals(errors, blocks, seed)
     own, foreign = tested[column, column], tested[row, column]
     costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True, seed=seed)
     of_horizons = np.column_stack([

@@ -29,14 +29,7 @@ from icrtool.kernels.open_loop.error_statistics import (
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.motion.trials import Trials
-from icrtool.records.dropout import (
-    BOOTSTRAP_LEVEL,
-    BOOTSTRAP_RESAMPLES,
-    DEFAULT_SEED,
-    LearnedSplit,
-    ModelResult,
-    ReferenceErrors,
-)
+from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, drive_of, no_slip_icrs, straight_drive
 
@@ -331,7 +324,7 @@ def _result_of(
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
         summary = summary_of_sorted([ordered])
-        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
+        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
         return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,))

@@ -19,9 +19,6 @@ OutageKind = Literal["forced", "real"]
 DEFAULT_SEED = 20140311
 """Seed of the bootstrap: any number, but the same for every run and every model."""
 
-BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL = 300, 0.95
-"""Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
-
 CHOICE_HORIZON_M = 10.0
 """Where extended models are chosen, and which horizon the picture of the model comparison shows."""
 

@@ -30,6 +30,9 @@ LABELS: dict[PathName, str] = {
     "no_slip": "no-slip odometry",
 }
 
+ERROR_HORIZON_M = 10.0
+"""Open-loop errors are exported after this distance."""
+
 LINE_CELL_M = 0.05
 """A line has a point where it enters another cell of a grid of this side."""
 
