@@ -1,4 +1,4 @@
-"""Types of arrays."""
+"""Types of arrays, and the integral of one."""
 
 from __future__ import annotations
 
