@@ -16,7 +16,8 @@ import numpy as np
 
 from icrtool.calibration.forecast import forecast_trials
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import calibrate_recordings, predictor, turning_recording_of
+from icrtool.calibration.pooled import calibrate_recordings, predictor
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.estimation.fit import fit

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, turning_recording_of
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.records.run import Run
 

@@ -14,15 +14,9 @@ import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import (
-    ErrorsOf,
-    calibration_from,
-    held_out_predictor,
-    recording_of,
-    scaled_gyro,
-    with_turn_rate,
-)
+from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.error_statistics import error_summary

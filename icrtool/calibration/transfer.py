@@ -17,8 +17,9 @@ import numpy as np
 
 from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, held_out_predictor, predictor, turning_recording_of
+from icrtool.calibration.pooled import CalibrationResult, held_out_predictor, predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary

@@ -72,7 +72,7 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
 
     with_gyro = calibration.gyro_sources is not None
     if is_run_directory(path):
-        from icrtool.calibration.pooled import turning_recording_of
+        from icrtool.calibration.run_recording import turning_recording_of
         from icrtool.output.stored_run import open_run
 
         recording = turning_recording_of(open_run(path))

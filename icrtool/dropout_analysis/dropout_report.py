@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Literal
 
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
-from icrtool.calibration.pooled import predictor, turning_recording_of
+from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials

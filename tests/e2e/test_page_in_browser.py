@@ -15,7 +15,8 @@ import pytest
 
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.model_comparison import _errors_along, _icrs_of, turned_path
-from icrtool.calibration.pooled import predictor, recording_of, turning_recording_of
+from icrtool.calibration.pooled import predictor
+from icrtool.calibration.run_recording import recording_of, turning_recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit

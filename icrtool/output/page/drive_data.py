@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.calibration.model_comparison import FAMILY, ROWS, turned_path
-from icrtool.calibration.pooled import calibrated, turning_recording_of
+from icrtool.calibration.pooled import calibrated
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels

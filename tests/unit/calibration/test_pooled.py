@@ -12,14 +12,8 @@ import pytest
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
 from icrtool.calibration.model_choice import choose
-from icrtool.calibration.pooled import (
-    CalibrationResult,
-    calibrate_recordings,
-    held_out_predictor,
-    predictor,
-    recording_of,
-    with_turn_rate,
-)
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, held_out_predictor, predictor
+from icrtool.calibration.run_recording import recording_of, with_turn_rate
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.align import align, sensors_as_sent
-from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.estimation.fit import fit
