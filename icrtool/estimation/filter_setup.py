@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -78,9 +77,8 @@ PAPER_TERRAIN_ICR_STD_M = 10.0
 width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class FilterSetup:
-    """One run, ready for the kernel.
+class FilterSetup(NamedTuple):
+    """One run, ready for the kernels: the arguments of `run_ekf` and `run_smoother`.
 
     Attributes
     ----------
@@ -88,10 +86,10 @@ class FilterSetup:
     """
 
     data: FilterInputs
-    parameters: FilterParameters
     t0: float
     x0: Floats
     P0: Floats
+    parameters: FilterParameters
 
 
 def check_start(config: Config) -> None:
@@ -175,7 +173,7 @@ def set_up_filter(
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
-    return FilterSetup(data, parameters, t0, x0, P0)
+    return FilterSetup(data, t0, x0, P0, parameters)
 
 
 def chi2_gate(probability: float, degrees: int) -> float:
