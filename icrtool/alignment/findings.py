@@ -87,7 +87,8 @@ def _window_summary(fit: AlignmentFit | None) -> dict[str, float | int | None]:
         return {"windows": 0, "stretches": 0, "residual_m": None}
     count = len(fit.windows.begin)
     along, across = fit.fit.scale[[0, count]].tolist()
-    return {"windows": count, "stretches": fit.fit.groups, "residual_m": math.hypot(along, across)}
+    stretches = len(np.union1d(fit.windows.group, fit.windows.turn_group))
+    return {"windows": count, "stretches": stretches, "residual_m": math.hypot(along, across)}
 
 
 def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:

@@ -297,6 +297,11 @@ def configured_noise(config: Config) -> ProcessNoise:
     )
 
 
+def rate_invariant(config: Config) -> bool:
+    """Return whether the process noise of a time does not depend on the number of steps, as in `FilterParameters`."""
+    return config.filter.preset != "paper"
+
+
 def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float, float, float, float, float]:
     """Return the diagonal of Q (Eq. 30), in the units of `FilterParameters`."""
     position, icr = noise.position_mps**2, config.filter.process_icr_mps**2
@@ -340,7 +345,7 @@ def _parameters(
     paper = settings.preset == "paper"
     return FilterParameters(
         process_variance=process_variance(config, noise),
-        rate_invariant=not paper,
+        rate_invariant=rate_invariant(config),
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),

@@ -11,7 +11,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.open_loop.trials import Drive
-from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
+from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
 from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.tables import States
@@ -162,16 +162,10 @@ def final_covariance(
     weight = np.tile(np.exp((windows.end_s - windows.end_s[-1]) / memory_s), 3)
     kind = np.repeat(np.arange(3), len(windows.length_m))
     scale = np.hypot(scale_by_kind(windows.residuals, kind), windows.noise[kind]) / np.sqrt(weight)
-    covariance, _, _ = sandwich_covariance(
-        windows.residuals,
-        windows.jacobian,
-        scale,
-        np.tile(windows.stretch, 3),
-        np.diag(prior_std(width_m) ** -2.0),
-        group_std=width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0]),
-    )
-    found: Floats = covariance[:3, :3]
-    return found
+    prior = np.diag(prior_std(width_m) ** -2.0)
+    at_final_icrs = Linearised(residuals=windows.residuals, jacobian=windows.jacobian, scale=scale, prior=prior)
+    of_stretch = width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
+    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch, 3), of_stretch)[:3, :3]
 
 
 def multiplier_std(covariance: Floats, track_width_m: float) -> float:

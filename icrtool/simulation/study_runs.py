@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import configured_noise, process_variance, set_up_filter
+from icrtool.estimation.filter_setup import configured_noise, process_variance, rate_invariant, set_up_filter
 from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.ekf import run_ekf
@@ -182,8 +182,8 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     icrs = np.array(plan.icrs_m) + rng.normal(0.0, scenario.model_icr_std_m or 0.0, 3)
     x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
-    noise, rate_invariant = rng.normal(0.0, 1.0, (len(t), 6)), scenario.config.filter.preset != "paper"
-    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant, noise)
+    noise = rng.normal(0.0, 1.0, (len(t), 6))
+    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant(scenario.config), noise)
     return _readings(states, t, speeds, sensors, rng), states, None
 
 

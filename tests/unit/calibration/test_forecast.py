@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
-from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
+from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
@@ -218,3 +219,19 @@ def test_long_drives_measure_errors_further_than_short_ones(calibration: Calibra
     longer = calibrate([make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]).calibration
     assert longer.sources is not None
     assert longer.sources.measured_to_m >= 50.0
+
+
+@pytest.mark.parametrize("columns", [2, 8])
+def test_non_negative_least_squares_are_those_of_scipy(columns: int) -> None:
+    """Units that differ by decades, columns without any effect, and two that are alike."""
+    rng = np.random.default_rng(columns)
+    for case in range(30):
+        design = np.abs(rng.normal(size=(60, columns))) * 10.0 ** rng.uniform(-6.0, 3.0, columns)
+        design[:, 0] *= case % 3 > 0
+        if case % 5 == 0:
+            design[:, -1] = 2.0 * design[:, -2]
+        target = (design / np.maximum(design.max(axis=0), 1e-9)) @ np.maximum(rng.normal(size=columns), 0.0)
+        target += rng.normal(0.0, 0.3, 60)
+        found = nonnegative(design.T @ design, design.T @ target)
+        assert (found >= 0.0).all()
+        assert np.linalg.norm(design @ found - target) == pytest.approx(nnls(design, target)[1], rel=1e-12)
