@@ -19,7 +19,7 @@ from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.measurements import Fixes, Measurements, SensorData
-from icrtool.records.run import half_width_m
+from icrtool.records.run import width_or_usual_m
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -98,7 +98,7 @@ def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurem
 
     A log with too little besides them keeps its first alignment.
     """
-    width = 2 * half_width_m(config.robot.track_width_m)
+    width = width_or_usual_m(config.robot.track_width_m)
     events = find_slip_events(found.sensors, width)
     if events:
         spans = tuple((event.begin_ns, event.end_ns) for event in events)

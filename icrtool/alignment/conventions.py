@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveArrays, DriveWindows, cut_chords
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, soft_l1_loss
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
@@ -36,6 +36,9 @@ DECISIVE = 25.0
 """Twice the log-likelihood, five standard deviations: less does not overrule that everything is as it is named."""
 
 OVERLAP = 8.0
+PRIOR_STD = 10.0
+"""Hardly any prior, of parameters near one."""
+
 FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "heading mirrored": 1.0,
           "position mirrored": 1.5, "pose mirrored": 0.75, "turned about": 0.5, "gyro upside down": 1.0,
           "drives backwards": 1.0}  # fmt: skip
@@ -183,7 +186,7 @@ def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
     seen = (drive.fix[end] - drive.fix[begin]) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
     design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
-    place = _linear(design, target, np.concatenate([windows.group[some]] * 2), 10.0)
+    place = _linear(design, target)
     few = slice(None, None, max(1, len(windows.turn_begin) // MOST_WINDOWS))
     first, last = windows.turn_begin[few], windows.turn_end[few]
     turned = hand * (np.interp(last, drive.heading_t, drive.heading) - np.interp(first, drive.heading_t, drive.heading))
@@ -191,8 +194,9 @@ def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
         np.interp(last, drive.wheel_t, total) - np.interp(first, drive.wheel_t, total)
         for total in map(drive.cumulate, (u, v))
     ]
-    turn = _linear(np.column_stack(by), turned, windows.turn_group[few], 10.0)
-    return _Shown(place.x, place.covariance, turn.x, turn.covariance, place.residuals)
+    turn = _linear(np.column_stack(by), turned)
+    of_place = sandwich_covariance(place, np.tile(windows.group[some], 2))
+    return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group[few]), place.residuals)
 
 
 def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
@@ -201,12 +205,10 @@ def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
     return {hand: soft_l1_loss(one.residuals / scale) / OVERLAP for hand, one in shown.items()}
 
 
-def _linear(design: Floats, target: Floats, group: Ints, prior_std: float) -> RobustFit:
+def _linear(design: Floats, target: Floats) -> RobustFit:
     zero = np.zeros(design.shape[1])
-    return robust_least_squares(
-        lambda x: (design @ x - target, design), zero, zero, np.full(len(zero), prior_std),
-        group=group, overlap=OVERLAP,
-    )  # fmt: skip
+    prior_std = np.full(len(zero), PRIOR_STD)
+    return robust_least_squares(lambda x: (design @ x - target, design), zero, zero, prior_std, overlap=OVERLAP)
 
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
-from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.records.measurements import RESPONSE_S
 
@@ -106,7 +106,7 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
-class WindowResiduals(NamedTuple):
+class ResidualsByEstimate(NamedTuple):
     """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
 
     Attributes
@@ -123,16 +123,18 @@ class WindowResiduals(NamedTuple):
 
 
 class AlignmentFit(NamedTuple):
-    """The parameters in the order of `NAMES`, with covariance.
+    """The parameters in the order of `NAMES`.
 
     Attributes
     ----------
-    fit : the robust fit; width_m : b that w was formed with
+    fit : the robust fit; covariance : of its parameters
+    width_m : b that w was formed with
     windows : DriveWindows it was made of, cut from drive
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
     fit: RobustFit
+    covariance: Floats
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
@@ -141,10 +143,10 @@ class AlignmentFit(NamedTuple):
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
         if name == "position_delay":
-            both = self.fit.covariance[np.ix_([TP, TH], [TP, TH])]
+            both = self.covariance[np.ix_([TP, TH], [TP, TH])]
             return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
         row = NAMES.index(name)
-        variance = float(self.fit.covariance[row, row])
+        variance = float(self.covariance[row, row])
         # rounding may leave a variance below zero where the drive hardly shows the parameter
         return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
 
@@ -191,13 +193,13 @@ class AlignmentFit(NamedTuple):
             columns.append(_geometry(moved, b, self.turning_speed_mps).imag / 1e-20)
         jacobian = np.column_stack(columns)
         values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
-        covariance = jacobian @ self.fit.covariance @ jacobian.T
+        covariance = jacobian @ self.covariance @ jacobian.T
         # at one speed, positions that lag look like an antenna further back
         covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.drive, self.width_m)) ** 2
         return Geometry(values, covariance)
 
 
-def window_residuals(found: AlignmentFit) -> WindowResiduals:
+def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
     model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
@@ -207,7 +209,7 @@ def window_residuals(found: AlignmentFit) -> WindowResiduals:
         residual, _ = model.evaluate(x)
         parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
     (before, turn_before), (after, turn_after) = parts
-    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
+    return ResidualsByEstimate(before, after, turn_before, turn_after, model.turned)
 
 
 def _clock_std_s(drive: DriveArrays, width_m: float) -> float:
@@ -253,9 +255,9 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     prior_std[C] *= width_m
     try:
         fit = robust_least_squares(
-            model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, group=group, overlap=OVERLAP, most_steps=MOST_STEPS
+            model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, overlap=OVERLAP, most_steps=MOST_STEPS
         )
-        covariance = correlated_covariance(fit, group, prior_std**-2.0, OVERLAP)
+        covariance = correlated_covariance(fit, group)
     except np.linalg.LinAlgError:
         return None
     if not np.isfinite(covariance).all():
@@ -268,12 +270,12 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
     weight = drive.wheel_dt * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit._replace(covariance=covariance), width_m, windows, speed, drive)
+    return AlignmentFit(fit, covariance, width_m, windows, speed, drive)
 
 
 def _smooth(t: Floats, angle: Floats) -> Floats:
     """Return the mean of an angle (h,) over `SMOOTH_S` to either side of its times t (h,): noise is no turn."""
-    area = np.concatenate([[0.0], np.cumsum(np.diff(t) * (angle[1:] + angle[:-1]) / 2)])
+    area = trapezoids(t, angle)
     begin, end = np.maximum(t - SMOOTH_S, t[0]), np.minimum(t + SMOOTH_S, t[-1])
     reach = np.minimum(t - begin, end - t)
     size = np.maximum(2.0 * reach, 1e-9)

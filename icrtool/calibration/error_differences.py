@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.block_sums import LEVEL
+from icrtool.kernels.open_loop.error_statistics import RESAMPLES, error_summary
 from icrtool.kernels.open_loop.trials import Drive
-
-RESAMPLES, LEVEL = 300, 0.95
 
 SHORTEST_BLOCK_M = 10.0
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -38,7 +39,6 @@ SCALED_FROM_M = 5.0
 FEWEST_WINDOWS = 20
 
 ANGLES, BISECTIONS = 24, 26
-DESCENTS = 400
 
 NORMAL_STRETCHES = 10
 """That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
@@ -274,9 +274,18 @@ def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Float
 
 
 def nonnegative(matrix: Floats, y: Floats) -> Floats:
-    """Return x >= 0 that minimises x matrix x / 2 - y x, by coordinate descent; matrix is positive semidefinite."""
-    x = np.zeros(len(y))
-    for _ in range(DESCENTS):
-        for i in np.flatnonzero(np.diag(matrix) > 0.0):
-            x[i] = max(0.0, x[i] + (y[i] - matrix[i] @ x) / matrix[i, i])
-    return x
+    """Return x >= 0 (n,) that minimises x matrix x / 2 - y x; matrix is positive semidefinite, n is small.
+
+    Notes
+    -----
+    Of all 2^n choices of which values are above zero, the best solution without a negative value.
+    """
+    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
+    scaled, target = matrix / np.outer(size, size), y / size
+    above = np.array(list(product((0.0, 1.0), repeat=len(y))))
+    parts = scaled * above[:, :, None] * above[:, None, :]
+    x = above * (np.linalg.pinv(parts, hermitian=True) @ (above * target)[:, :, None])[:, :, 0]
+    cost = np.einsum("si,ij,sj->s", x, scaled, x) / 2.0 - x @ target
+    cost[(x < 0.0).any(axis=1)] = np.inf
+    found: Floats = x[np.argmin(cost)] / size
+    return found

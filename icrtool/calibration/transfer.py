@@ -15,17 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_differences import (
-    LEVEL,
-    RESAMPLES,
-    ErrorEstimate,
-    blocks_of,
-    compare_errors,
-    same_route,
-)
+from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, held_out_predictor, predictor
+from icrtool.calibration.pooled import CalibrationResult, held_out_predictor, predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
@@ -132,7 +126,7 @@ def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_S
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
-    recordings = {name: [gyro_recording_of(run) for run in runs] for name, runs in groups.items()}
+    recordings = {name: [turning_recording_of(run) for run in runs] for name, runs in groups.items()}
     _check_apart(recordings)
     return compare_calibrations({name: calibrate_runs(runs) for name, runs in groups.items()}, recordings, seed=seed)
 
@@ -200,7 +194,7 @@ def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], see
     errors, path = tested[row, column]
     summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
-    interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
+    interval = bootstrap_intervals(errors, blocks, seed)
     own, foreign = tested[column, column], tested[row, column]
     costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True, seed=seed)
     of_horizons = np.column_stack([

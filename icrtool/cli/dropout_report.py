@@ -11,7 +11,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.drive_options import numbers
-from icrtool.cli.fit import RUNS, fit_log, logs_of, run_directories
+from icrtool.cli.fit import RUNS, check_run_config, fit_log, logs_of, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
 from icrtool.cli.terminal import show
@@ -152,9 +152,7 @@ def plan_sources(
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
     if logs:
         return sources, dict(zip(logs, run_directories(logs, output, into), strict=True))
-    if given := sorted(config.given_sections - {"dropout"}):
-        advice = "fit the log again with it, or name the log in place of its run"
-        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+    check_run_config(config, free="dropout")
     if output or into:
         raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
     return sources, {}
@@ -200,12 +198,9 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
             source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
             overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
-    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
     from icrtool.fleet.fit_and_report import report_and_write
 
     directory = source if place is None else place
-    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
-        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
     baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
     with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
         report = report_and_write(

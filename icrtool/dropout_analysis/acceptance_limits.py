@@ -41,10 +41,10 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
     found = []
     for result in report.results:
-        reached = _budget_distance(report.horizons_m, result.summary.p95, budget_m)
+        reached = within_budget(report.horizons_m, result.summary.p95, budget_m)
         if reached is not None:
             ends = (
-                _budget_distance(report.horizons_m, p95, budget_m)
+                within_budget(report.horizons_m, p95, budget_m)
                 for p95 in (result.intervals.p95_high, result.intervals.p95_low)
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
@@ -129,9 +129,14 @@ def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[
     raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
 
 
-def _budget_distance(
-    horizons_m: Floats, p95_m: Floats, budget_m: float
-) -> tuple[float, bool, tuple[float, float]] | None:
+def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
+    """Return how far an error (h,) [m] that grows with the distance (h,) [m], from 0 m at 0 m, stays within a budget.
+
+    Returns
+    -------
+    The interpolated distance, whether the error is within the budget at the last one, and the distances interpolated
+    between; None without errors.
+    """
     known = np.isfinite(p95_m)
     if not known.any():
         return None

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Literal
 
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
-from icrtool.calibration.pooled import gyro_recording_of, predictor
+from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
@@ -107,15 +108,11 @@ def dropout_report(
     )
 
 
-def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> tuple[float, ...]:
-    """Return the lengths of outages to force: those given, else those of the run's configuration."""
-    return tuple(outage_s if outage_s is not None else run.config.dropout.forced_outage_s)
-
-
 def _force(run: Run, outage_s: Sequence[float] | None, outage_at_s: Sequence[float]) -> list[Outage]:
-    lengths = forced_lengths_s(run, outage_s)
+    """Return the outages of the lengths given, else of those in the run's configuration."""
+    lengths = outage_s if outage_s is not None else run.config.dropout.forced_outage_s
     if outage_at_s and not lengths:
-        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
+        raise ConfigError("outage", "its begin is given without its length", "give outage_s (--outage) too")
     plans = [plan_outages(run, length, outage_at_s) for length in lengths]
     return [outage for plan in plans for outage in force_outages(run, plan)]
 
@@ -134,7 +131,7 @@ def _calibration_rows(
 ) -> tuple[tuple[UsedCalibration, ...], list[ConstantModel]]:
     """Return what is known of each calibration, and the model of its row."""
     used, models = [], []
-    recording = gyro_recording_of(run) if calibrations else None
+    recording = turning_recording_of(run) if calibrations else None
     for number, one in enumerate(calibrations, start=1):
         stem = one.name or str(number)
         if sum(other.name == one.name for other in calibrations) > 1:

@@ -7,11 +7,10 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
+from icrtool.dropout_analysis.starts import Starts, counted_ends
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_of_cells
-from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import TurningSplit
@@ -33,9 +32,7 @@ def split_by_turning(
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
-    ends = trial_ends(drive, np.array([horizon_m]))
-    if starts == "moving":
-        leave_out_standing(ends, standing_states(drive))
+    ends = counted_ends(drive, horizon_m, starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
     straight = heading_range(drive, horizon_m)[tried] < STRAIGHT_RAD
     errors = {

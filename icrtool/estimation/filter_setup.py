@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
 from icrtool.records.events import SlipEvent, intervals_in
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
-from icrtool.records.run import WarmStart, half_width_m
+from icrtool.records.run import WarmStart, width_or_usual_m
 
 
 class ProcessNoise(NamedTuple):
@@ -78,9 +77,8 @@ PAPER_TERRAIN_ICR_STD_M = 10.0
 width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class FilterSetup:
-    """One run, ready for the kernel.
+class FilterSetup(NamedTuple):
+    """One run, ready for the kernels: the arguments of `run_ekf` and `run_smoother`.
 
     Attributes
     ----------
@@ -88,10 +86,10 @@ class FilterSetup:
     """
 
     data: FilterInputs
-    parameters: FilterParameters
     t0: float
     x0: Floats
     P0: Floats
+    parameters: FilterParameters
 
 
 def check_start(config: Config) -> None:
@@ -175,7 +173,7 @@ def set_up_filter(
     alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
-    return FilterSetup(data, parameters, t0, x0, P0)
+    return FilterSetup(data, t0, x0, P0, parameters)
 
 
 def chi2_gate(probability: float, degrees: int) -> float:
@@ -257,7 +255,7 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
-    settings, half = config.filter, half_width_m(config.robot.track_width_m)
+    settings, half = config.filter, width_or_usual_m(config.robot.track_width_m) / 2
     paper = settings.preset == "paper"
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     std = settings.initial_icr_std_m
@@ -276,9 +274,7 @@ def _terrain_icr_std_m(config: Config) -> float:
     given = config.filter.terrain_icr_std_m
     if given is not None:
         return given
-    return (
-        PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config.robot.track_width_m)
-    )
+    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else width_or_usual_m(config.robot.track_width_m)
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
@@ -295,6 +291,11 @@ def configured_noise(config: Config) -> ProcessNoise:
         position if position != "auto" else preset.position_mps,
         heading if heading is not None else preset.heading_degps,
     )
+
+
+def rate_invariant(config: Config) -> bool:
+    """Return whether the process noise of a time does not depend on the number of steps, as in `FilterParameters`."""
+    return config.filter.preset != "paper"
 
 
 def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float, float, float, float, float]:
@@ -340,7 +341,7 @@ def _parameters(
     paper = settings.preset == "paper"
     return FilterParameters(
         process_variance=process_variance(config, noise),
-        rate_invariant=not paper,
+        rate_invariant=rate_invariant(config),
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
@@ -353,5 +354,5 @@ def _parameters(
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config.robot.track_width_m),
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_or_usual_m(config.robot.track_width_m) / 2,
     )

@@ -11,7 +11,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.open_loop.trials import Drive
-from icrtool.kernels.robust import sandwich_covariance, scale_by_kind
+from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
 from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.tables import States
@@ -36,7 +36,7 @@ drive: ground and slip. x_icr moves with the speed of a turn as well: the prior 
 0.6 (`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
 
 
-class DriveWindows(NamedTuple):
+class StateWindows(NamedTuple):
     """Displacement and turn over windows of distance, linear in what may be unknown.
 
     Attributes
@@ -66,7 +66,7 @@ class DriveWindows(NamedTuple):
         return np.array([place, place, math.sqrt(2.0) * self.heading_std_rad])
 
 
-def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
+def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     """Return the windows of a drive, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
     dt = np.where(drive.gap, 0.0, drive.dt_s)
     distance = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
@@ -93,7 +93,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     turned = np.diff(sums[:, 0])
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
-    return DriveWindows(
+    return StateWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
         length_m=np.diff(distance),
@@ -121,12 +121,12 @@ def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Flo
 
 
 def prior_std(width_m: float) -> Floats:
-    """Return the standard deviations (6,) of what `DriveWindows.jacobian` is by, before a drive."""
+    """Return the standard deviations (6,) of what `StateWindows.jacobian` is by, before a drive."""
     return np.array([width_m, width_m, width_m, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
 
 
 def final_covariance(
-    windows: DriveWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
+    windows: StateWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
 ) -> Floats:
     """Return the covariance (3, 3) of the final ICRs [m^2]: from how much the stretches of their drive differ.
 
@@ -162,16 +162,10 @@ def final_covariance(
     weight = np.tile(np.exp((windows.end_s - windows.end_s[-1]) / memory_s), 3)
     kind = np.repeat(np.arange(3), len(windows.length_m))
     scale = np.hypot(scale_by_kind(windows.residuals, kind), windows.noise[kind]) / np.sqrt(weight)
-    covariance, _, _ = sandwich_covariance(
-        windows.residuals,
-        windows.jacobian,
-        scale,
-        np.tile(windows.stretch, 3),
-        np.diag(prior_std(width_m) ** -2.0),
-        group_std=width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0]),
-    )
-    found: Floats = covariance[:3, :3]
-    return found
+    prior = np.diag(prior_std(width_m) ** -2.0)
+    at_final_icrs = Linearised(residuals=windows.residuals, jacobian=windows.jacobian, scale=scale, prior=prior)
+    of_stretch = width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
+    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch, 3), of_stretch)[:3, :3]
 
 
 def multiplier_std(covariance: Floats, track_width_m: float) -> float:

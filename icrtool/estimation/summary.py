@@ -14,7 +14,7 @@ from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import WheelPaths
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -24,7 +24,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive, no_slip_icrs
 from icrtool.records.run_document import EVENT_COLUMNS, IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
@@ -92,7 +92,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": _end_errors(WheelPaths(table, filtered.in_gap, width)),
+            "odometry": _end_errors(table, filtered.in_gap, width),
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
@@ -207,11 +207,13 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
     return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
-def _end_errors(found: WheelPaths) -> dict[str, Any]:
+def _end_errors(table: States, in_gap: Bools, track_width_m: float | None) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
-    no_slip_m = path.end_error_m if (path := found.drive_no_slip()) is not None else None
-    ends = {"icr": found.drive_icr().end_error_m, "no_slip": no_slip_m}
-    return {name: {"end_error_m": end} if end is not None else None for name, end in ends.items()}
+    icrs = {"icr": table.icrs_at(-1), "no_slip": None if track_width_m is None else no_slip_icrs(track_width_m)}
+    return {
+        name: None if one is None else {"end_error_m": drive_wheels(table, in_gap, one).end_error_m}
+        for name, one in icrs.items()
+    }
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:

@@ -125,9 +125,9 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
 
     def usable() -> Iterator[Run]:
         for row in members:
-            if row.log in spaced and (run := open_run(directory / row.run)).usable:
+            if row.log in spaced and row.usable:
                 used.append(row.log)
-                yield run
+                yield open_run(directory / row.run)
 
     try:
         result = calibrate_runs(usable())

@@ -8,7 +8,8 @@ distance of one log), not from single ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -72,36 +73,60 @@ def huber_weights(z: Floats) -> Floats:
     return weights
 
 
-class RobustFit(NamedTuple):
-    """The minimum of a robust least squares problem.
+@dataclass(frozen=True, kw_only=True)
+class Linearised:
+    """A robust least squares problem about its minimum, to first order: what covariances are made of.
+
+    Attributes
+    ----------
+    residuals : (m,), jacobian : (m, k)
+    scale : (m,) robust standard deviation of each residual, that of its kind
+    prior : (k, k) information of the prior
+    overlap : so many residuals count as one independent one
+    """
+
+    residuals: Floats
+    jacobian: Floats
+    scale: Floats
+    prior: Floats
+    overlap: float = 1.0
+
+    @cached_property
+    def weights(self) -> Floats:
+        """Weights (m,) of the squared residuals."""
+        return robust_weights(self.residuals, self.scale, self.overlap)
+
+    @cached_property
+    def of_data(self) -> Floats:
+        """Gauss-Newton matrix (k, k) of the data, one residual in `overlap`."""
+        return normal_equations(self.residuals, self.jacobian, self.weights)[0]
+
+    @property
+    def information(self) -> Floats:
+        """Gauss-Newton matrix (k, k) of data and prior."""
+        return self.of_data + self.prior
+
+    def gradients(self, group: Ints) -> Floats:
+        """Return the gradient (g, k) of the data of each group (m,), in their order."""
+        order, first = _grouped(group)
+        gradients: Floats = np.add.reduceat((self.jacobian * (self.weights * self.residuals)[:, None])[order], first)
+        return gradients
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustFit(Linearised):
+    """The minimum of a robust least squares problem; jacobian and prior follow the parts' own parameters.
 
     Attributes
     ----------
     x : (k + p c,) parameters, those of the parts behind the k shared ones
-    covariance : (k, k) of the shared ones, from the spread between groups, nowhere less than `information` allows
-    information : (k, k) Gauss-Newton matrix: data, one residual in `overlap`, and prior
     own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
         follow the shared ones
-    residuals : (m,), jacobian : (m, k), at `x`, to first order of the last step; own parameters follow the shared ones
-    scale : (m,) robust standard deviation of each residual, that of its kind
-    groups : independent groups of residuals
     """
 
     x: Floats
-    covariance: Floats
-    information: Floats
     own_prior: Floats
     own_pull: Floats
-    residuals: Floats
-    jacobian: Floats
-    scale: Floats
-    groups: int
-
-    @property
-    def std(self) -> Floats:
-        """One standard deviation of each shared parameter (k,)."""
-        deviations: Floats = np.sqrt(np.diag(self.covariance))
-        return deviations
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
@@ -115,7 +140,6 @@ def robust_least_squares(
     prior_std: Floats,
     *,
     kind: Ints | None = None,
-    group: Ints | None = None,
     parts: Parts | None = None,
     overlap: float = 1.0,
     most_steps: int = 15,
@@ -129,7 +153,6 @@ def robust_least_squares(
     start : (k + p c,) where to begin
     prior_mean, prior_std : (k + p c,); an infinite deviation is no prior
     kind : (m,) residuals of one kind share one robust scale, which is their own; default one kind
-    group : (m,) residuals of one group depend on one another, others do not; default each its own
     parts : of the data, which have parameters of their own; default one part without
     overlap : so many residuals count as one independent one
     most_steps : at most this many steps
@@ -138,7 +161,6 @@ def robust_least_squares(
     Notes
     -----
     Iteratively reweighted Gauss-Newton (Holland and Welsch 1977) with step halving; the scale follows the residuals.
-    Covariance: `sandwich_covariance`.
     """
     x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
     residuals, jacobian = evaluate(x)
@@ -172,10 +194,11 @@ def robust_least_squares(
     own, away = (of_all[k:].reshape(found.gain.shape[:2]) for of_all in (pull, x - prior_mean))
     own_prior = np.einsum("pck,pc,pcl->pkl", found.gain, own, found.gain)
     own_pull = -np.einsum("pck,pc->pk", found.gain, own * away)
-    groups = np.arange(len(residuals)) if group is None else group
     prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
-    covariance, information, count = sandwich_covariance(residuals, jacobian, scale, groups, prior, overlap)
-    return RobustFit(x, covariance, information, own_prior, own_pull, residuals, jacobian, scale, count)
+    return RobustFit(
+        residuals=residuals, jacobian=jacobian, scale=scale, prior=prior, overlap=overlap, x=x, own_prior=own_prior,
+        own_pull=own_pull,
+    )  # fmt: skip
 
 
 def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
@@ -196,20 +219,12 @@ def robust_weights(residuals: Floats, scale: Floats, overlap: float) -> Floats:
     return weights
 
 
-def sandwich_covariance(
-    residuals: Floats,
-    jacobian: Floats,
-    scale: Floats,
-    group: Ints,
-    prior: Floats,
-    overlap: float = 1.0,
-    group_std: Floats | None = None,
-) -> tuple[Floats, Floats, int]:
-    """Return the covariance (k, k) of a robust fit, its information matrix (k, k), and the number of groups.
+def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None = None) -> Floats:
+    """Return the covariance (k, k) of a robust fit, nowhere less than its information allows.
 
     Parameters
     ----------
-    prior : (k, k) information of the prior
+    group : (m,) residuals of one group depend on one another, others do not
     group_std : (k,) how far the parameters of a group are expected to lie from the common ones, an expectation that
         counts as one group; None: the groups alone show it
 
@@ -220,19 +235,16 @@ def sandwich_covariance(
     than that of H^-1. A group with parameters of its own, T their covariance about the common ones, and information A
     has a gradient of covariance A T A: so is the spread expected with `group_std`, and the two are averaged.
     """
-    weights = robust_weights(residuals, scale, overlap)
-    information = normal_equations(residuals, jacobian, weights)[0] + prior
-    gradients = _gradients(residuals, jacobian, weights, group)
     expected = None
     if group_std is not None:
         order, first = _grouped(group)
         of_groups = [
-            normal_equations(residuals[one], jacobian[one], weights[one])[0] * group_std
+            normal_equations(fit.residuals[one], fit.jacobian[one], fit.weights[one])[0] * group_std
             for one in np.split(order, first[1:])
         ]
         expected = np.sum([one @ one.T for one in of_groups], axis=0)
-    meat = _spread(gradients, expected) + prior
-    inverse = np.linalg.solve(information, np.eye(len(prior)))
+    meat = _spread(fit.gradients(group), expected) + fit.prior
+    inverse = np.linalg.inv(fit.information)
     sandwich = inverse @ meat @ inverse
     if not (np.diag(sandwich) > 0.0).all():
         # rounding: weights that differ by hundreds of decades
@@ -241,7 +253,7 @@ def sandwich_covariance(
     with np.errstate(over="ignore", invalid="ignore"):
         grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
         covariance: Floats = sandwich * np.outer(grown, grown)
-    return (covariance + covariance.T) / 2.0, information, len(gradients)
+    return (covariance + covariance.T) / 2.0
 
 
 def _spread(gradients: Floats, expected: Floats | None) -> Floats:
@@ -257,39 +269,32 @@ def _grouped(group: Ints) -> tuple[Ints, Ints]:
     return order, np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
 
 
-def _gradients(residuals: Floats, jacobian: Floats, weights: Floats, group: Ints) -> Floats:
-    """Return the gradient (g, k) of each group, in their order."""
-    order, first = _grouped(group)
-    gradients: Floats = np.add.reduceat((jacobian * (weights * residuals)[:, None])[order], first)
-    return gradients
-
-
-def correlated_covariance(fit: RobustFit, group: Ints, pull: Floats, overlap: float = 1.0) -> Floats:
+def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
     """Return the covariance (k, k) of a robust fit whose residuals stay correlated beyond a group.
 
     Parameters
     ----------
-    group : (m,) stretches in their order; pull : (k,) information of the prior
+    group : (m,) stretches in their order
 
     Notes
     -----
-    The influence of the groups on each parameter is a series in order of distance; `long_run_factor` applies to it.
+    `sandwich_covariance`, grown: the influence of the groups on each parameter is a series in order of distance, to
+    which `long_run_factor` applies.
     """
-    weights = robust_weights(fit.residuals, fit.scale, overlap)
-    gradients = _gradients(fit.residuals, fit.jacobian, weights, group)
-    inverse = np.linalg.solve(fit.information, np.eye(len(pull)))
-    series = gradients @ inverse
-    of_prior = np.einsum("ij,j,ij->i", inverse, pull, inverse)
+    covariance = sandwich_covariance(fit, group)
+    inverse = np.linalg.inv(fit.information)
+    series = fit.gradients(group) @ inverse
+    of_prior = np.einsum("ij,j,ij->i", inverse, np.diag(fit.prior), inverse)
     square = (series**2).sum(axis=0)
-    data = np.diag(fit.covariance)
+    data = np.diag(covariance)
     known = data > 0.0
-    grown = np.ones(len(pull))
+    grown = np.ones(len(data))
     grown[known] = np.maximum(1.0, ((square * long_run_factor(series) + of_prior)[known] / data[known]))
     size = np.sqrt(grown)
-    return np.asarray(fit.covariance * np.outer(size, size), np.float64)
+    return np.asarray(covariance * np.outer(size, size), np.float64)
 
 
-def student_covariance(fit: RobustFit, levels: Sequence[Ints], overlap: float = 1.0) -> Floats:
+def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
     """Return the covariance (k, k) of a robust fit, so that two standard deviations hold 95.4 % with few groups, too.
 
     Parameters
@@ -302,16 +307,14 @@ def student_covariance(fit: RobustFit, levels: Sequence[Ints], overlap: float = 
     the spread between groups, with the variance that the level below expects counted as one group more. The spread is
     an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964, 26.7.5).
     """
-    weights = robust_weights(fit.residuals, fit.scale, overlap)
-    expected = normal_equations(fit.residuals, fit.jacobian, weights)[0]
-    variance = expected
+    variance = fit.of_data
     for group in levels:
-        gradients = _gradients(fit.residuals, fit.jacobian, weights, group)
+        gradients = fit.gradients(group)
         count = len(gradients)
         student = 1.0 + 1.25 / count + 1.53 / count**2
         variance = _spread(gradients, variance) * student**2
-    inverse = np.linalg.solve(fit.information, np.eye(len(expected)))
-    return np.asarray(inverse @ (variance + fit.information - expected) @ inverse, np.float64)
+    inverse = np.linalg.inv(fit.information)
+    return np.asarray(inverse @ (variance + fit.prior) @ inverse, np.float64)
 
 
 def long_run_factor(series: Floats) -> Floats:

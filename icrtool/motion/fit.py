@@ -126,9 +126,8 @@ class PooledFit(FittedModel):
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
             found = self.refit_without(i)
-            # of a single recording its constants are parameters, too
-            inverse = np.linalg.inv(found.curvature)[:k, :k]
-            fitted = replace(found.fitted, covariance=self._covariance(self.curvature, inverse))
+            covariance = self._covariance(self.curvature, np.linalg.inv(found.curvature))
+            fitted = replace(found.fitted, covariance=covariance)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
@@ -138,7 +137,7 @@ class PooledFit(FittedModel):
             fitted = FittedModel(self.model, self.parameters + self._steps(gradient, curvature), covariance, wheels)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         x, covariance = self._reweighted(clear)
-        return FittedModel(self.model, x[:k], covariance[:k, :k], wheels), self._constants(x, i)
+        return FittedModel(self.model, x[:k], covariance, wheels), self._constants(x, i)
 
     def refit_without(self, recording: int) -> PooledFit:
         """Return a fit of the model to the other recordings."""
@@ -148,7 +147,7 @@ class PooledFit(FittedModel):
         return self._refits[recording]
 
     def _reweighted(self, clear: Bools) -> tuple[Floats, Floats]:
-        """Return all parameters of a single recording as fitted to some residuals (m,), and their covariance.
+        """Return all parameters of a single recording as fitted to some residuals (m,), and the model's covariance.
 
         Notes
         -----
@@ -167,14 +166,16 @@ class PooledFit(FittedModel):
         return x, self._covariance(at.information, np.linalg.inv(information))
 
     def _covariance(self, whole: Floats, inverse: NDArray[Any]) -> Floats:
-        """Return the covariance without a fold, from the information with it, and the inverse of that without it.
+        """Return the covariance (k, k) without a fold, from the information with it and the inverse without it.
 
         Notes
         -----
-        A parameter's variance exceeds that of independent residuals by as much as with the fold.
+        A parameter's variance exceeds that of independent residuals by as much as with the fold. Of a single recording
+        its constants are in both matrices too, behind the model's parameters.
         """
-        grown = np.sqrt(np.diag(self.solution.covariance) / np.diag(np.linalg.inv(whole)))
-        return np.asarray(inverse * np.outer(grown, grown), np.float64)
+        k = len(self.parameters)
+        grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(whole))[:k])
+        return np.asarray(inverse[:k, :k] * np.outer(grown, grown), np.float64)
 
     def residuals_without(self, fold: Fold, others: Sequence[Fold]) -> Floats:
         """Return the residuals (f, m) of a fold's recording, as fitted without the fold and without each of others.
@@ -215,7 +216,7 @@ class PooledFit(FittedModel):
     @cached_property
     def curvature(self) -> Floats:
         """Second derivatives of the loss and the prior together (k, k)."""
-        prior = self.pool.prior(self.model)[1][: len(self.solution.information)] ** -2.0
+        prior = self.pool.prior(self.model)[1][: len(self.solution.prior)] ** -2.0
         return np.asarray(self._by_recording[1].sum(axis=0) + np.diag(prior), np.float64)
 
     def _derivatives(self, rows: Bools | slice) -> tuple[Floats, Floats]:
@@ -373,11 +374,9 @@ class Pool:
             return residuals, jacobian
 
         found = robust_least_squares(
-            evaluate, mean, mean, std, group=self.group, parts=Parts(self.first, own if count > 1 else 0),
-            overlap=self.overlap, settled=SETTLED,
+            evaluate, mean, mean, std, parts=Parts(self.first, own if count > 1 else 0), overlap=self.overlap,
+            settled=SETTLED,
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]
-        found = found._replace(covariance=student_covariance(found, levels, self.overlap))
-        return PooledFit(
-            model, found.x[:k], found.covariance[:k, :k], wheels=wheels, pool=self, solution=found
-        )  # fmt: skip
+        covariance = student_covariance(found, levels)[:k, :k]
+        return PooledFit(model, found.x[:k], covariance, wheels=wheels, pool=self, solution=found)

@@ -12,8 +12,10 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
+from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
+from icrtool.kernels.open_loop.block_sums import LEVEL
+from icrtool.kernels.open_loop.error_statistics import RESAMPLES
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic_directory import atomic_directory
@@ -120,8 +122,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "bootstrap": {
             "method": "moving blocks of path",
             "block": "the horizon",
-            "resamples": BOOTSTRAP_RESAMPLES,
-            "level": BOOTSTRAP_LEVEL,
+            "resamples": RESAMPLES,
+            "level": LEVEL,
             "seed": report.seed,
         },
         "models": [_model_document(result, report) for result in report.results],

@@ -12,17 +12,16 @@ import numpy as np
 
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import configured_noise, process_variance, set_up_filter
+from icrtool.estimation.filter_setup import configured_noise, process_variance, rate_invariant, set_up_filter
 from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
-from icrtool.records.tables import RobotLog
+from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import (
     DrivePlan,
-    Icrs,
     Readings,
     Sensors,
     Truth,
@@ -142,14 +141,14 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
     sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
     setup = set_up_filter(sensors, scenario.config, changes_s=changes)
-    parameters = setup.parameters
     if scenario.guard != GUARDED:
-        parameters = parameters._replace(guard=scenario.guard, step_heading=0.0)
+        euler = setup.parameters._replace(guard=scenario.guard, step_heading=0.0)
+        setup = setup._replace(parameters=euler)
     first = int(np.searchsorted(setup.data.wheel_t, setup.t0))
     times = readings.wheel_t[first:]
     stops = np.unique(np.append(np.searchsorted(times, stops_s, side="right") - 1, len(times) - 1))
     stops = stops[stops >= 0]
-    out = run_ekf(setup.data, setup.t0, setup.x0, setup.P0, parameters, stops.tolist())
+    out = run_ekf(*setup, stops.tolist())
     return StudyRun(
         t_s=times,
         x=out.x,
@@ -182,8 +181,8 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     icrs = np.array(plan.icrs_m) + rng.normal(0.0, scenario.model_icr_std_m or 0.0, 3)
     x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
-    noise, rate_invariant = rng.normal(0.0, 1.0, (len(t), 6)), scenario.config.filter.preset != "paper"
-    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant, noise)
+    noise = rng.normal(0.0, 1.0, (len(t), 6))
+    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant(scenario.config), noise)
     return _readings(states, t, speeds, sensors, rng), states, None
 
 

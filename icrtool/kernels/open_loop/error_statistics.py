@@ -15,7 +15,7 @@ import numpy as np
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.equal_steps import rows_of_cells
-from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, Blocks, quantile
+from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, LEVEL, Blocks, quantile
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, Summary
 
 TAIL = 0.05
@@ -24,7 +24,7 @@ MIN_BLOCKS = 3
 """With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
-RESAMPLES_AT_ONCE = 50
+RESAMPLES, RESAMPLES_AT_ONCE = 300, 50
 """Bounds memory: a long log has thousands of blocks."""
 MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
@@ -122,7 +122,7 @@ def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
 
 
 def bootstrap_interval(
-    errors_m: Floats, blocks: Blocks | None, rng: np.random.Generator, resamples: int = 300, level: float = 0.95
+    errors_m: Floats, blocks: Blocks | None, rng: np.random.Generator, resamples: int = RESAMPLES
 ) -> tuple[float, float, float, float]:
     """Compute confidence intervals of one horizon's expected error and p95 by the moving-block bootstrap.
 
@@ -131,7 +131,6 @@ def bootstrap_interval(
     errors_m : (n,) [m], NaN where there was no trial
     blocks : of `cut_blocks`
     rng : random numbers; the same state gives the same blocks, so models can be compared on the same resamples
-    resamples, level : number of resamples, and the share of them within the interval
 
     Returns
     -------
@@ -158,13 +157,11 @@ def bootstrap_interval(
     for some in np.split(replicates, range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)):
         starts = rng.integers(0, n_starts, size=(len(some), len(per_segment) // BLOCK_PARTS))
         resample_blocks(sums, starts, segments, ordered, some)
-    low, high = np.quantile(replicates, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    low, high = np.quantile(replicates, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
-def bootstrap_intervals(
-    errors_m: Floats, blocks: Sequence[Blocks | None], seed: int, resamples: int = 300, level: float = 0.95
-) -> Intervals:
+def bootstrap_intervals(errors_m: Floats, blocks: Sequence[Blocks | None], seed: int) -> Intervals:
     """Compute `bootstrap_interval` for every horizon.
 
     Parameters
@@ -172,10 +169,9 @@ def bootstrap_intervals(
     errors_m : (n_starts, n_horizons) [m]
     blocks : of `cut_blocks`, one a horizon
     seed : every horizon starts from it, so that an interval does not depend on which others are asked for
-    resamples, level : as in `bootstrap_interval`
     """
     rows = [
-        bootstrap_interval(column, cut, np.random.default_rng(seed), resamples, level)
+        bootstrap_interval(column, cut, np.random.default_rng(seed))
         for column, cut in zip(errors_m.T, blocks, strict=True)
     ]
     return Intervals(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)

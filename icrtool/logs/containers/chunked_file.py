@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,9 @@ from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, Decompressio
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
+
+BLOCKS_AHEAD = 2
+"""Made while one is used: the thread that makes them does not wait for the one that uses them."""
 
 MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
 """Messages that a scan finds at a time; a record has more bytes than this."""
@@ -63,8 +67,8 @@ class ChunkedFile(ABC):
         self.files = [path]
         self.problems = Problems(path.name)
         self._inflation = Inflation()
-        # A block is used while the next one is made.
-        self._spaces, self._other_spaces = (Spaces(Space(), Space(), Space()) for _ in range(2))
+        # One block is used while the next ones are made.
+        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
         self._stream = path.open("rb")
         self._at = 0
         self._size = path.stat().st_size
@@ -100,9 +104,9 @@ class ChunkedFile(ABC):
             needed = [one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted)]
             blocks = self._indexed(needed, wanted)
         with ThreadPoolExecutor(1) as pool:
-            pending = pool.submit(next, blocks, None)
-            while (block := pending.result()) is not None:
-                pending = pool.submit(next, blocks, None)
+            pending = deque(pool.submit(next, blocks, None) for _ in range(BLOCKS_AHEAD))
+            while (block := pending.popleft().result()) is not None:
+                pending.append(pool.submit(next, blocks, None))
                 yield block
         self._free()
 
@@ -114,8 +118,9 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        for space in (*self._spaces, *self._other_spaces):
-            space.free()
+        for spaces in self._spaces:
+            for space in spaces:
+                space.free()
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -137,7 +142,7 @@ class ChunkedFile(ABC):
 
     def _read(self, at: int, length: int) -> Bytes:
         """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
-        space = self._spaces.packed.of(max(min(length, self._size - at), 0))
+        space = self._spaces[0].packed.of(max(min(length, self._size - at), 0))
         self._at = min(at, self._size)
         self._stream.seek(self._at)
         found = space[: self._stream.readinto(space.data)]
@@ -169,7 +174,7 @@ class ChunkedFile(ABC):
             begin = stop
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
-        self._spaces, self._other_spaces = self._other_spaces, self._spaces
+        self._spaces.rotate(1)
         if stop < len(data) and not cut:
             self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 

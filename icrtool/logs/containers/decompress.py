@@ -12,7 +12,7 @@ from icrtool.kernels.arrays import Bytes
 from icrtool.logs.containers.channel import Block
 
 LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
-"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; two are in memory at a time."""
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; three are in memory at a time."""
 
 LARGEST_RATIO = 100
 """A log may take this many times its size when decompressed, and `FREE_BYTES` more.

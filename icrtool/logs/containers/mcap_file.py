@@ -132,19 +132,19 @@ class McapFile(ChunkedFile):
             return 0
         if len(records) < needed - first:
             return 0
-        copy_ranges(records, first, ranges, count, self._spaces.joined.of(held + size, held), held)
+        copy_ranges(records, first, ranges, count, self._spaces[0].joined.of(held + size, held), held)
         return size
 
     def _read_group(self, chunks: list[Chunk], size: int) -> Iterator[Block]:
         """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
         if not chunks:
             return
-        records = self._spaces.joined.of(size)
+        records = self._spaces[0].joined.of(size)
         records.flags.writeable = False
         block, stop = self._scanned(records)
         if stop == size:
             yield block
-            self._spaces, self._other_spaces = self._other_spaces, self._spaces
+            self._spaces.rotate(1)
         else:
             for chunk in chunks:
                 yield from self._read_chunk(chunk)
@@ -321,7 +321,7 @@ class McapFile(ChunkedFile):
         packed = content[name_end + 8 : name_end + 8 + length]
         if len(packed) < length and not cut:
             raise DecompressionError("its header is damaged")
-        space = self._spaces.records
+        space = self._spaces[0].records
         data = self._inflation.decompress(packed, compression, min(size, needed) if cut else size, space, partial=cut)
         if checksum and not cut and zlib.crc32(data.data) != checksum:
             raise DecompressionError("its checksum is wrong")

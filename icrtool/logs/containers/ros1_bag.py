@@ -151,7 +151,7 @@ class Ros1Bag(ChunkedFile):
     def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         def unpack(content: Bytes) -> Bytes:
             size, compression = record.number(b"size"), record.text(b"compression")
-            return self._inflation.decompress(content, compression, size, self._spaces.records, partial=cut)
+            return self._inflation.decompress(content, compression, size, self._spaces[0].records, partial=cut)
 
         return self._chunk(record.at, record.length, record.at, unpack, learn=learn, cut=cut)
 

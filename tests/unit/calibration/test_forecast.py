@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
-from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, radius
+from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
-from icrtool.calibration.pooled import calibrate, predictor
+from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, IcrToolError
@@ -31,7 +32,7 @@ ROUNDING = 1e-6
 def calibrated(seed: int) -> Calibration:
     parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
     logs = [make_recording(SIX, parameters, 10 * seed + k, 150.0, name=f"log {k}") for k in range(3)]
-    return calibrate(logs).calibration
+    return calibrate_recordings(logs).calibration
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +200,7 @@ def test_reverse_along_a_path_is_as_uncertain_as_forward(calibration: Calibratio
 def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     parameters = draw_parameters(SIX, np.random.default_rng([1, 3]))
     logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
-    found = calibrate(logs).calibration
+    found = calibrate_recordings(logs).calibration
     assert found.gyro_sources is not None
     assert calibration_of(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
@@ -215,6 +216,24 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
 def test_long_drives_measure_errors_further_than_short_ones(calibration: Calibration) -> None:
     assert calibration.sources is not None
     assert calibration.sources.measured_to_m == 20.0
-    longer = calibrate([make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]).calibration
+    longer = calibrate_recordings(
+        [make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]
+    ).calibration
     assert longer.sources is not None
     assert longer.sources.measured_to_m >= 50.0
+
+
+@pytest.mark.parametrize("columns", [2, 8])
+def test_non_negative_least_squares_are_those_of_scipy(columns: int) -> None:
+    """Units that differ by decades, columns without any effect, and two that are alike."""
+    rng = np.random.default_rng(columns)
+    for case in range(30):
+        design = np.abs(rng.normal(size=(60, columns))) * 10.0 ** rng.uniform(-6.0, 3.0, columns)
+        design[:, 0] *= case % 3 > 0
+        if case % 5 == 0:
+            design[:, -1] = 2.0 * design[:, -2]
+        target = (design / np.maximum(design.max(axis=0), 1e-9)) @ np.maximum(rng.normal(size=columns), 0.0)
+        target += rng.normal(0.0, 0.3, 60)
+        found = nonnegative(design.T @ design, design.T @ target)
+        assert (found >= 0.0).all()
+        assert np.linalg.norm(design @ found - target) == pytest.approx(nnls(design, target)[1], rel=1e-12)

@@ -30,8 +30,6 @@ def place(run: Run, make_run: Callable[..., Run], tmp_path_factory: pytest.TempP
     place = tmp_path_factory.mktemp("fleet")
     for name, one, sha in (("a", run, "1"), ("b", make_run(duration_s=70.0), "2"), ("copy", run, "1")):
         write(one, place / "runs" / name, sha)
-    unusable = replace(run, summary=run.summary | {"usable": False, "unusable_because": "a test"})
-    write(unusable, place / "runs" / "c", "3")
     return place
 
 
@@ -39,9 +37,10 @@ CONTENT = {"a": "1", "b": "2", "copy": "1", "c": "3"}
 
 
 def rows(*names: str, group: str = "grass", **values: object) -> list[Row]:
+    """Return rows of logs; "c" is not usable, and no run of it is there to be read."""
     return [
         Row(name, f"runs/{name}", "done", robot="barn", group=group, key="k",
-            inputs=(File(name, 1, 1, CONTENT.get(name, name)),), **values)
+            inputs=(File(name, 1, 1, CONTENT.get(name, name)),), **{"usable": name != "c"} | values)
         for name in names
     ]  # fmt: skip
 
