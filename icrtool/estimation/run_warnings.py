@@ -23,8 +23,8 @@ SMALLEST_MULTIPLIER = 0.9
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not treated as even ones."""
 
-USUAL_X_M = 0.1
-"""Most skid-steer robots have their x_icr within this of the body origin (Pentzer 2014: 0.06 and 0.14 m)."""
+USUAL_X_M = 0.15
+"""Skid-steer robots have their x_icr within about this of the body origin (Pentzer 2014: 0.06 and 0.14 m)."""
 
 LEAST_SEPARATION = 1.1
 """Skid-steer robots turn as if they were at least so many times as wide: a body twist that shows less has a controller
