@@ -15,7 +15,7 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.kernels.open_loop.trials import Summary
-from icrtool.records.dropout import BudgetDistance, Gate, Verdict
+from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -94,8 +94,8 @@ def check_gate(
         known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
         raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m for {gate.model}", f"use {known}")
     h = int(places[0])
-    column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
-    value = float(getattr(summary, column)[h])
+    field, _ = METRICS[gate.metric]
+    value = float(getattr(summary, field)[h])
     if gate.baseline_factor and baseline is None:
         return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
     half_width, before = math.nan, math.nan

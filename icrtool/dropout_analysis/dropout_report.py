@@ -103,7 +103,7 @@ def dropout_report(
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),
         baseline=baseline,
-        by_turning=split_by_turning(compared, starts=starts),
+        by_turning=split_by_turning(compared, starts),
         no_comparison=why,
     )
 

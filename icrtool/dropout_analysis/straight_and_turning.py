@@ -24,29 +24,26 @@ CELLS = 20
 SPLIT_MODELS = ("icr", "no_slip")
 
 
-def split_by_turning(
-    run: Run, horizon_m: float = SPLIT_HORIZON_M, *, starts: Starts = "moving"
-) -> tuple[TurningSplit, ...]:
-    """Return the errors of straight and turning trials of one horizon (Pentzer 2014, Section 6.4, Figs. 33-34).
+def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
+    """Return the errors of straight and turning trials of `SPLIT_HORIZON_M` (Pentzer 2014, Section 6.4, Figs. 33-34).
 
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
-    ends = counted_ends(drive, horizon_m, starts)
+    ends = counted_ends(drive, SPLIT_HORIZON_M, starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
-    straight = heading_range(drive, horizon_m)[tried] < STRAIGHT_RAD
+    straight = heading_range(drive, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
     errors = {
         model.name: open_loop_errors(drive, model.icrs, ends)[tried, 0]
         for model in models_of(run)
         if model.name in SPLIT_MODELS
     }
-    return tuple(
-        TurningSplit(
-            kind, horizon_m, int(np.count_nonzero(part)), {name: float(e[part].mean()) for name, e in errors.items()}
-        )
-        for kind, part in ((True, straight), (False, ~straight))
-        if part.any()
-    )
+    found = []
+    for kind, part in ((True, straight), (False, ~straight)):
+        if part.any():
+            means = {name: float(e[part].mean()) for name, e in errors.items()}
+            found.append(TurningSplit(kind, SPLIT_HORIZON_M, int(np.count_nonzero(part)), means))
+    return tuple(found)
 
 
 def heading_range(drive: Drive, horizon_m: float) -> Floats:

@@ -161,16 +161,7 @@ def set_up_filter(
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
     noise = noise or configured_noise(config)
-    correlation_s = sensors.heading_correlation_s
-    if sensors.heading_is_estimated:
-        # Headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
-        # with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more.
-        density = math.radians(noise.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
-        variance = float(np.median(headings.var_rad2))
-        # The memory of the filter is then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
-        usual = math.radians(FIELD_NOISE.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
-        correlation_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
-    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
+    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), _heading_correlation_s(sensors, noise))
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
     return FilterSetup(data, t0, x0, P0, parameters)
@@ -302,6 +293,24 @@ def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float,
     """Return the diagonal of Q (Eq. 30), in the units of `FilterParameters`."""
     position, icr = noise.position_mps**2, config.filter.process_icr_mps**2
     return position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr
+
+
+def _heading_correlation_s(sensors: SensorData, noise: ProcessNoise) -> float:
+    """Return how long headings err alike.
+
+    Notes
+    -----
+    Estimated headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
+    with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is then
+    sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
+    """
+    if not sensors.heading_is_estimated:
+        return sensors.heading_correlation_s
+    density, usual = (
+        math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)
+    )
+    variance = float(np.median(sensors.headings.var_rad2))
+    return max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
 
 
 def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:

@@ -23,13 +23,8 @@ from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.trials_file import trials_file
 from icrtool.output.tables.dropout import no_trial, why_no_trial
-from icrtool.output.tables.model_comparison import (
-    COMPARISON_COLUMNS,
-    comparison_document,
-    comparison_rows,
-    error_columns,
-)
-from icrtool.records.dropout import ExampleTrial, ModelResult
+from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
+from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
 from icrtool.records.plain_data import rows_of
 
 REPORT_FILE = "report.json"

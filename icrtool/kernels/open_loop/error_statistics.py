@@ -26,6 +26,8 @@ TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
 RESAMPLES, RESAMPLES_AT_ONCE = 300, 50
 """Bounds memory: a long log has thousands of blocks."""
+BINS = 50
+"""Of a histogram, up to its largest error or less."""
 MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
 
@@ -177,11 +179,11 @@ def bootstrap_intervals(errors_m: Floats, blocks: Sequence[Blocks | None], seed:
     return Intervals(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
 
 
-def round_bin_width(largest_m: float, bins: int = 50) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `bins` bins reach `largest_m`."""
+def round_bin_width(largest_m: float) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `BINS` bins reach `largest_m`."""
     if not largest_m > 0.0:
         return 0.01
-    least = largest_m / bins
+    least = largest_m / BINS
     power = 10.0 ** math.floor(math.log10(least))
     return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
 

@@ -26,7 +26,7 @@ from icrtool.output.figures.style import (
     spot,
     styled,
 )
-from icrtool.output.text_format import distance_text, duration_text, error_text, position_word, run_title
+from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run, no_slip_icrs
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
@@ -71,7 +71,7 @@ REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewi
 @styled
 def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
-    table, drive = run.table, run.summary["drive"]
+    table = run.table
     paths = [(table.icrs_at(-1), ICR, "ICR odometry", 3)]
     if (b := run.track_width_m) is not None:
         paths.append((no_slip_icrs(b), NO_SLIP, "no-slip odometry", 2))
@@ -81,9 +81,8 @@ def trajectory(run: Run) -> Figure:
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     figure = new_figure(
-        run_title(run.summary), f"Trajectory, {driven}; ICR odometry: final ICRs",
+        run_title(run.summary), f"Trajectory, {driven_text(run.summary['drive'])}; ICR odometry: final ICRs",
         height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
     )  # fmt: skip
     axes = figure.subplots()

@@ -21,7 +21,7 @@ from icrtool.motion.models import MODELS, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
 from icrtool.output.files.csv_file import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
-from support.recordings import WIDTH_M, draw_parameters, make_recording
+from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 
 SIX = MODELS["six"]
 SEEDS = range(5)
@@ -115,7 +115,7 @@ def test_wheel_speeds_make_the_motion_asked_for(name: str) -> None:
 
 def test_a_drive_is_forecast_as_its_trials_from_the_start_are(calibration: Calibration) -> None:
     recording = make_recording(SIX, SIX.prior_mean, 4, 60.0)
-    trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
+    trials = trials_from_all(recording, (5.0, 10.0))
     _, p95 = forecast_trials(calibration, recording, trials)
     np.testing.assert_allclose(forecast_drive(calibration, recording).p95_m[[4, 9]], p95[0], rtol=1e-9)
 

@@ -26,7 +26,7 @@ from icrtool.output.files.calibration_file import open_calibration, write_calibr
 from icrtool.output.tables.held_out import format_result
 from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
-from support.recordings import WIDTH_M, make_recording, table_errors
+from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
 
 SIX = MODELS["six"]
 TRUTH = np.array([0.96, -0.1, 0.6, -0.02, 0.1, -0.12])
@@ -144,7 +144,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
 
 def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
     new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
-    trials = cut_trials(new, (5.0, 10.0), all_starts=True)
+    trials = trials_from_all(new, (5.0, 10.0))
     errors = predictor(result.calibration, new)(trials)
     np.testing.assert_array_equal(np.isfinite(errors), trials.ends >= 0)
     assert np.nanmean(errors[:, 1]) < 0.5
