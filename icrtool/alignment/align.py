@@ -10,6 +10,7 @@ import numpy as np
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, run_sections, start_icrs
 from icrtool.alignment.position.gnss_quality import grade_fixes
+from icrtool.alignment.position.gnss_steps import without_frozen
 from icrtool.alignment.position.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
@@ -42,6 +43,8 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
+    if config.filter.preset == "field":
+        log = without_frozen(log)
     found = _align_once(log, config)
     if config.filter.preset == "paper":
         # it takes its wheels as they are

@@ -69,7 +69,10 @@ def summarise(
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     scale = measurements.findings["wheel_scale"] if config.filter.preset == "field" else None
-    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise, scale)
+    of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
+    unusable = unusable_reasons(
+        excitation, filtered.gnss, filtered.heading, filtered.noise, scale, multiplier if of_twist else None
+    )
     document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,

@@ -208,7 +208,10 @@ def _count_lines(report: DropoutReport) -> list[str]:
 
 def _event_lines(report: DropoutReport) -> list[str]:
     """Return what slip events cost, at the longest horizon with trials on both sides."""
-    cost, icr = report.event_cost, report.result("icr")
+    cost, icr, events = report.event_cost, report.result("icr"), report.run_summary["events"]
+    if cost is None and events:
+        lasted = duration_text(sum(event["end_s"] - event["begin_s"] for event in events))
+        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
     if cost is None or icr is None:
         return []
     if not cost.events:
