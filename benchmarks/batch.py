@@ -22,6 +22,13 @@ ROBOT = ("--robot", "husky-a200")
 RATES = ("--wheel-rate", "50", "--gnss-rate", "5", "--heading-rate", "50")
 
 
+DASK_SETTINGS = {  # of docs/fleet.md
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "500ms",
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "2s",
+}
+
+
 def make_logs(folder: Path, count: int) -> Path:
     """Simulate the logs that are not there yet."""
     logs = folder / f"logs{count}"
@@ -78,7 +85,8 @@ def with_dask(logs: Path, output: Path) -> dict[str, float]:
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "8799",
             "--dashboard-address", "127.0.0.1:0"]  # fmt: skip
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "tcp://127.0.0.1:8799", "--nthreads", "1"]
-    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in (dask, worker, worker)]
+    settings = {**os.environ, **DASK_SETTINGS}
+    processes = [subprocess.Popen(one, stderr=subprocess.DEVNULL, env=settings) for one in (dask, worker, worker)]
     try:
         time.sleep(5.0)
         return run(logs, output, "--scheduler", "tcp://127.0.0.1:8799")

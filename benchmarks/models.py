@@ -16,7 +16,8 @@ import numpy as np
 
 from icrtool.calibration.forecast import forecast_trials
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import calibrate, gyro_recording_of, predictor
+from icrtool.calibration.pooled import calibrate_recordings, predictor
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.estimation.fit import fit
@@ -57,7 +58,7 @@ def recordings_below(folder: Path, config: Config) -> Iterator[tuple[Path, Recor
     for path in runs or sorted(one.path for one in find_recordings(places)):
         try:
             run = open_run(path) if runs else fit(read_log(path, config), config)
-            yield path, gyro_recording_of(run)
+            yield path, turning_recording_of(run)
         except IcrToolError as err:
             print(f"<!-- left out: {err} -->")
 
@@ -88,7 +89,7 @@ def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
     """Return the share of the trials of all left-out logs within their 95 % forecast, by wheels, and with the gyro."""
     inside: dict[str, list[Floats]] = {}
     for i, one in enumerate(recordings):
-        calibration = calibrate(recordings[:i] + recordings[i + 1 :]).calibration
+        calibration = calibrate_recordings(recordings[:i] + recordings[i + 1 :]).calibration
         trials = cut_trials(one, HORIZONS_M)
         for with_gyro in (False, True)[: 1 + (calibration.gyro is not None and one.gyro_radps is not None)]:
             errors = predictor(calibration, one, with_gyro=with_gyro)(trials)

@@ -111,7 +111,7 @@ def filter_speed(logs: dict[str, Path], repeats: int) -> None:
 
     config = icrtool.load_config(robot="segway-rmp400")
     setup = set_up_filter(sensors_as_sent(icrtool.read_log(logs["hour.mcap"], config), config), config)
-    seconds = timed(lambda: run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters), max(repeats, 5))
+    seconds = timed(lambda: run_ekf(*setup), max(repeats, 5))
     events = len(setup.data.wheel_t) + len(setup.data.gnss_t) + len(setup.data.heading_t)
     row("filter, events a second", [events / s / 1e6 for s in seconds], goal=">= 5", unit="million")
 

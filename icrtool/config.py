@@ -1,4 +1,7 @@
-"""Validated configuration: built-in robot < TOML file < ``--set`` < option. Out again as plain data for run.json."""
+"""Validated configuration: built-in robot < TOML file < ``--set`` < option. Out again as plain data for run.json.
+
+What each key means stands in ``config_keys.toml``, which ``icrtool config`` prints with types, bounds and defaults.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ Longitude = Annotated[float, msgspec.Meta(ge=-180, le=360)]
 
 @dataclass(frozen=True, slots=True)
 class RobotConfig:
-    """The robot: `track_width_m` is b of Eqs. 38-39, the distance between the centre lines of the tracks."""
+    """The robot: `track_width_m` is b of Eqs. 38-39."""
 
     name: str | None = None
     track_width_m: Width | None = None
@@ -56,7 +59,7 @@ class RobotConfig:
 
 @dataclass(frozen=True, slots=True)
 class TopicsConfig:
-    """Topics by role. What is left out is found by type and content."""
+    """Topics by role."""
 
     wheels: str | None = None
     wheel_left: str | None = None
@@ -73,13 +76,7 @@ class TopicsConfig:
 
 @dataclass(frozen=True, slots=True)
 class WheelsConfig:
-    """How wheel messages become speeds.
-
-    Scales multiply the travel of a side (1.02: the wheel is 2 % larger). ``auto`` is 1, or with preset ``field`` the
-    common scale of both sides by the position reference, where it is significant.
-    `twist_width_m` is the width that the controller used to compute a body twist from wheel speeds: its wheel
-    separation times its multiplier. Default: `RobotConfig.track_width_m`.
-    """
+    """How wheel messages become speeds."""
 
     left_joints: tuple[str, ...] = ()
     right_joints: tuple[str, ...] = ()
@@ -96,12 +93,7 @@ class WheelsConfig:
 
 @dataclass(frozen=True, slots=True)
 class FramesConfig:
-    """Positions of sensors on the robot, and the convention, offset and delay of the heading.
-
-    `antenna_*`: the antenna from the body origin; ``auto`` takes it from the log's own ``/tf_static``, else 0.
-    `reference_delay_s`, `heading_delay_s`: how much the position reference and the heading lag behind the wheels;
-    ``auto`` corrects a significant delay (preset ``field``).
-    """
+    """Positions of sensors on the robot, and the convention, offset and delay of the heading."""
 
     heading: Literal["auto", "enu", "ned"] = "auto"
     heading_offset_deg: Literal["auto"] | Degrees = "auto"
@@ -114,16 +106,10 @@ class FramesConfig:
 
 @dataclass(frozen=True, slots=True)
 class FilterConfig:
-    """The EKF of Section 3. A value left out is the preset's.
+    """The EKF of Pentzer 2014, Section 3.
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
-    `heading_std_deg` those of R (Eq. 31), used where the messages state none. `process_position_mps` is 0.2 (Eq. 30);
-    in preset ``field``, ``auto`` starts at 0.3 and raises it when the fixes contradict wheels this good.
-    `process_heading_degps` is 5 (Eq. 30), in preset ``field`` 7.
-    `terrain_icr_std_m` is how uncertain the ICRs are after a terrain change: 10 (Section 5.2), in preset ``field`` the
-    robot's width.
-    `heading_correlation_s`: errors of an AHRS are correlated over this time, so closer samples are not independent
-    (``field`` only).
+    `heading_std_deg` those of R (Eq. 31); `terrain_icr_std_m`: Section 5.2. A value left out is the preset's.
     """
 
     preset: Literal["field", "paper"] = "field"

@@ -15,7 +15,7 @@ import pytest
 
 from icrtool.calibration.forecast import forecast_drive
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_recording import recording_of
 from icrtool.calibration.transfer import compare_groups
 from icrtool.dropout_analysis.acceptance_limits import parse_gate
 from icrtool.dropout_analysis.dropout_report import dropout_report

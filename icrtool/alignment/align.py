@@ -10,6 +10,7 @@ import numpy as np
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, run_sections, start_icrs
 from icrtool.alignment.position.gnss_quality import grade_fixes
+from icrtool.alignment.position.gnss_steps import without_frozen
 from icrtool.alignment.position.sensor_noise import heading_variance, position_variance
 from icrtool.alignment.slip.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
@@ -18,7 +19,7 @@ from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.measurements import Fixes, Measurements, SensorData
-from icrtool.records.run import half_width_m
+from icrtool.records.run import width_or_usual_m
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -42,6 +43,8 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
+    if config.filter.preset == "field":
+        log = without_frozen(log)
     found = _align_once(log, config)
     if config.filter.preset == "paper":
         # it takes its wheels as they are
@@ -95,7 +98,7 @@ def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurem
 
     A log with too little besides them keeps its first alignment.
     """
-    width = 2 * half_width_m(config.robot.track_width_m)
+    width = width_or_usual_m(config.robot.track_width_m)
     events = find_slip_events(found.sensors, width)
     if events:
         spans = tuple((event.begin_ns, event.end_ns) for event in events)

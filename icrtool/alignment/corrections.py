@@ -51,7 +51,7 @@ from icrtool.alignment.wheels.wheel_alignment import (
 from icrtool.alignment.wheels.wheel_units import refuse_parked
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.records.run import half_width_m
+from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 FAR_IN_POSITION_STD, SHORT_DRIVE_M = 30.0, 0.3
@@ -101,7 +101,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     DataError
         Streams that cannot be used together, an unexplained heading, wheels that turn while the robot stands.
     """
-    corrects, width = config.filter.preset == "field", 2.0 * half_width_m(config.robot.track_width_m)
+    corrects, width = config.filter.preset == "field", width_or_usual_m(config.robot.track_width_m)
     as_sent = log
     log, derived, decision, drive, windows, notes, sound = _name_streams(log, config, width)
     refuse_standing(log, drive, windows)

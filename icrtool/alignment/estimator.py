@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
-from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.records.measurements import RESPONSE_S
 
@@ -106,7 +106,7 @@ class Geometry(NamedTuple):
     covariance: Floats
 
 
-class WindowResiduals(NamedTuple):
+class ResidualsByEstimate(NamedTuple):
     """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
 
     Attributes
@@ -199,7 +199,7 @@ class AlignmentFit(NamedTuple):
         return Geometry(values, covariance)
 
 
-def window_residuals(found: AlignmentFit) -> WindowResiduals:
+def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
     model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
@@ -209,7 +209,7 @@ def window_residuals(found: AlignmentFit) -> WindowResiduals:
         residual, _ = model.evaluate(x)
         parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
     (before, turn_before), (after, turn_after) = parts
-    return WindowResiduals(before, after, turn_before, turn_after, model.turned)
+    return ResidualsByEstimate(before, after, turn_before, turn_after, model.turned)
 
 
 def _clock_std_s(drive: DriveArrays, width_m: float) -> float:
@@ -275,7 +275,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
 
 def _smooth(t: Floats, angle: Floats) -> Floats:
     """Return the mean of an angle (h,) over `SMOOTH_S` to either side of its times t (h,): noise is no turn."""
-    area = np.concatenate([[0.0], np.cumsum(np.diff(t) * (angle[1:] + angle[:-1]) / 2)])
+    area = trapezoids(t, angle)
     begin, end = np.maximum(t - SMOOTH_S, t[0]), np.minimum(t + SMOOTH_S, t[-1])
     reach = np.minimum(t - begin, end - t)
     size = np.maximum(2.0 * reach, 1e-9)

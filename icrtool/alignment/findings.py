@@ -10,7 +10,7 @@ from icrtool.alignment.corrections import AlignedStreams
 from icrtool.alignment.estimator import AlignmentFit, Geometry
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, IcrStart, Scalar
-from icrtool.records.run import half_width_m
+from icrtool.records.run import width_or_usual_m
 
 LEAST_START_STD, INFLATION = 0.15, 3.0
 """The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
@@ -111,7 +111,7 @@ def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: C
     """
     if config.filter.preset == "paper":
         return None
-    b = 2.0 * half_width_m(config.robot.track_width_m)
+    b = width_or_usual_m(config.robot.track_width_m)
     least = LEAST_START_STD * b
     if found is not None:
         right, left, x = found.values[:3].tolist()

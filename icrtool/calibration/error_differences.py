@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.open_loop.block_sums import LEVEL
+from icrtool.kernels.open_loop.error_statistics import RESAMPLES, error_summary
 from icrtool.kernels.open_loop.trials import Drive
-
-RESAMPLES, LEVEL = 300, 0.95
+from icrtool.records.dropout import DEFAULT_SEED
 
 SHORTEST_BLOCK_M = 10.0
 
@@ -33,7 +33,7 @@ class ErrorEstimate(NamedTuple):
 
 
 def compare_errors(
-    first: Floats, first_block: Ints, second: Floats, second_block: Ints, *, paired: bool, seed: int
+    first: Floats, first_block: Ints, second: Floats, second_block: Ints, *, paired: bool, seed: int = DEFAULT_SEED
 ) -> ErrorEstimate:
     """Return p95 and mean of errors, second minus first.
 

@@ -8,8 +8,8 @@ from typing import cast
 
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import recommend
-from icrtool.calibration.pooled import recording_of
 from icrtool.calibration.record import fitted_document
+from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit as fit_filter

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of
-from icrtool.calibration.pooled import calibrate as calibrate_recordings
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.records.run import Run
 
@@ -36,7 +36,7 @@ def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
     alone: tuple[str, ...] = ()
     warnings: list[str] = []
     for run in runs:
-        recordings.append(gyro_recording_of(run))
+        recordings.append(turning_recording_of(run))
         robots.append(robot_of(run))
         alone = use_warnings(run)
         warnings += use_warnings(run, alone=False)

@@ -14,15 +14,9 @@ import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import (
-    ErrorsOf,
-    calibration_from,
-    held_out_predictor,
-    recording_of,
-    scaled_gyro,
-    with_turn_rate,
-)
+from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.error_statistics import error_summary
@@ -33,7 +27,7 @@ from icrtool.motion.recording import Recording
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import MeasuredHeading, ModelScore
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run, half_width_m
+from icrtool.records.run import Run, width_or_usual_m
 
 FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
 """Names of the table's rows (public) and of the models of the family that they are."""
@@ -152,7 +146,7 @@ def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
     notes = []
-    plain = recording_of(run, width_m=2.0 * half_width_m(run.track_width_m))
+    plain = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
         found = with_turn_rate(plain, one)
         if found.gyro_radps is not None:
@@ -167,8 +161,9 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
 
 def _icrs_of(run: Run, name: str) -> FrozenIcrs:
     """Return the filter's ICRs, momentary or final."""
-    columns = (run.table.y_icr_right_m, run.table.y_icr_left_m, run.table.x_icr_m)
-    return FrozenIcrs(*columns) if name == "icr" else FrozenIcrs(*(column[-1:] for column in columns))
+    if name == "icr":
+        return FrozenIcrs(run.table.y_icr_right_m, run.table.y_icr_left_m, run.table.x_icr_m)
+    return FrozenIcrs.constant(*run.table.icrs_at(-1))
 
 
 def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOut) -> Iterator[ModelScore]:

@@ -58,7 +58,7 @@ RESPONSE_PART = "the robot's own response to its wheels is part of it"
 STEADY = 0.15
 """A speed is steady where its standard deviation is less than this share of its mean."""
 
-MOVING_MPS = 0.05
+MOVING_MPS, TURNING_DEGPS = 0.05, 2.0
 
 SETTING_SIGMAS = 3.0
 
@@ -95,12 +95,12 @@ class Setting:
 class DriveFacts(NamedTuple):
     """Turns, speeds and distance of a drive; speeds are those while moving."""
 
-    turned_right_rad: float
-    turned_left_rad: float
-    turn_rate_radps: float
-    speed_mps: float
-    speed_std_mps: float
     distance_m: float
+    turned_right_deg: float
+    turned_left_deg: float
+    turn_rate_p95_degps: float
+    speed_mean_mps: float
+    speed_std_mps: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class LogCalibration:
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for calibration.json."""
-        facts = self.facts
+        facts = self.facts._asdict()
         return {
             "schema": CALIBRATION_SCHEMA,
             "log": self.name,
@@ -138,14 +138,7 @@ class LogCalibration:
             "windows": self.windows,
             "independent_stretches": self.stretches,
             "window_miss_m": self.residual_m,
-            "drive": {
-                "way_m": facts.distance_m,
-                "turned_right_deg": math.degrees(facts.turned_right_rad),
-                "turned_left_deg": math.degrees(facts.turned_left_rad),
-                "turn_rate_p95_degps": math.degrees(facts.turn_rate_radps),
-                "speed_mean_mps": facts.speed_mps,
-                "speed_std_mps": facts.speed_std_mps,
-            },
+            "drive": {"way_m": facts.pop("distance_m"), **facts},
             "parameters": {
                 one.key: {"value": one.value, "std": one.std, "verdict": one.verdict, "note": one.note}
                 for one in self.parameters
@@ -187,15 +180,15 @@ def _drive_facts(run: Run) -> DriveFacts:
     )
     moving = np.abs(left) + np.abs(right) > MOVING_MPS
     speed = (left + right)[moving] / 2
-    rate = np.abs(left - right)[moving] / max(_finding(run, SEPARATION.finding)[0], 1e-3)
-    turning = rate[rate > math.radians(2.0)]
+    rate = np.degrees(np.abs(left - right)[moving] / max(_finding(run, SEPARATION.finding)[0], 1e-3))
+    turning = rate[rate > TURNING_DEGPS]
     return DriveFacts(
-        math.radians(excitation["turned_right_deg"]),
-        math.radians(excitation["turned_left_deg"]),
+        run.summary["drive"]["distance_m"],
+        excitation["turned_right_deg"],
+        excitation["turned_left_deg"],
         float(np.percentile(turning, 95)) if len(turning) else 0.0,
         float(np.abs(speed).mean()) if len(speed) else 0.0,
         float(speed.std()) if len(speed) else 0.0,
-        run.summary["drive"]["distance_m"],
     )
 
 
@@ -222,9 +215,11 @@ def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
 
 def _reason(kind: _Kind, facts: DriveFacts) -> str:
     """Return why the drive does not determine a parameter well, and what to drive."""
-    if kind.key.startswith("gnss_delay") and facts.speed_std_mps < STEADY * facts.speed_mps:
-        return f"speed hardly changes ({facts.speed_mps:.2f} ± {facts.speed_std_mps:.2f} m/s): add stops and starts"
-    right, left = facts.turned_right_rad, facts.turned_left_rad
+    if kind.key.startswith("gnss_delay") and facts.speed_std_mps < STEADY * facts.speed_mean_mps:
+        return (
+            f"speed hardly changes ({facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s): add stops and starts"
+        )
+    right, left = math.radians(facts.turned_right_deg), math.radians(facts.turned_left_deg)
     lacks = lacking_turns(right, left)
     if lacks and (kind.key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
         return lacks

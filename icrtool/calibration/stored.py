@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, TypedDict, TypeVar
+from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
 
 import msgspec
 import numpy as np
 
-from icrtool.calibration.record import (
-    Calibration,
-    CalibrationLog,
-    ControllerErrors,
-    ErrorSources,
-    HeldOutScore,
-)
+from icrtool.calibration.record import Calibration, CalibrationLog, ControllerErrors, ErrorSources, HeldOutScore
 from icrtool.motion.models import FittedModel, TypicalDrive, find_model
 from icrtool.records.run import CALIBRATION_SCHEMA
 from icrtool.records.text import escaped
@@ -31,18 +25,13 @@ Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
 class RobotDocument(TypedDict):
-    """The robot of a calibration; radius and scales may be missing."""
+    """The robot of a calibration."""
 
     name: str | None
     track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
-
-
-class ScalesDocument(TypedDict, total=False):
-    """What else is known of the robot."""
-
-    wheel_radius_m: Scale | None
-    left_scale: Scale
-    right_scale: Scale
+    wheel_radius_m: NotRequired[Scale | None]
+    left_scale: NotRequired[Scale]
+    right_scale: NotRequired[Scale]
 
 
 def calibration_of(document: Mapping[str, Any]) -> Calibration:
@@ -91,7 +80,6 @@ def _text(value: object) -> str:
 
 def _robot(document: Mapping[str, Any]) -> dict[str, Any]:
     msgspec.convert(document, RobotDocument)
-    msgspec.convert(document, ScalesDocument)
     return {name: escaped(value) if isinstance(value, str) else value for name, value in document.items()}
 
 

@@ -15,17 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_differences import (
-    LEVEL,
-    RESAMPLES,
-    ErrorEstimate,
-    blocks_of,
-    compare_errors,
-    same_route,
-)
+from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, gyro_recording_of, held_out_predictor, predictor
+from icrtool.calibration.pooled import CalibrationResult, held_out_predictor, predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
@@ -107,14 +101,13 @@ class Transfer:
         return next(one for one in self.cells if one[:3] == where)
 
 
-def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_SEED) -> Transfer:
+def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
     """Calibrate each group of runs and compare the groups.
 
     Parameters
     ----------
     groups : at least two, by name, each the runs of one robot; groups of different robots have no errors of one
         calibration on the other (NaN)
-    seed : of the bootstrap
 
     Raises
     ------
@@ -132,13 +125,13 @@ def compare_groups(groups: Mapping[str, Sequence[Run]], *, seed: int = DEFAULT_S
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
-    recordings = {name: [gyro_recording_of(run) for run in runs] for name, runs in groups.items()}
+    recordings = {name: [turning_recording_of(run) for run in runs] for name, runs in groups.items()}
     _check_apart(recordings)
-    return compare_calibrations({name: calibrate_runs(runs) for name, runs in groups.items()}, recordings, seed=seed)
+    return compare_calibrations({name: calibrate_runs(runs) for name, runs in groups.items()}, recordings)
 
 
 def compare_calibrations(
-    results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]], *, seed: int = DEFAULT_SEED
+    results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]]
 ) -> Transfer:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
@@ -148,14 +141,14 @@ def compare_calibrations(
         else:
             known = tested[column, column]
             tested[row, column] = known._replace(errors=np.full_like(known.errors, np.nan))
-    cells = (cell for row, column in product(results, results) for cell in _cells(row, column, tested, seed))
+    cells = (cell for row, column in product(results, results) for cell in _cells(row, column, tested))
     first, *others = results
     pairs = []
     for other in others:
         (one, *_), (two, *_) = groups = recordings[first], recordings[other]
         paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.drive, two.drive)
         parameters = _parameter_differences(results[first].calibration, results[other].calibration)
-        errors = _differences(tested[first, first], tested[other, other], paired=paired, seed=seed)
+        errors = _differences(tested[first, first], tested[other, other], paired=paired)
         pairs.append(Pair(first, other, parameters, dict(zip(HORIZONS_M, errors, strict=True)), paired))
     return Transfer({name: one.calibration for name, one in results.items()}, tuple(pairs), tuple(cells))
 
@@ -185,24 +178,24 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     return _Tested(np.concatenate(errors), np.concatenate(path))
 
 
-def _differences(first: _Tested, second: _Tested, *, paired: bool, seed: int) -> list[ErrorEstimate]:
+def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorEstimate]:
     """Return the difference of errors at each horizon, second minus first."""
     found = []
     for h, horizon in enumerate(HORIZONS_M):
         blocks = [blocks_of(one.path, horizon) for one in (first, second)]
         sides = first.errors[:, h], blocks[0], second.errors[:, h], blocks[1]
-        found.append(compare_errors(*sides, paired=paired, seed=seed))
+        found.append(compare_errors(*sides, paired=paired))
     return found
 
 
-def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested], seed: int) -> Iterator[Cell]:
+def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested]) -> Iterator[Cell]:
     """Yield the cells of one row and column, a horizon each."""
     errors, path = tested[row, column]
     summary = error_summary(errors)
     blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
-    interval = bootstrap_intervals(errors, blocks, seed, RESAMPLES, LEVEL)
+    interval = bootstrap_intervals(errors, blocks, DEFAULT_SEED)
     own, foreign = tested[column, column], tested[row, column]
-    costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True, seed=seed)
+    costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True)
     of_horizons = np.column_stack([
         summary.p95, interval.p95_low, interval.p95_high, summary.expected, interval.expected_low,
         interval.expected_high,

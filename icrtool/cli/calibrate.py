@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import runs_of
+from icrtool.cli.fit import check_run_config, runs_of
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -87,14 +87,11 @@ def command(
 
 def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:
     """Read runs, and fit logs."""
-    from icrtool.errors import ConfigError
     from icrtool.output.run_directory import is_run_directory
 
     finished = all(is_run_directory(source) for source in sources)
-    if config.given_sections and finished:
-        section = min(config.given_sections)
-        advice = "name the logs instead"
-        raise ConfigError(f"[{section}]", "a finished run keeps the configuration it was made with", advice)
+    if finished:
+        check_run_config(config)
     with ThreadPoolExecutor(1) as other:
         if finished:
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter
@@ -124,7 +121,7 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
 def _draw(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
     from icrtool.alignment.corrections import align_streams
-    from icrtool.alignment.estimator import window_residuals
+    from icrtool.alignment.estimator import residuals_by_estimate
     from icrtool.alignment.position.reference_choice import choose_reference
     from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
@@ -135,4 +132,4 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     log = read_log(source if run.directory is None else log_of(run), run.config)
     fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit
     if fit is not None:
-        save_picture(residuals_figure(run.name, window_residuals(fit)), plot)
+        save_picture(residuals_figure(run.name, residuals_by_estimate(fit)), plot)

@@ -25,10 +25,4 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     """  # noqa: D301 - click reads the escape
     from icrtool.output.tables.configuration import format_configuration
 
-    text = format_configuration(options.load(config_file, robot, sets))
-    if output is None:
-        click.echo(text, nl=False)
-        return
-    from icrtool.output.files.atomic_file import write_file
-
-    write_file(output, text)
+    options.write_or_print(format_configuration(options.load(config_file, robot, sets)), output)

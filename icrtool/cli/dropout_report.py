@@ -11,7 +11,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.drive_options import numbers
-from icrtool.cli.fit import RUNS, fit_log, logs_of, run_directories
+from icrtool.cli.fit import RUNS, check_run_config, fit_log, logs_of, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
 from icrtool.cli.terminal import show
@@ -152,9 +152,7 @@ def plan_sources(
     logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
     if logs:
         return sources, dict(zip(logs, run_directories(logs, output, into), strict=True))
-    if given := sorted(config.given_sections - {"dropout"}):
-        advice = "fit the log again with it, or name the log in place of its run"
-        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+    check_run_config(config, free="dropout")
     if output or into:
         raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
     return sources, {}

@@ -66,9 +66,9 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
     if target in CONTROLLERS:
         from icrtool.output.exports.controllers import format_export
 
-        _leave(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
+        options.write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
     else:
-        _leave(_path_text(_run(source), target), output)
+        options.write_or_print(_path_text(_run(source), target), output)
 
 
 def _path_text(run: Run, target: str) -> str:
@@ -87,16 +87,6 @@ def _path_text(run: Run, target: str) -> str:
     return f"{format_kml(run)}\n"
 
 
-def _leave(text: str, output: Path | None) -> None:
-    """Write a text to its file, or print it."""
-    if output is None:
-        click.echo(text, nl=False)
-        return
-    from icrtool.output.files.atomic_file import write_file
-
-    write_file(output, text)
-
-
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
     from icrtool.output.exports.paths import paths_of
@@ -105,7 +95,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
     directory.mkdir(parents=True, exist_ok=True)
     for path in paths_of(run):
         file = directory / f"{path.name}{SUFFIXES[target]}"
-        _leave(format_trajectory(path, target), file)
+        options.write_or_print(format_trajectory(path, target), file)
         click.echo(f"written to {file}")
 
 

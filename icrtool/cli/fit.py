@@ -100,6 +100,15 @@ def logs_of(places: tuple[Path, ...], *, quiet: bool) -> tuple[Path, ...]:
     return tuple(logs)
 
 
+def check_run_config(config: Config, *, free: str = "") -> None:
+    """Refuse settings for a finished run, but those of the section that a report on it is free to change."""
+    from icrtool.errors import ConfigError
+
+    if given := sorted(config.given_sections - {free}):
+        advice = "fit the log again with it, or name the log in place of its run"
+        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+
+
 def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[Path]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
 

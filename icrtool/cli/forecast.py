@@ -72,10 +72,10 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
 
     with_gyro = calibration.gyro_sources is not None
     if is_run_directory(path):
-        from icrtool.calibration.pooled import gyro_recording_of
+        from icrtool.calibration.run_recording import turning_recording_of
         from icrtool.output.stored_run import open_run
 
-        recording = gyro_recording_of(open_run(path))
+        recording = turning_recording_of(open_run(path))
         with_gyro = with_gyro and recording.gyro_radps is not None
         forecast = partial(forecast_drive, calibration, recording)
     else:

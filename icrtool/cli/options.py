@@ -227,6 +227,16 @@ def load(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> 
     return load_config(config_file, robot, sets)
 
 
+def write_or_print(text: str, output: Path | None) -> None:
+    """Write a text to its file, or print it where none is named."""
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    from icrtool.output.files.atomic_file import write_file
+
+    write_file(output, text)
+
+
 def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
     """Print warnings on standard error."""
     if not quiet:

@@ -15,7 +15,8 @@ from icrtool.cli.options import NOT_NEGATIVE, POSITIVE
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.logs.writing.log import WriteOptions
-    from icrtool.simulation.drives import DrivePlan, Icrs, Sensors
+    from icrtool.records.tables import Icrs
+    from icrtool.simulation.drives import DrivePlan, Sensors
     from icrtool.simulation.record import TruthTable
 
 WHEEL_MESSAGES = ("joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped")

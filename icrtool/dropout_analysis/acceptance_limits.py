@@ -15,7 +15,7 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.kernels.open_loop.trials import Summary
-from icrtool.records.dropout import BudgetDistance, Gate, Verdict
+from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -41,10 +41,10 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
     found = []
     for result in report.results:
-        reached = _budget_distance(report.horizons_m, result.summary.p95, budget_m)
+        reached = within_budget(report.horizons_m, result.summary.p95, budget_m)
         if reached is not None:
             ends = (
-                _budget_distance(report.horizons_m, p95, budget_m)
+                within_budget(report.horizons_m, p95, budget_m)
                 for p95 in (result.intervals.p95_high, result.intervals.p95_low)
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
@@ -94,8 +94,8 @@ def check_gate(
         known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
         raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m for {gate.model}", f"use {known}")
     h = int(places[0])
-    column = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}[gate.metric]
-    value = float(getattr(summary, column)[h])
+    field, _ = METRICS[gate.metric]
+    value = float(getattr(summary, field)[h])
     if gate.baseline_factor and baseline is None:
         return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
     half_width, before = math.nan, math.nan
@@ -129,9 +129,14 @@ def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[
     raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
 
 
-def _budget_distance(
-    horizons_m: Floats, p95_m: Floats, budget_m: float
-) -> tuple[float, bool, tuple[float, float]] | None:
+def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
+    """Return how far an error (h,) [m] that grows with the distance (h,) [m], from 0 m at 0 m, stays within a budget.
+
+    Returns
+    -------
+    The interpolated distance, whether the error is within the budget at the last one, and the distances interpolated
+    between; None without errors.
+    """
     known = np.isfinite(p95_m)
     if not known.any():
         return None

@@ -9,13 +9,10 @@ from typing import Any, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import ConfigError
-from icrtool.kernels.open_loop.block_sums import BlockSums, variance_of_sum
+from icrtool.kernels.open_loop.block_sums import LEVEL, BlockSums, variance_of_sum
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import listed
-
-LEVEL = 0.95
-"""The interval of a difference holds the true one with this probability."""
 
 
 class BaselineRow(NamedTuple):

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Literal
 
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
-from icrtool.calibration.pooled import gyro_recording_of, predictor
+from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
@@ -102,7 +103,7 @@ def dropout_report(
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),
         baseline=baseline,
-        by_turning=split_by_turning(compared, starts=starts),
+        by_turning=split_by_turning(compared, starts),
         no_comparison=why,
     )
 
@@ -130,7 +131,7 @@ def _calibration_rows(
 ) -> tuple[tuple[UsedCalibration, ...], list[ConstantModel]]:
     """Return what is known of each calibration, and the model of its row."""
     used, models = [], []
-    recording = gyro_recording_of(run) if calibrations else None
+    recording = turning_recording_of(run) if calibrations else None
     for number, one in enumerate(calibrations, start=1):
         stem = one.name or str(number)
         if sum(other.name == one.name for other in calibrations) > 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
+from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, open_loop_path, trial_ends
@@ -28,9 +28,7 @@ def worst_trials(
 ) -> tuple[ExampleTrial, ...]:
     """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
     drive, models = drive_of(run), models_of(run)
-    ends = trial_ends(drive, np.array([horizon_m]))
-    if starts == "moving":
-        leave_out_standing(ends, standing_states(drive))
+    ends = counted_ends(drive, horizon_m, starts)
     errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
     ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
     chosen: list[int] = []

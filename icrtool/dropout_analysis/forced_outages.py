@@ -75,7 +75,7 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
         The run cannot be made again.
     """
     setup = set_up_again(run, tuple(spans_ns))
-    output = run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    output = run_ekf(*setup)
     # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
     rows = min(len(output.x), len(run.table))
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]

@@ -28,11 +28,10 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))
         if first == 0 or last >= len(table) or last <= first or run.in_gap[first:last].any():
             continue
-        right, left, x = (float(column[first]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
         after = int(np.searchsorted(table.stamp_ns, end + round(COMPARED_S * 1e9)))
         gaps = np.flatnonzero(run.in_gap[last:after])
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
-        path = open_loop_path(drive, right, left, x, first, after)
+        path = open_loop_path(drive, *table.icrs_at(first), first, after)
         error = _end_error_m(run, path, table.stamp_ns[first : after + 1], int(end))
         inside = slice(last - first + 1)
         outages.append(

@@ -6,7 +6,6 @@ it is here, and no kernel: a process that only draws it need not load numba.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -27,6 +26,7 @@ from icrtool.records.dropout import (
     TurningSplit,
     UsedCalibration,
     Verdict,
+    error_columns,
 )
 from icrtool.records.late_output import call_output
 
@@ -123,29 +123,16 @@ class DropoutReport:
     def summary_columns(self) -> dict[str, list[str] | Floats | Ints]:
         """Return the columns of summary.csv: a row per model and horizon."""
         h = self.horizons_m
-        names = [result.name for result in self.results for _ in h]
-        horizon = np.tile(h, len(self.results))
-
-        def stacked(values: Sequence[Floats]) -> Floats:
-            return np.concatenate(values) if values else np.empty(0)
-
-        summaries = [result.summary for result in self.results]
-        intervals = [result.intervals for result in self.results]
-        expected, p95 = stacked([s.expected for s in summaries]), stacked([s.p95 for s in summaries])
+        parts = [
+            error_columns(one.summary)
+            | {"expected_pct": 100.0 * one.summary.expected / h, "p95_pct": 100.0 * one.summary.p95 / h}
+            | {f"{name}_m": values for name, values in one.intervals._asdict().items()}
+            for one in self.results
+        ]
         return {
-            "model": names,
-            "horizon_m": horizon,
-            "trials": np.concatenate([s.trials for s in summaries]) if summaries else np.empty(0, np.int64),
-            "expected_error_m": expected,
-            "p50_m": stacked([s.p50 for s in summaries]),
-            "p95_m": p95,
-            "max_m": stacked([s.largest for s in summaries]),
-            "expected_pct": 100.0 * expected / horizon,
-            "p95_pct": 100.0 * p95 / horizon,
-            "expected_low_m": stacked([i.expected_low for i in intervals]),
-            "expected_high_m": stacked([i.expected_high for i in intervals]),
-            "p95_low_m": stacked([i.p95_low for i in intervals]),
-            "p95_high_m": stacked([i.p95_high for i in intervals]),
+            "model": [one.name for one in self.results for _ in h],
+            "horizon_m": np.tile(h, len(parts)),
+            **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         }
 
     def write(self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",)) -> None:

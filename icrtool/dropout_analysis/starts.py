@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.estimation.observability import WEAK_SHARE
-from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.open_loop.direct import STANDING
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.open_loop.direct import STANDING, trial_ends
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.run import ICR_COLUMNS, Run
 
@@ -36,6 +36,14 @@ def standing_states(drive: Drive) -> Bools:
 def leave_out_standing(ends: NDArray[np.signedinteger], standing: Bools) -> None:
     """Mark the trials of standing starts as none, in the ends (n, h) of `trial_ends`."""
     ends[standing[:, None] & (ends >= 0)] = STANDING
+
+
+def counted_ends(drive: Drive, horizon_m: float, starts: Starts) -> Ints:
+    """Return `trial_ends` (n, 1) of one horizon, without the starts that do not count."""
+    ends = trial_ends(drive, np.array([horizon_m]))
+    if starts == "moving":
+        leave_out_standing(ends, standing_states(drive))
+    return ends
 
 
 def first_learned(run: Run) -> int | None:

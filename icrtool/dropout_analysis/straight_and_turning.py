@@ -7,11 +7,10 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from icrtool.dropout_analysis.starts import Starts, leave_out_standing, standing_states
+from icrtool.dropout_analysis.starts import Starts, counted_ends
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_of_cells
-from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import TurningSplit
@@ -25,28 +24,26 @@ CELLS = 20
 SPLIT_MODELS = ("icr", "no_slip")
 
 
-def split_by_turning(
-    run: Run, horizon_m: float = SPLIT_HORIZON_M, *, starts: Starts = "moving"
-) -> tuple[TurningSplit, ...]:
-    """Return the errors of straight and turning trials of one horizon (Pentzer 2014, Section 6.4, Figs. 33-34).
+def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
+    """Return the errors of straight and turning trials of `SPLIT_HORIZON_M` (Pentzer 2014, Section 6.4, Figs. 33-34).
 
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     drive = drive_of(run)
-    ends = trial_ends(drive, np.array([horizon_m]))
-    if starts == "moving":
-        leave_out_standing(ends, standing_states(drive))
+    ends = counted_ends(drive, SPLIT_HORIZON_M, starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
-    straight = heading_range(drive, horizon_m)[tried] < STRAIGHT_RAD
+    straight = heading_range(drive, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
     parts = {kind: part for kind, part in ((True, straight), (False, ~straight)) if part.any()}
 
     def mean_errors(model: Model) -> dict[bool, float]:
         errors = open_loop_errors(drive, model.icrs, ends)[tried, 0]
         return {kind: float(errors[part].mean()) for kind, part in parts.items()}
 
-    means = {model.name: mean_errors(model) for model in models_of(run) if model.name in SPLIT_MODELS}
+    of_model = {model.name: mean_errors(model) for model in models_of(run) if model.name in SPLIT_MODELS}
     return tuple(
-        TurningSplit(kind, horizon_m, int(np.count_nonzero(part)), {name: mean[kind] for name, mean in means.items()})
+        TurningSplit(
+            kind, SPLIT_HORIZON_M, int(np.count_nonzero(part)), {name: means[kind] for name, means in of_model.items()}
+        )
         for kind, part in parts.items()
     )
 

@@ -31,11 +31,7 @@ from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summa
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run, drive_of, straight_drive
-
-BOOTSTRAP_RESAMPLES = 300
-BOOTSTRAP_LEVEL = 0.95
-"""Intervals hold the truth with this probability, as far as blocks of the horizon's length are independent."""
+from icrtool.records.run import Run, drive_of, no_slip_icrs, straight_drive
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -249,9 +245,8 @@ def models_of(run: Run) -> tuple[Model, ...]:
     models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
     width = run.track_width_m
     if width is not None:
-        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
-    final = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*final)))
+        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width))))
+    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*table.icrs_at(-1))))
     return tuple(models)
 
 
@@ -329,7 +324,7 @@ def _result_of(
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
         summary = summary_of_sorted([ordered])
-        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed, BOOTSTRAP_RESAMPLES, BOOTSTRAP_LEVEL)
+        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
         return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
 from icrtool.records.events import SlipEvent, intervals_in
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
-from icrtool.records.run import WarmStart, half_width_m
+from icrtool.records.run import WarmStart, width_or_usual_m
 
 
 class ProcessNoise(NamedTuple):
@@ -78,9 +77,8 @@ PAPER_TERRAIN_ICR_STD_M = 10.0
 width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
-@dataclass(frozen=True, slots=True)
-class FilterSetup:
-    """One run, ready for the kernel.
+class FilterSetup(NamedTuple):
+    """One run, ready for the kernels: the arguments of `run_ekf` and `run_smoother`.
 
     Attributes
     ----------
@@ -88,10 +86,10 @@ class FilterSetup:
     """
 
     data: FilterInputs
-    parameters: FilterParameters
     t0: float
     x0: Floats
     P0: Floats
+    parameters: FilterParameters
 
 
 def check_start(config: Config) -> None:
@@ -163,19 +161,10 @@ def set_up_filter(
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     # Of the whole stream: what an outage takes away must not change how the rest is weighed.
     noise = noise or configured_noise(config)
-    correlation_s = sensors.heading_correlation_s
-    if sensors.heading_is_estimated:
-        # Headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
-        # with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more.
-        density = math.radians(noise.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
-        variance = float(np.median(headings.var_rad2))
-        # The memory of the filter is then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
-        usual = math.radians(FIELD_NOISE.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
-        correlation_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
-    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), correlation_s)
+    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), _heading_correlation_s(sensors, noise))
     parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
-    return FilterSetup(data, parameters, t0, x0, P0)
+    return FilterSetup(data, t0, x0, P0, parameters)
 
 
 def chi2_gate(probability: float, degrees: int) -> float:
@@ -257,7 +246,7 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
     In preset ``field`` a given start inside the tracks is moved out to them: there is no turn rate that close to W = 0
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
-    settings, half = config.filter, half_width_m(config.robot.track_width_m)
+    settings, half = config.filter, width_or_usual_m(config.robot.track_width_m) / 2
     paper = settings.preset == "paper"
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     std = settings.initial_icr_std_m
@@ -276,9 +265,7 @@ def _terrain_icr_std_m(config: Config) -> float:
     given = config.filter.terrain_icr_std_m
     if given is not None:
         return given
-    return (
-        PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else 2.0 * half_width_m(config.robot.track_width_m)
-    )
+    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else width_or_usual_m(config.robot.track_width_m)
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
@@ -306,6 +293,24 @@ def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float,
     """Return the diagonal of Q (Eq. 30), in the units of `FilterParameters`."""
     position, icr = noise.position_mps**2, config.filter.process_icr_mps**2
     return position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr
+
+
+def _heading_correlation_s(sensors: SensorData, noise: ProcessNoise) -> float:
+    """Return how long headings err alike.
+
+    Notes
+    -----
+    Estimated headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
+    with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is then
+    sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
+    """
+    if not sensors.heading_is_estimated:
+        return sensors.heading_correlation_s
+    density, usual = (
+        math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)
+    )
+    variance = float(np.median(sensors.headings.var_rad2))
+    return max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
 
 
 def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
@@ -358,5 +363,5 @@ def _parameters(
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * half_width_m(config.robot.track_width_m),
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_or_usual_m(config.robot.track_width_m) / 2,
     )

@@ -37,7 +37,7 @@ drive: ground and slip. x_icr moves with the speed of a turn as well: the prior 
 0.6 (`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
 
 
-class DriveWindows(NamedTuple):
+class StateWindows(NamedTuple):
     """Displacement and turn over windows of distance, linear in what may be unknown.
 
     Attributes
@@ -67,7 +67,7 @@ class DriveWindows(NamedTuple):
         return np.array([place, place, math.sqrt(2.0) * self.heading_std_rad])
 
 
-def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
+def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     """Return the windows of a drive, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
     dt = np.where(drive.gap, 0.0, drive.dt_s)
     driven, distance = np.abs(drive.v_left), np.zeros(len(dt))
@@ -100,7 +100,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> DriveWindows:
     turned = np.diff(sums[:, 0])
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
-    return DriveWindows(
+    return StateWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
         length_m=np.diff(distance),
@@ -128,12 +128,12 @@ def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Flo
 
 
 def prior_std(width_m: float) -> Floats:
-    """Return the standard deviations (6,) of what `DriveWindows.jacobian` is by, before a drive."""
+    """Return the standard deviations (6,) of what `StateWindows.jacobian` is by, before a drive."""
     return np.array([width_m, width_m, width_m, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
 
 
 def final_covariance(
-    windows: DriveWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
+    windows: StateWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
 ) -> Floats:
     """Return the covariance (3, 3) of the final ICRs [m^2]: from how much the stretches of their drive differ.
 

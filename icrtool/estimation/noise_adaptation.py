@@ -47,7 +47,7 @@ def run_adaptively(
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
-        return setup, run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+        return setup, run_ekf(*setup)
 
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.estimation.icr_uncertainty import DriveWindows, prior_std
+from icrtool.estimation.icr_uncertainty import StateWindows, prior_std
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop.trials import Drive
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, half_width_m
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
 from icrtool.records.run_document import Excited
 from icrtool.records.tables import States
 
@@ -75,7 +75,7 @@ class Excitation:
         }
 
 
-def find_excitation(table: States, drive: Drive, track_width_m: float | None, windows: DriveWindows) -> Excitation:
+def find_excitation(table: States, drive: Drive, track_width_m: float | None, windows: StateWindows) -> Excitation:
     """Return which ICRs a drive could show.
 
     Parameters
@@ -132,7 +132,7 @@ def withhold_unlearned(
     start_std_m : (3,) of the filter's start
     least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
     """
-    final = {name: float(getattr(table, name)[-1]) for name in ICR_COLUMNS}
+    final = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True))
     filter_std = {name: float(getattr(table, f"std_{name}")[-1]) for name in ICR_COLUMNS}
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
     verdicts, sentences = dict(found.verdicts), list(found.sentences)
@@ -154,14 +154,14 @@ def withhold_unlearned(
 
 def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
     """Return ICRs (3,) [m] near which to ask: the run's final ones where they can be, else those of the width."""
-    right, left, x = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-    half = half_width_m(track_width_m)
+    right, left, x = table.icrs_at(-1)
+    half = width_or_usual_m(track_width_m) / 2
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
     return np.array([right, left, x])
 
 
-def _posterior(windows: DriveWindows, width: float) -> Floats:
+def _posterior(windows: StateWindows, width: float) -> Floats:
     """Return standard deviations (3,) of the ICRs, heading offset and scales marginalised."""
     slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
     rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]

@@ -8,8 +8,8 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.open_loop.direct import open_loop_path
-from icrtool.records.run import Run, make_drive
-from icrtool.records.tables import States
+from icrtool.records.run import make_drive
+from icrtool.records.tables import Icrs, States
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,40 +29,14 @@ class OdometryPath:
     end_error_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class WheelPaths:
-    """Both paths of a run, each driven at every call: of a long log one takes as much memory as its positions.
+def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
+    """Drive from the first state to the last; through a gap in the wheel data move as the filter did.
 
-    Attributes
+    Parameters
     ----------
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
-    track_width_m : b, None where not known
-    """
-
-    table: States
-    in_gap: Bools
-    track_width_m: float | None
-
-    def drive_icr(self) -> OdometryPath:
-        """Return the path with the final ICRs."""
-        table = self.table
-        icrs = (float(column[-1]) for column in (table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))
-        return _path(table, self.in_gap, *icrs)
-
-    def drive_no_slip(self) -> OdometryPath | None:
-        """Return the path of the no-slip model (Eqs. 38-39), None where the track width is not known."""
-        b = self.track_width_m
-        return _path(self.table, self.in_gap, b / 2, -b / 2, 0.0) if b is not None else None
-
-
-def odometry(run: Run) -> WheelPaths:
-    """Return the wheels-only paths of a run; run.json holds their end errors as ``odometry``."""
-    return WheelPaths(run.table, run.in_gap, run.track_width_m)
-
-
-def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x_icr: float) -> OdometryPath:
-    """Drive from the first state to the last; through a gap in the wheel data move as the filter did.
+    icrs : the run's final ones, or `no_slip_icrs`
 
     Notes
     -----
@@ -74,7 +48,7 @@ def _path(table: States, in_gap: Bools, y_icr_right: float, y_icr_left: float, x
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
     for first, last in zip([0, *(edges + 1)], [*edges, len(table) - 1], strict=True):
-        piece = open_loop_path(drive, y_icr_right, y_icr_left, x_icr, int(first), int(last))
+        piece = open_loop_path(drive, *icrs, int(first), int(last))
         stretch = slice(first, last + 1)
         if first:
             # The error at the gap's begin is carried over it: the displacement turned by `turned`, less itself.

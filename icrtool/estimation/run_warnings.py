@@ -23,6 +23,12 @@ SMALLEST_MULTIPLIER = 0.9
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not treated as even ones."""
 
+USUAL_X_M = 0.15
+"""Skid-steer robots have their x_icr within about this of the body origin (Pentzer 2014: 0.06 and 0.14 m)."""
+
+LEAST_SEPARATION = 1.1
+"""Skid-steer robots turn as if they were at least so many times as wide: a body twist that shows less has a controller
+that knows the slip, or is fused with a gyro."""
 
 WORTH_WARNING_SHARE = 0.1
 USELESS_HEADING_DEGPS = 50.0
@@ -38,8 +44,14 @@ def unusable_reasons(
     heading: MeasurementOutcome,
     noise: ProcessNoise,
     wheel_scale: Finding | None = None,
+    twist_separation: float | None = None,
 ) -> list[str]:
-    """Return why the ICRs of a run must not be used; empty where they can be."""
+    """Return why the ICRs of a run must not be used; empty where they can be.
+
+    Parameters
+    ----------
+    twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
+    """
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
@@ -54,6 +66,11 @@ def unusable_reasons(
         left = wheel_scale.value / wheel_scale.applied
         if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
             reasons.append(f"the robot goes {100 * left:.0f} % of the distance that the wheels report")
+    if twist_separation is not None and twist_separation < LEAST_SEPARATION and not hidden:
+        reasons.append(
+            f"the ICRs are {twist_separation:.2f} of the track width apart: the body twist turns as the robot does; "
+            "its controller multiplies the width (set wheels.twist_width_m), or it is fused with a gyro"
+        )
     return reasons
 
 
@@ -115,13 +132,18 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
     Notes
     -----
     An antenna off the centre line and sides that slip unequally look the same: only the difference shows
-    (`icrtool.calibration.one_log`). So nothing is moved.
+    (`icrtool.calibration.one_log`). So do an antenna ahead of the body origin and an x_icr behind it. Nothing is moved.
     """
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2
     sigma = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     if abs(middle) <= max(LOPSIDED_M, LOPSIDED_SIGMAS * sigma):
-        return []
+        x = float(table.x_icr_m[-1])
+        if abs(x) <= max(USUAL_X_M, LOPSIDED_SIGMAS * math.sqrt(max(float(covariance[2, 2]), 0.0))):
+            return []
+        unknown = "as the log does not hold its place on the robot"
+        advice = "frames.antenna_forward_m sets how far ahead of the body origin it is, and is added to x"
+        return [f"{name}: x {x:+.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"]
     side, other = ("right", "left") if middle > 0 else ("left", "right")
     where = f"{abs(middle):.2f} m"
     return [

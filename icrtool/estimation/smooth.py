@@ -32,7 +32,7 @@ def smooth(run: Run) -> States:
     process noise of `filter.process_icr_mps`.
     """
     setup = set_up_again(run)
-    smoothed = run_smoother(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters)
+    smoothed = run_smoother(*setup)
     std = np.sqrt(np.maximum(smoothed.variance, 0.0))
     columns: dict[str, Floats] = {}
     for i, name in enumerate(STATE_COLUMNS):

@@ -14,7 +14,7 @@ from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import OdometryPath, WheelPaths
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -24,7 +24,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive, no_slip_icrs
 from icrtool.records.run_document import EVENT_COLUMNS, IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
@@ -65,12 +65,15 @@ def summarise(
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
-    end_errors = _end_errors(WheelPaths(table, filtered.in_gap, width))
+    end_errors = _end_errors(table, filtered.in_gap, width)
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     scale = measurements.findings["wheel_scale"] if config.filter.preset == "field" else None
-    unusable = unusable_reasons(excitation, filtered.gnss, filtered.heading, filtered.noise, scale)
+    of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
+    unusable = unusable_reasons(
+        excitation, filtered.gnss, filtered.heading, filtered.noise, scale, multiplier if of_twist else None
+    )
     document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,
@@ -205,13 +208,13 @@ def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str
     return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
-def _end_errors(found: WheelPaths) -> dict[str, Any]:
+def _end_errors(table: States, in_gap: Bools, track_width_m: float | None) -> dict[str, Any]:
     """Return how far from the filter's last position the wheels-only paths end."""
-
-    def end(path: OdometryPath | None) -> dict[str, float] | None:
-        return {"end_error_m": path.end_error_m} if path is not None else None
-
-    return {"icr": end(found.drive_icr()), "no_slip": end(found.drive_no_slip())}
+    icrs = {"icr": table.icrs_at(-1), "no_slip": None if track_width_m is None else no_slip_icrs(track_width_m)}
+    return {
+        name: None if one is None else {"end_error_m": drive_wheels(table, in_gap, one).end_error_m}
+        for name, one in icrs.items()
+    }
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:

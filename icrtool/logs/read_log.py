@@ -209,10 +209,9 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
     warnings += wheel_warnings
     warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
+    warnings += [f"{name}: {one.topic}: {one.note}" for one in (motion, source) if one is not None and one.note]
     if source is None:
         warnings += [f"{name}: {one.topic} gives no heading: {one.problem}" for one in found.heading]
-    elif source.note:
-        warnings.append(f"{name}: {source.topic}: {source.note}")
     antenna = antenna_place(survey.tables, position.topic)
     quantity = "position" if samples.from_position else "speed"
     streams: tuple[StreamChoice, ...] = (
@@ -320,9 +319,7 @@ def _fixes(
 ) -> tuple[PositionFixes, Datum | None, dict[str, int]]:
     """Return positions in the local plane about the datum: `given`, else the configured one, else the first fix."""
     if not source.usable.any():
-        raise DataError(
-            name, f"{source.topic}: {source.problem or 'no usable fix'}", str(source.rejected or "all rows are bad")
-        )
+        raise DataError(name, f"{source.topic}: {source.problem}", "name another position in topics.gnss")
     stamps = source.stamps.on(clock)
     rows = np.flatnonzero(source.usable)
     rows = rows[np.argsort(stamps[rows], kind="stable")]

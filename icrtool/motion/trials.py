@@ -37,20 +37,15 @@ class Trials(NamedTuple):
     ends: Ints
 
 
-def cut_trials(recording: Recording, horizons_m: Sequence[float], *, all_starts: bool = False) -> Trials:
-    """Return the trials of a recording.
+def cut_trials(recording: Recording, horizons_m: Sequence[float]) -> Trials:
+    """Return the trials of a recording from states in which it moves.
 
-    Parameters
-    ----------
-    all_starts : from every recorded state, as the paper; default from moving ones, as far apart as the steps of the
-        fits are long, about `MOST_STARTS` of a long drive, since nearer ones are copies of one another
+    They are as far apart as the steps of the fits are long, about `MOST_STARTS` of a long drive: nearer ones are copies
+    of one another.
     """
-    drive = recording.drive
-    starts = np.arange(len(drive.distance))
-    if not all_starts:
-        moving = np.flatnonzero(moving_states(drive))
-        starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)].copy()
-    return Trials(starts, ends_from(drive, np.array(horizons_m, np.float64), starts))
+    moving = np.flatnonzero(moving_states(recording.drive))
+    starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)].copy()
+    return Trials(starts, ends_from(recording.drive, np.array(horizons_m, np.float64), starts))
 
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]

@@ -12,8 +12,10 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import BOOTSTRAP_LEVEL, BOOTSTRAP_RESAMPLES, ErrorSink
+from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
+from icrtool.kernels.open_loop.block_sums import LEVEL
+from icrtool.kernels.open_loop.error_statistics import RESAMPLES
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic_directory import atomic_directory
@@ -21,13 +23,8 @@ from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.trials_file import trials_file
 from icrtool.output.tables.dropout import no_trial, why_no_trial
-from icrtool.output.tables.model_comparison import (
-    COMPARISON_COLUMNS,
-    comparison_document,
-    comparison_rows,
-    error_columns,
-)
-from icrtool.records.dropout import ExampleTrial, ModelResult
+from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
+from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
 from icrtool.records.plain_data import rows_of
 
 REPORT_FILE = "report.json"
@@ -120,8 +117,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "bootstrap": {
             "method": "moving blocks of path",
             "block": "the horizon",
-            "resamples": BOOTSTRAP_RESAMPLES,
-            "level": BOOTSTRAP_LEVEL,
+            "resamples": RESAMPLES,
+            "level": LEVEL,
             "seed": report.seed,
         },
         "models": [_model_document(result, report) for result in report.results],

@@ -17,7 +17,7 @@ from icrtool.records.text import counted
 if TYPE_CHECKING:
     from icrtool.calibration.record import ControllerErrors
     from icrtool.motion.models import FittedModel
-    from icrtool.records.run_document import RunDocument
+    from icrtool.records.run_document import DriveDocument, RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -88,6 +88,11 @@ def duration_text(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d} h"
+
+
+def driven_text(drive: DriveDocument) -> str:
+    """Return distance and duration of a drive, as ``398.5 m in 14:59 min``; `drive` of a run's summary."""
+    return f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
 
 
 def model_text(label: str, name: str, parameters: int) -> str:

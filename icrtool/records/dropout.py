@@ -23,6 +23,18 @@ CHOICE_HORIZON_M = 10.0
 """Where extended models are chosen, and which horizon the picture of the model comparison shows."""
 
 
+METRICS = {
+    "expected": ("expected", "expected_error_m"), "p50": ("p50", "p50_m"), "p95": ("p95", "p95_m"),
+    "max": ("largest", "max_m"),
+}  # fmt: skip
+"""By its name in an acceptance limit: an error's field of `Summary`, and its name in files."""
+
+
+def error_columns(summary: Summary) -> dict[str, Floats | Ints]:
+    """Return the errors by horizon under their names in files."""
+    return {"trials": summary.trials} | {column: getattr(summary, field) for field, column in METRICS.values()}
+
+
 class ModelResult(NamedTuple):
     """The errors of one model's trials, by horizon; `block_sums` has None where there is too little path."""
 

@@ -16,7 +16,7 @@ from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.events import intervals_in
 from icrtool.records.late_output import call_output
 from icrtool.records.measurements import SensorData
-from icrtool.records.tables import States
+from icrtool.records.tables import Icrs, States
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,8 +35,8 @@ ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), st
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""
 
-DEFAULT_HALF_WIDTH_M = 0.3
-"""Half the width of a small field robot [m], used where the width is not known."""
+USUAL_WIDTH_M = 0.6
+"""Track width of a small field robot [m], used where that of the robot is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +162,8 @@ class Run:
     @property
     def ended_with(self) -> WarmStart:
         """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
-        icrs = np.array([getattr(self.table, column)[-1] for column in ICR_COLUMNS], np.float64)
         covariance = np.array(self.summary["icr"]["final_covariance_m2"], np.float64)
-        return WarmStart(icrs, covariance, self.track_width_m)
+        return WarmStart(np.array(self.table.icrs_at(-1)), covariance, self.track_width_m)
 
     @property
     def wheel_scales(self) -> tuple[float, float]:
@@ -225,9 +224,14 @@ def icr_text(icr: IcrDocument, column: IcrColumn) -> str:
     return f"{final:+.3f} ± {std:.3f}" if final is not None else "not shown"
 
 
-def half_width_m(track_width_m: float | None) -> float:
-    """Return b/2 [m], or a default where the width is not known."""
-    return track_width_m / 2 if track_width_m is not None else DEFAULT_HALF_WIDTH_M
+def width_or_usual_m(track_width_m: float | None) -> float:
+    """Return the track width b [m], `USUAL_WIDTH_M` where it is not known."""
+    return track_width_m if track_width_m is not None else USUAL_WIDTH_M
+
+
+def no_slip_icrs(track_width_m: float) -> Icrs:
+    """Return the ICRs of a robot that does not slip (Pentzer 2014, Eqs. 38-39): in the middle of its tracks."""
+    return track_width_m / 2, -track_width_m / 2, 0.0
 
 
 def drive_of(run: Run) -> Drive:

@@ -193,6 +193,11 @@ class StreamChoice:
     jitter_ms: float
     why: str
 
+    @property
+    def is_twist(self) -> bool:
+        """Whether the wheels' speeds were made of a body twist."""
+        return self.role == "wheels" and any(word in self.message_type for word in ("Odometry", "Twist", "ScoutStatus"))
+
 
 def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
     """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""

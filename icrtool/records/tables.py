@@ -25,6 +25,9 @@ from icrtool.records.text import LogText
 if TYPE_CHECKING:
     import pandas as pd
 
+Icrs = tuple[float, float, float]
+"""y_icr_right, y_icr_left, x_icr [m]."""
+
 LARGEST = 1e30
 """Of a state or a measurement: squares of larger numbers overflow."""
 
@@ -142,6 +145,10 @@ class States:
     def columns(self) -> dict[str, Floats | Ints]:
         """Return the columns by name, in the order of states.csv."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def icrs_at(self, row: int) -> Icrs:
+        """Return the ICRs at a state."""
+        return float(self.y_icr_right_m[row]), float(self.y_icr_left_m[row]), float(self.x_icr_m[row])
 
     def frame(self) -> pd.DataFrame:
         """Return the columns as a DataFrame equal to states.csv."""

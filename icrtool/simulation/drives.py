@@ -12,10 +12,8 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.kernels.arcs import drive, follow, poses_at
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.records.tables import Icrs
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
-
-Icrs = tuple[float, float, float]
-"""y_icr_right, y_icr_left, x_icr [m]."""
 
 TRUTH_STEP_S = 0.001
 """Track speeds of a path are held this long by default; every sensor is slower."""

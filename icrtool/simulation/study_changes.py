@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.simulation.drives import Icrs
+from icrtool.records.tables import Icrs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, statistics
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, measure_times, trace

@@ -19,10 +19,9 @@ from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
-from icrtool.records.tables import RobotLog
+from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import (
     DrivePlan,
-    Icrs,
     Readings,
     Sensors,
     Truth,
@@ -142,14 +141,14 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
     sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
     setup = set_up_filter(sensors, scenario.config, changes_s=changes)
-    parameters = setup.parameters
     if scenario.guard != GUARDED:
-        parameters = parameters._replace(guard=scenario.guard, step_heading=0.0)
+        euler = setup.parameters._replace(guard=scenario.guard, step_heading=0.0)
+        setup = setup._replace(parameters=euler)
     first = int(np.searchsorted(setup.data.wheel_t, setup.t0))
     times = readings.wheel_t[first:]
     stops = np.unique(np.append(np.searchsorted(times, stops_s, side="right") - 1, len(times) - 1))
     stops = stops[stops >= 0]
-    out = run_ekf(setup.data, setup.t0, setup.x0, setup.P0, parameters, stops.tolist())
+    out = run_ekf(*setup, stops.tolist())
     return StudyRun(
         t_s=times,
         x=out.x,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.calibration.pooled import calibrate
+from icrtool.calibration.pooled import calibrate_recordings
 from icrtool.motion.models import MODELS
 from support.recordings import make_recording
 
@@ -18,7 +18,7 @@ MODEL = MODELS["five"]
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     logs = [make_recording(MODEL, MODEL.prior_mean, seed, 120.0, name=f"log {seed}") for seed in range(2)]
-    return calibrate(logs).calibration.write(tmp_path_factory.mktemp("calibration") / "cal.json")
+    return calibrate_recordings(logs).calibration.write(tmp_path_factory.mktemp("calibration") / "cal.json")
 
 
 @pytest.fixture

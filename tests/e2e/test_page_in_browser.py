@@ -15,17 +15,14 @@ import pytest
 
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.model_comparison import _errors_along, _icrs_of, turned_path
-from icrtool.calibration.pooled import (
-    gyro_recording_of,
-    heading_recording_of,
-    in_recording,
-    predictor,
-    recording_of,
-)
+from icrtool.calibration.pooled import predictor
+from icrtool.calibration.run_recording import recording_of, turning_recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
+from icrtool.motion.fit import own_constants
+from icrtool.motion.recording import cut_windows
 from icrtool.motion.trials import Trials, predicted_path
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.json_file import json_bytes
@@ -175,16 +172,16 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
     compared = report.comparison
     assert compared is not None
     assert compared.heading == "heading"
-    turned = heading_recording_of(run, "heading")
+    turned = turning_recording_of(run, "heading")
     for row, of in (
         ("multiplier", ""),
         ("window", "icr"),
         ("window_heading", "icr_gyro"),
         ("no_slip_heading", "no_slip_gyro"),
     ):
-        along[row] = table_errors(
-            turned, trials, predicted_path(turned, *in_recording(compared.fits[of or row], turned))
-        )
+        fitted = compared.fits[of or row]
+        own = own_constants(cut_windows(turned), fitted, turned.width_m)
+        along[row] = table_errors(turned, trials, predicted_path(turned, fitted, own))
     turned_path_of_run = turned_path(run, turned)
     for name in ("icr", "icr_final"):
         along[f"{name}_heading"] = _errors_along(turned_path_of_run, drive, trials, _icrs_of(run, name))
@@ -252,7 +249,7 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     page = chrome.page()
     page.open(file)
     assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {3}
-    table, recording = report.comparison, gyro_recording_of(run)
+    table, recording = report.comparison, turning_recording_of(run)
     assert table is not None
     drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))
     # What the comparison chose by block is, of the whole drive, the recommended model.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.open_loop.direct import ends_from
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import Recording
@@ -66,3 +69,9 @@ def table_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
     row, column = np.nonzero(trials.ends >= 0)
     errors[row, column] = trial_errors(recording, trials.starts[row], trials.ends[row, column], path)
     return errors
+
+
+def trials_from_all(recording: Recording, horizons_m: Sequence[float]) -> Trials:
+    """Return the trials from every recorded state."""
+    starts = np.arange(len(recording.t_s))
+    return Trials(starts, ends_from(recording.drive, np.array(horizons_m), starts))

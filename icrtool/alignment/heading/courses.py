@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays
-from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
@@ -62,7 +62,7 @@ class TurnRate(NamedTuple):
 
     def integrated(self) -> Floats:
         """Return the turn since the first sample (n,) [rad], by trapezoids."""
-        return np.concatenate([[0.0], np.cumsum(np.diff(self.t) * (self.rate[:-1] + self.rate[1:]) / 2)])
+        return trapezoids(self.t, self.rate)
 
     def stamp_std(self) -> Floats:
         """Return what an error of its stamps turns the heading by (n,) [rad].
@@ -131,7 +131,7 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     psi = np.interp(middle, turn.t, corrected)
     nose = np.exp(1j * psi) * drive.wheel_dt
     step = (v + guess.middle * u) * nose
-    gone = np.concatenate([[0.0], np.cumsum((np.abs(v) * drive.wheel_dt)[:-1])])
+    gone = drive.cumulate(np.abs(v)).real
     length = _course_length(drive)
     t, place = _without_spikes(
         drive._replace(fix_t=drive.fix_t - guess.delay_s),
@@ -200,8 +200,7 @@ def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
 
     Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
     """
-    v = (drive.v_left + drive.v_right) / 2
-    along, gone = (np.concatenate([[0.0], np.cumsum((one * drive.wheel_dt)[:-1])]) for one in (v, np.abs(v)))
+    along, gone = (drive.cumulate(one).real for one in (drive.mean_speed, np.abs(drive.mean_speed)))
     t, place = _without_spikes(drive, float(drive.wheel_t[0]), float(drive.wheel_t[-1]))
     length = _course_length(drive)
     edge = _edges(np.interp(t, drive.wheel_t, gone), length)

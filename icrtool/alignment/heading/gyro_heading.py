@@ -161,7 +161,7 @@ def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
     """Return ends of spans [s] in which the wheels stood, and the mean rate in each [rad/s]."""
     edges = drive.wheel_t[0] + STANDING_S * np.unique(np.floor((drive.wheel_t - drive.wheel_t[0]) / STANDING_S))
     begin, end = edges[:-1], edges[1:]
-    gone = np.concatenate([[0.0], np.cumsum((np.abs(drive.v_left) + np.abs(drive.v_right))[:-1] * drive.wheel_dt[:-1])])
+    gone = drive.cumulate(np.abs(drive.v_left) + np.abs(drive.v_right)).real
     still = np.interp(end, drive.wheel_t, gone) - np.interp(begin - STANDING_S, drive.wheel_t, gone) < 1e-3
     still &= (end - begin < 1.5 * STANDING_S) & (begin >= turn.t[0]) & (end <= turn.t[-1])
     G = turn.integrated()

@@ -92,7 +92,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         )
     drive = drive_arrays(log)
     found = _with_gyro(log, drive, None)
-    if found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT:
+    if found is not None and _is_alive(found.estimate):
         return found
     turn = wheel_rate(drive, width_m)
     pair, length = _pair(log, turn)
@@ -109,8 +109,8 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
 def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
-    None without a gyro, where the gyro contradicts the courses over ground, where the stated heading alone is as good,
-    and where it is the position reference's own.
+    None without a gyro, where the gyro is dead or contradicts the courses over ground, where the stated heading alone
+    is as good, and where it is the position reference's own.
 
     Parameters
     ----------
@@ -119,9 +119,14 @@ def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
     if drive.same_clock:
         return None
     found = _with_gyro(log, drive, log.heading)
-    if found is None or found.estimate.median_std > math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD):
+    if found is None or not _is_alive(found.estimate):
         return None
-    return found
+    return found if found.estimate.median_std <= math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD) else None
+
+
+def _is_alive(estimate: HeadingEstimate) -> bool:
+    """Return whether the turn rate of an estimate turns with the robot."""
+    return estimate.noises["angle"] < LARGEST_DRIFT
 
 
 def attitude_error(estimate: HeadingEstimate) -> float:

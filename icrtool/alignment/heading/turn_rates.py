@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.alignment.heading.courses import TurnRate, course_changes
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
@@ -57,7 +57,7 @@ def gyro_rate(drive: DriveArrays, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRa
 
 
 def _turn_between(t: Floats, rate: Floats, begin: Floats, end: Floats) -> Floats:
-    turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2)])
+    turned = trapezoids(t, rate)
     return np.asarray(np.interp(end, t, turned) - np.interp(begin, t, turned), np.float64)
 
 

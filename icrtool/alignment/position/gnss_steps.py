@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -11,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.records.measurements import Fixes
 from icrtool.records.samples import PositionFixes
+from icrtool.records.tables import RobotLog
 
 FEWEST_STEPS = 40
 """Fewer steps show no noise; a stretch is evaluated by as many."""
@@ -30,6 +31,10 @@ MOVES_MPS = 0.05
 """Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
 
 GAP_IN_INTERVALS = 5.0
+
+FROZEN_M, FROZEN_SHARE = 1.0, 0.5
+"""A fix that repeats the one before to the last digit while the wheels go this far is old. Where they do so on more
+than half of the distance, the robot does not move."""
 
 LONGEST_INTERVAL_S = 1.0
 """Between wheel samples further apart the path is not known."""
@@ -148,3 +153,27 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
 def unbroken(interval_s: Floats) -> Floats:
     """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
     return np.where(interval_s < LONGEST_INTERVAL_S, interval_s, 0.0)
+
+
+def without_frozen(log: RobotLog) -> RobotLog:
+    """Return a log without fixes that a driver sent again while its receiver had none; the same log where none is."""
+    gnss, wheels = log.gnss, log.wheels
+    if log.datum is None or min(len(gnss.stamp_ns), len(wheels.stamp_ns)) < 2:
+        return log
+    speed = np.abs(wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
+    gone = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
+    travel = np.interp(gnss.stamp_ns, wheels.stamp_ns, gone)
+    first = np.flatnonzero(np.diff(gnss.north_m, prepend=np.nan) != 0.0)
+    first = np.union1d(first, np.flatnonzero(np.diff(gnss.east_m, prepend=np.nan) != 0.0))
+    count = np.diff(first, append=len(travel))
+    length = travel[first + count - 1] - travel[first]
+    old = length > FROZEN_M
+    if not old.any() or float(length[old].sum()) > FROZEN_SHARE * float(travel[-1] - travel[0]):
+        return log
+    keep = ~np.repeat(old, count)
+    keep[first] = True
+    note = (
+        f"{log.name}: {np.count_nonzero(~keep)} fixes repeat the one before to the last digit while the wheels go on: "
+        "left out"
+    )
+    return replace(log, gnss=gnss.cut(keep), warnings=(*log.warnings, note))

@@ -15,7 +15,7 @@ from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.records.run import half_width_m
+from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 LENGTH_M, SHARE = 10.0, 0.9
@@ -72,7 +72,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
 
 def agreement(log: RobotLog, config: Config) -> Agreement:
     """Return how the position reference of a log agrees with its wheels along its heading."""
-    width = 2.0 * half_width_m(config.robot.track_width_m)
+    width = width_or_usual_m(config.robot.track_width_m)
     try:
         log = with_wheel_speeds(log, config)
         check_streams(log)

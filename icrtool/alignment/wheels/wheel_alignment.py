@@ -10,14 +10,20 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.position.gnss_steps import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
 
 SMALLEST_TURN_RAD = math.radians(20.0)
 
-NEVER_MOVES_SHARE = 0.02
+NEVER_MOVES_SHARE, DEAD_M = 0.02, 10.0
+"""A side slower than this share of the other's speed over this distance has a dead encoder: no robot turns about one
+side for so long."""
+
 FEWEST_WINDOWS = 8
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
@@ -126,17 +132,32 @@ def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, str]:
 def dead_or_copied(log: RobotLog) -> list[str]:
     """Return a warning where a side never moves while the other does, or copies the other while the robot turns."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
-    total_left, total_right = float(np.abs(left).sum()), float(np.abs(right).sum())
-    most = max(total_left, total_right)
-    if most == 0.0:
-        return []
-    if min(total_left, total_right) < NEVER_MOVES_SHARE * most:
-        side = "left" if total_left < total_right else "right"
-        meaning = "if so, do not use the ICRs; topics.wheels chooses others"
-        return [f"the {side} wheels hardly ever move: is their encoder dead? {meaning}"]
+    seconds = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
+    interval = unbroken(np.diff(seconds, append=seconds[-1:]))
+    for side, still, moving in (("left", left, right), ("right", right, left)):
+        gone = np.cumsum(np.abs(moving) * interval)
+        begin, end = _longest_rest(np.cumsum(still * interval), gone)
+        if (distance := gone[end] - gone[begin]) > DEAD_M:
+            span = f"from {seconds[begin]:.0f} s to {seconds[end]:.0f} s, while the others go {distance:.0f} m"
+            meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
+            return [f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         return ["left and right wheels are equal throughout while the robot turns: one is a copy of the other"]
     return []
+
+
+def _longest_rest(still_m: Floats, gone: Floats) -> tuple[int, int]:
+    """Return the rows [begin, end) in which one side hardly moves while the other goes furthest.
+
+    Parameters
+    ----------
+    still_m, gone : (n,) position of the one side, distance gone by the other [m]; compared every metre of that
+    """
+    rows = np.append(rows_at_steps(gone, 1.0), len(gone) - 1)
+    moves = np.flatnonzero(np.abs(np.diff(still_m[rows])) > NEVER_MOVES_SHARE * np.diff(gone[rows]))
+    begin, end = rows[np.append(0, moves + 1)], rows[np.append(moves, len(rows) - 1)]
+    longest = int(np.argmax(gone[end] - gone[begin]))
+    return int(begin[longest]), int(end[longest])
 
 
 def _held_share(wheels: WheelSamples) -> float:
@@ -258,9 +279,8 @@ def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
 
 def _fused_note(log: RobotLog) -> list[str]:
     """Warn of wheels that are another filter's output: their turn rate is the gyro's."""
-    stream = next((one for one in log.streams if one.role == "wheels"), None)
-    fused_type = stream is not None and any(word in stream.message_type for word in ("Odometry", "Twist"))
-    if stream is None or not fused_type or log.gyro is None:
+    stream = next((one for one in log.streams if one.is_twist), None)
+    if stream is None or log.gyro is None:
         return []
     t = (log.wheels.stamp_ns - log.gyro.stamp_ns[0]) / 1e9
     rate = np.interp(t, (log.gyro.stamp_ns - log.gyro.stamp_ns[0]) / 1e9, log.gyro.rate_radps)

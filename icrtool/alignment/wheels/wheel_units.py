@@ -192,11 +192,7 @@ def _metres_per_unit(
         )
     how = f"{_SCALE_WORDS.get(unit, 'travel of a unit of the wheels')} {_with_std(scale)} m"
     how += " (estimated from the position reference)"
-    why = (
-        "neither the wheel radius nor the encoder counts fit the distance"
-        if radius and counts
-        else f"{lacking} is not given"
-    )
+    why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
     return scale.value, f", {how}", [f"{why}: {how}"]
 
 

@@ -18,6 +18,9 @@ MOST_BLOCKS = 16
 """More would narrow an interval by less than 2 %: the factor of Student's distribution is 2.13, without limit 1.96."""
 
 
+LEVEL = 0.95
+"""An interval holds the truth with this probability, as far as blocks of the horizon's length are independent."""
+
 BLOCK_PARTS = 4
 """Blocks begin at every quarter of their length."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.equal_steps import rows_of_cells
-from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, Blocks, quantile
+from icrtool.kernels.open_loop.block_sums import BLOCK_PARTS, LEVEL, Blocks, quantile
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, Summary
 
 TAIL = 0.05
@@ -25,8 +25,10 @@ MIN_BLOCKS = 3
 """With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
-RESAMPLES_AT_ONCE = 10
+RESAMPLES, RESAMPLES_AT_ONCE = 300, 10
 """Bounds memory: a long log has thousands of blocks."""
+BINS = 50
+"""Of a histogram, up to its largest error or less."""
 MIN_KEPT_TRIALS = 20_000
 """Trials kept when p95 is resampled, at least; all of them where there are fewer than twice as many."""
 
@@ -123,7 +125,7 @@ def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
 
 
 def bootstrap_interval(
-    errors_m: Floats, blocks: Blocks | None, rng: np.random.Generator, resamples: int = 300, level: float = 0.95
+    errors_m: Floats, blocks: Blocks | None, rng: np.random.Generator, resamples: int = RESAMPLES
 ) -> tuple[float, float, float, float]:
     """Compute confidence intervals of one horizon's expected error and p95 by the moving-block bootstrap.
 
@@ -132,7 +134,6 @@ def bootstrap_interval(
     errors_m : (n,) [m], NaN where there was no trial
     blocks : of `cut_blocks`
     rng : random numbers; the same state gives the same blocks, so models can be compared on the same resamples
-    resamples, level : number of resamples, and the share of them within the interval
 
     Returns
     -------
@@ -159,13 +160,11 @@ def bootstrap_interval(
     for some in np.split(replicates, range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)):
         starts = rng.integers(0, n_starts, size=(len(some), len(per_segment) // BLOCK_PARTS))
         resample_blocks(sums, starts, segments, ordered, some)
-    low, high = np.quantile(replicates, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    low, high = np.quantile(replicates, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
-def bootstrap_intervals(
-    errors_m: Floats, blocks: Sequence[Blocks | None], seed: int, resamples: int = 300, level: float = 0.95
-) -> Intervals:
+def bootstrap_intervals(errors_m: Floats, blocks: Sequence[Blocks | None], seed: int) -> Intervals:
     """Compute `bootstrap_interval` for every horizon.
 
     Parameters
@@ -173,20 +172,19 @@ def bootstrap_intervals(
     errors_m : (n_starts, n_horizons) [m]
     blocks : of `cut_blocks`, one a horizon
     seed : every horizon starts from it, so that an interval does not depend on which others are asked for
-    resamples, level : as in `bootstrap_interval`
     """
     rows = [
-        bootstrap_interval(column, cut, np.random.default_rng(seed), resamples, level)
+        bootstrap_interval(column, cut, np.random.default_rng(seed))
         for column, cut in zip(errors_m.T, blocks, strict=True)
     ]
     return Intervals(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
 
 
-def round_bin_width(largest_m: float, bins: int = 50) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `bins` bins reach `largest_m`."""
+def round_bin_width(largest_m: float) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `BINS` bins reach `largest_m`."""
     if not largest_m > 0.0:
         return 0.01
-    least = largest_m / bins
+    least = largest_m / BINS
     power = 10.0 ** math.floor(math.log10(least))
     return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
 

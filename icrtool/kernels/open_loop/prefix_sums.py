@@ -241,22 +241,11 @@ def solve_block(
 
 
 def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
-    """Compute the open-loop error of every trial: equal to `open_loop_errors_direct` to 1e-9 m, far sooner.
-
-    Parameters
-    ----------
-    drive : recorded states (n,)
-    icrs : what each start drives with
-    ends : int64 (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
-
-    Returns
-    -------
-    float64 (n_starts, n_horizons) [m], one horizon contiguous: horizontal distance between the open-loop position and
-    the reference at the trial's end; NaN where there is no trial.
+    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, far sooner.
 
     Notes
     -----
-    Section 6.4 of Pentzer 2014. Beyond the result and `ends`, memory is a few MB whatever the log; call it for ranges
+    Beyond the result and `ends`, memory is a few MB whatever the log; call it for ranges
     of starts to bound those as well. Blocks whose ICRs vary too much over their turns, or whose ICRs nearly coincide,
     are halved; the smallest blocks are integrated directly.
     """

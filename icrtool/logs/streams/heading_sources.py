@@ -41,6 +41,9 @@ _BASELINE_ACCURACY = ("accN", "acc_n", "accE", "acc_e")
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
 _REFERENCES = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
+UNKNOWN_RAD2 = (2 * np.pi) ** 2
+"""A heading with a standard deviation of a turn is not known yet: drivers of moving bases write 1000."""
+
 LARGEST_DEG = 720.0
 """A heading beyond this stands for "unknown": Septentrio writes -2e10."""
 
@@ -111,6 +114,9 @@ def _orientation(
         yaw, usable, note = nose_yaw(_quaternion(table, path), turning)
         variance = table.floats(f"{covariance}[{place}]") if covariance else np.full(len(table), np.nan)
         variance = np.where(variance > 0, variance, np.nan)
+        unknown = variance >= UNKNOWN_RAD2
+        # where all are, the number means nothing
+        usable = usable if unknown[usable].all() else usable & ~unknown
         convention, why = frame_convention(table)
         if stuffed and not _ATTITUDE_WORDS.search(table.topic):
             convention, why = "ned", "compass angle as yaw"

@@ -53,6 +53,9 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 )
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
+LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
+"""A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
+
 GOOD_STD_M = 0.3
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
 
@@ -119,9 +122,12 @@ def _geodetic(
     if std > GOOD_STD_M:
         score -= 35.0
     stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
+    problem = (
+        "" if usable.any() else f"no usable fix ({', '.join(f'{why} {count}' for why, count in rejected.items())})"
+    )
     return PositionSource(
         **of_topic(table), geodetic=np.column_stack([latitude, longitude, filled]), variance=variance, usable=usable,
-        rejected=rejected, score=score, why=f"{what}{stated}", problem="" if usable.any() else "no usable fix",
+        rejected=rejected, score=score, why=f"{what}{stated}", problem=problem,
         stated_class=stated_class,
     )  # fmt: skip
 
@@ -262,6 +268,8 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
             bool(REFERENCE_WORDS.search(table.topic)) or table.text("header.frame_id").lstrip("/") in REFERENCE_FRAMES
         )
         problem = "" if usable.any() else "no finite position"
+        if not _is_level(np.column_stack([x, y, table.floats(f"{pose}position.z")])[usable]):
+            problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
         if GOAL_WORDS.search(table.topic):
             problem = problem or "its name is that of a goal, not of a measurement"
         elif not named and (odometry or "odom" in table.topic.lower()):
@@ -275,7 +283,19 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
         )  # fmt: skip
 
     variances = tuple(f"{covariance}[{i}]" for i in (0, 1, 7) if covariance)
-    return (*HEADER, *(f"{pose}position.{axis}" for axis in "xy"), *variances), read
+    return (*HEADER, *(f"{pose}position.{axis}" for axis in "xyz"), *variances), read
+
+
+def _is_level(places_m: Floats) -> bool:
+    """Return whether a drive (n, 3) that has an area lies in a plane whose normal is within 45 deg of z."""
+    some = places_m[:: max(1, len(places_m) // MOST_PLACES)]
+    if len(some) < 3 or not (np.abs(some) < LARGEST_PLACE_M).all():
+        return True
+    # single jumps are no place
+    kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
+    _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
+    _, across_m, off_m = size / math.sqrt(len(some))
+    return bool(across_m < LEAST_AREA_M or off_m > FLAT * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
 
 
 _COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))

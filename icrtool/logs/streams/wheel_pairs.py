@@ -13,7 +13,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
-from icrtool.logs.streams.wheel_sources import COMMANDED, Unit, WheelMotion, motion_of
+from icrtool.logs.streams.wheel_sources import COMMAND_NOTE, COMMANDED, Unit, WheelMotion, motion_of
 from icrtool.records.text import LogText
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
@@ -35,6 +35,7 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
     topic = LogText(f"{LogText(left.topic).raw} + {LogText(right.topic).raw}")
     commanded = bool(COMMANDED.search(left.topic))
     score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
+    note = COMMAND_NOTE if commanded else ""
 
     def unusable(problem: str) -> WheelMotion:
         stamps = StampedRows(None, left.log_time_ns, "no header", 0)
@@ -56,11 +57,13 @@ def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMot
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         other = np.interp(moments, right.log_time_ns, values[1])
         why = f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}"
-        pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit=unit, score=score, why=why)
+        pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit=unit, score=score, why=why, note=note)
         return motion_of(pair, (values[0][both], other))
     place = np.clip(np.searchsorted(right.log_time_ns, moments + _half_interval(left), side="right") - 1, 0, None)
     speed = (values[0][both], values[1][place])
-    pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=f"{why}: speeds")
+    pair = WheelMotion(
+        topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=f"{why}: speeds", note=note
+    )
     return motion_of(pair, speed=speed)
 
 

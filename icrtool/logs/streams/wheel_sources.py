@@ -23,6 +23,7 @@ from icrtool.logs.streams.wheel_names import wheel_joints
 Unit = Literal["rad", "m", "counts", "unknown"]
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
+COMMAND_NOTE = "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays"
 _FUSED = re.compile(
     r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
     re.IGNORECASE,
@@ -56,6 +57,7 @@ class WheelMotion(Source):
     speed : in `unit` per second; None where not recorded
     twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
     joints : the joints that its messages list by name, where they do
+    note : what a user must know of it
     """
 
     position: Pair | None = None
@@ -63,6 +65,7 @@ class WheelMotion(Source):
     unit: Unit = "rad"
     twist: Floats | None = None
     joints: tuple[str, ...] = ()
+    note: str = ""
 
     @property
     def is_empty(self) -> bool:
@@ -102,15 +105,26 @@ def _nonzero(values: Floats) -> bool:
 
 
 def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
-    """Return the mean over the joints of each side that have finite values; None where none has."""
+    """Return the mean over the joints of each side that have finite values; None where none has.
+
+    A joint that never changes while another one of its side does has a dead encoder, and is left out.
+    """
     means: list[Floats | None] = []
+    dead = _dead_joints(values, left, right)
     for places in (left, right):
-        finite = [place for place in places if np.isfinite(values[:, place]).any()]
+        finite = [place for place in places if place not in dead and np.isfinite(values[:, place]).any()]
         if len(finite) == 1:
             means.append(values[:, finite[0]].astype(np.float64, copy=False))
         else:
             means.append(values.T[finite].astype(np.float64, copy=False).mean(axis=0) if finite else None)
     return means[0], means[1]
+
+
+def _dead_joints(values: NDArray[Any], left: list[int], right: list[int]) -> list[int]:
+    """Return the places of the joints that never change while another one of their side does."""
+    with np.errstate(invalid="ignore"):  # infinite ones are left out later
+        changes = np.fmax.reduce(values, axis=0) > np.fmin.reduce(values, axis=0)
+    return [place for side in (left, right) for place in side if not changes[place] and changes[side].any()]
 
 
 def _unwound(positions: Floats) -> Floats:
@@ -156,10 +170,14 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
     sides = [*range(lefts)], [*range(lefts, lefts + rights)]
-    position = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
-    speed = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
+    positions = _unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights))
+    speeds = _by_wheel(table.find(paths[2]), wheels, lefts + rights)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-    return motion_of(WheelMotion(**of_topic(table), score=score, why=why), position, speed)
+    dead = {place for values in (positions, speeds) for place in _dead_joints(values, *sides)}
+    names = some_of([texts[(left + right)[place]] for place in sorted(dead)])
+    note = f"{names} never turns while the other wheels of its side do: left out" if dead else ""
+    base = WheelMotion(**of_topic(table), score=score, why=why, note=note)
+    return motion_of(base, _side_means(positions, *sides), _side_means(speeds, *sides))
 
 
 def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
@@ -252,14 +270,17 @@ def _segway(prefix: str, *header: str) -> Entry:
 
 def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
     twist = np.column_stack([table.column(speed), table.column(turn)]).astype(np.float64)
+    note = ""
     if COMMANDED.search(table.topic):
-        score, why = score - 40.0, f"{why} (commanded)"
+        score, why, note = score - 40.0, f"{why} (commanded)", COMMAND_NOTE
     across = table.floats(sideways)
     forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
     problem = ""
     if not _nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
         problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
-    return motion_of(WheelMotion(**of_topic(table), unit="m", twist=twist, score=score, why=why, problem=problem))
+    return motion_of(
+        WheelMotion(**of_topic(table), unit="m", twist=twist, score=score, why=why, note=note, problem=problem)
+    )
 
 
 def _scout(table: TopicTable, _: Config) -> WheelMotion:

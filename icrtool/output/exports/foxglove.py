@@ -28,6 +28,7 @@ from icrtool.logs.writing.messages import (
     serialise_topic,
 )
 from icrtool.output.exports.paths import (
+    ERROR_HORIZON_M,
     ExportPath,
     Globe,
     PathName,
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
 
 INTERVAL_S = 0.05
 """States are written 20 times a second at most."""
-
-ERROR_HORIZON_M = 10.0
 
 WORLD = "map"
 BODIES: dict[PathName, str] = {

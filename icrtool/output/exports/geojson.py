@@ -15,6 +15,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.measurement_codes import GATED, UNSEEN
 from icrtool.output.decimate import places
 from icrtool.output.exports.paths import (
+    ERROR_HORIZON_M,
     LABELS,
     ExportPath,
     Globe,
@@ -29,8 +30,6 @@ from icrtool.records.run import ICR_COLUMNS, Run
 
 STATE_CELL_M = 0.2
 """A state becomes a point where the path enters another cell of a grid of this side."""
-
-ERROR_HORIZON_M = 10.0
 
 DEGREE_DIGITS = 9
 """Decimals of latitude and longitude: 0.1 mm."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.output.exports.geojson import coordinates, event_features, outage_features, path_features
 from icrtool.output.exports.paths import ExportPath, Globe, PathName, find_globe, paths_of, rows_apart, utc_text
-from icrtool.output.text_format import distance_text, duration_text, run_title, xml_text
+from icrtool.output.text_format import distance_text, driven_text, duration_text, run_title, xml_text
 from icrtool.records.run import Run
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
@@ -70,9 +70,8 @@ def format_kml(run: Run) -> str:
 
 
 def _about(run: Run) -> str:
-    drive = run.summary["drive"]
     begin, _ = utc_text(run.table.stamp_ns[[0, -1]])
-    driven = f"{begin}: {distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    driven = f"{begin}: {driven_text(run.summary['drive'])}"
     return driven if run.usable else f"{driven}. Not usable: {run.summary['unusable_because']}"
 
 

@@ -14,12 +14,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import OdometryPath, odometry
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.output.decimate import places
-from icrtool.records.run import Run
-from icrtool.records.tables import States
+from icrtool.records.run import Run, no_slip_icrs
+from icrtool.records.tables import Icrs, States
 
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
 
@@ -29,6 +29,9 @@ LABELS: dict[PathName, str] = {
     "icr": "ICR odometry",
     "no_slip": "no-slip odometry",
 }
+
+ERROR_HORIZON_M = 10.0
+"""Open-loop errors are exported after this distance."""
 
 LINE_CELL_M = 0.05
 """A line has a point where it enters another cell of a grid of this side."""
@@ -81,15 +84,14 @@ class Globe(NamedTuple):
 
 def paths_of(run: Run) -> tuple[ExportPath, ...]:
     """Return the paths of a run: filter, smoother where it has one, ICR odometry, no slip where b is known."""
-    table, driven, width = run.table, odometry(run), run.track_width_m
+    table, width = run.table, run.track_width_m
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    final = FrozenIcrs.constant(*(float(column[-1]) for column in momentary))
     paths = [_of_states("filter", table, momentary)]
     if run.smoothed is not None:
         paths.append(_of_states("smoothed", run.smoothed, momentary))
-    paths.append(_of_odometry("icr", table, driven.drive_icr(), final))
-    if width is not None and (no_slip := driven.drive_no_slip()) is not None:
-        paths.append(_of_odometry("no_slip", table, no_slip, FrozenIcrs.constant(width / 2, -width / 2, 0.0)))
+    paths.append(_of_odometry("icr", run, table.icrs_at(-1)))
+    if width is not None:
+        paths.append(_of_odometry("no_slip", run, no_slip_icrs(width)))
     return tuple(paths)
 
 
@@ -144,6 +146,7 @@ def _of_states(name: PathName, table: States, icrs: FrozenIcrs) -> ExportPath:
     return ExportPath(name, table.stamp_ns, table.east_m, table.north_m, yaw, icrs, 0.0)
 
 
-def _of_odometry(name: PathName, table: States, path: OdometryPath, icrs: FrozenIcrs) -> ExportPath:
-    yaw = math.pi / 2 - path.heading_rad
-    return ExportPath(name, table.stamp_ns, path.east_m, path.north_m, yaw, icrs, path.end_error_m)
+def _of_odometry(name: PathName, run: Run, icrs: Icrs) -> ExportPath:
+    path = drive_wheels(run.table, run.in_gap, icrs)
+    yaw, constant = math.pi / 2 - path.heading_rad, FrozenIcrs.constant(*icrs)
+    return ExportPath(name, run.table.stamp_ns, path.east_m, path.north_m, yaw, constant, path.end_error_m)

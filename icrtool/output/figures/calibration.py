@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.alignment.estimator import WindowResiduals
+from icrtool.alignment.estimator import ResidualsByEstimate
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import ICR, add_legend, new_figure, styled
 
@@ -29,7 +29,7 @@ AFTER: dict[str, Any] = BEFORE | {"label": "after: calibrated", "marker": "o", "
 
 
 @styled
-def residuals_figure(name: str, residuals: WindowResiduals) -> Figure:
+def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     """Return residuals of displacements and of heading changes over windows, before and after."""
     figure = new_figure(
         name, f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals",

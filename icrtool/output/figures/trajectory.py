@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.alignment.position.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, odometry
+from icrtool.estimation.odometry import OdometryPath, drive_wheels
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
 from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
@@ -26,8 +26,8 @@ from icrtool.output.figures.style import (
     spot,
     styled,
 )
-from icrtool.output.text_format import distance_text, duration_text, error_text, position_word, run_title
-from icrtool.records.run import Run
+from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
+from icrtool.records.run import Run, no_slip_icrs
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
 
@@ -71,16 +71,18 @@ REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewi
 @styled
 def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
-    found = odometry(run)
-    table, drive = run.table, run.summary["drive"]
+    table = run.table
+    paths = [(table.icrs_at(-1), ICR, "ICR odometry", 3)]
+    if (b := run.track_width_m) is not None:
+        paths.append((no_slip_icrs(b), NO_SLIP, "no-slip odometry", 2))
     # Each path is driven twice, here for its corners only: both at once would be in memory beside the picture.
-    lowest, highest = _extent(_corners(table), _corners(found.drive_icr()), _corners(found.drive_no_slip()))
+    corners = [_corners(drive_wheels(table, run.in_gap, icrs)) for icrs, *_ in paths]
+    lowest, highest = _extent(_corners(table), *corners)
     norths, easts = np.column_stack([lowest, highest])
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     figure = new_figure(
-        run_title(run.summary), f"Trajectory, {driven}; ICR odometry: final ICRs",
+        run_title(run.summary), f"Trajectory, {driven_text(run.summary['drive'])}; ICR odometry: final ICRs",
         height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
     )  # fmt: skip
     axes = figure.subplots()
@@ -88,8 +90,8 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
-    _draw_odometry(axes, found.drive_icr(), cell, ICR, "ICR odometry", 3)
-    _draw_odometry(axes, found.drive_no_slip(), cell, NO_SLIP, "no-slip odometry", 2)
+    for icrs, pen, name, order in paths:
+        _draw_odometry(axes, drive_wheels(table, run.in_gap, icrs), cell, pen, name, order)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
@@ -105,28 +107,25 @@ def _extent(drive: Corners, *paths: Corners) -> Corners:
     lowest, highest = drive
     detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
     lows, highs = zip(drive, *paths, strict=True)
-    return np.maximum(np.fmin.reduce(lows), lowest - detour), np.minimum(np.fmax.reduce(highs), highest + detour)
+    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
 
 
-def _corners(path: States | OdometryPath | None) -> Corners:
-    """Return the least and the greatest (north, east) of a path [m]; NaN without one."""
-    if path is None:
-        return np.full(2, np.nan), np.full(2, np.nan)
+def _corners(path: States | OdometryPath) -> Corners:
+    """Return the least and the greatest (north, east) of a path [m]."""
     north, east = path.north_m, path.east_m
     return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
-def _draw_odometry(axes: Axes, path: OdometryPath | None, cell_m: float, pen: Pen, name: str, order: int) -> None:
+def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: Pen, name: str, order: int) -> None:
     """Draw a wheels-only path and its end; the label states where it leaves the view."""
-    if path is not None:
-        low, high = _corners(path)
-        lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
-        leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
-        label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
-        draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
-        # copies: views would keep the whole path in memory with the picture
-        ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
-        axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    low, high = _corners(path)
+    lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
+    leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+    label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
+    draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
+    # copies: views would keep the whole path in memory with the picture
+    ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
+    axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:

@@ -18,9 +18,8 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
+from icrtool.records.dropout import METRICS
 from icrtool.records.text import escaped
-
-METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
 
 LARGEST = 1e12
 """Of a number in a report [m]: beyond it is damage, whose squares overflow."""
@@ -130,12 +129,12 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], Base
     ladder = document.get("ladder") or {}
     for model in ladder.get("models", ()):
         for h, horizon_m in enumerate(ladder["horizons_m"]):
-            values = {metric: _number(model[column][h]) for metric, column in METRICS.items()}
+            values = {metric: _number(model[column][h]) for metric, (_, column) in METRICS.items()}
             yield (model["name"], float(horizon_m)), BaselineRow(values, None)
     for model in document["models"]:
         sums = {float(one["horizon_m"]): _sums(one) for one in model.get("blocks", ())}
         for row in model["by_horizon"]:
-            values = {metric: _number(row[column]) for metric, column in METRICS.items()}
+            values = {metric: _number(row[column]) for metric, (_, column) in METRICS.items()}
             yield (model["name"], float(row["horizon_m"])), BaselineRow(values, sums.get(float(row["horizon_m"])))
 
 

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.calibration.model_comparison import FAMILY, ROWS, turned_path
-from icrtool.calibration.pooled import calibrated, heading_recording_of
+from icrtool.calibration.pooled import calibrated
+from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import OdometryPath, WheelPaths, odometry
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import MODELS, FittedModel, MotionModel
@@ -26,7 +27,8 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
-from icrtool.records.run import ICR_COLUMNS, Run, drive_of, half_width_m
+from icrtool.records.run import Run, drive_of, no_slip_icrs, width_or_usual_m
+from icrtool.records.tables import Icrs
 
 MOST_STEPS = 150_000
 """Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""
@@ -43,7 +45,7 @@ ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", 
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
 
 
-class Steps(NamedTuple):
+class PageSteps(NamedTuple):
     """Which states a page has, all of them or every `joined`-th.
 
     Attributes
@@ -67,7 +69,7 @@ def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dic
     """
     table = run.table
     joined = -(-len(table) // MOST_STEPS)
-    steps = Steps(np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1)), joined)
+    steps = PageSteps(np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1)), joined)
     origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
     return {
         "origin": origin if coordinates else None,
@@ -76,7 +78,7 @@ def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dic
         "series": _series_data(run, steps),
         "fixes": _fixes_data(run, origin),
         "headings": _headings_data(run),
-        "odometry": _odometry_data(odometry(run), run, origin),
+        "odometry": _odometry_data(run, origin),
         "models": _models(run, report, steps),
         "events": _events_data(run, origin),
         "outages": [
@@ -103,7 +105,7 @@ def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _steps_data(run: Run, steps: Steps, origin: tuple[float, float]) -> dict[str, Any]:
+def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict[str, Any]:
     """Return what the wheels did and where the reference was, at every step."""
     drive, rows = drive_of(run), steps.rows
     held = np.where(drive.gap, 0.0, drive.dt_s)
@@ -125,7 +127,7 @@ def _steps_data(run: Run, steps: Steps, origin: tuple[float, float]) -> dict[str
     } | {name: packed_sums(column) for name, column in columns.items()}
 
 
-def _series_data(run: Run, steps: Steps) -> dict[str, Any]:
+def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
     """Return the states that the time series show; each is a step too."""
     table = run.table
     columns = {
@@ -175,21 +177,20 @@ def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:
     return rows[extremes(difference[rows], points=FIX_POINTS)]
 
 
-def _odometry_data(found: WheelPaths, run: Run, origin: tuple[float, float]) -> dict[str, Any]:
-    table = run.table
+def _odometry_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+    table, b = run.table, run.track_width_m
     extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
 
-    def path(one: OdometryPath | None) -> dict[str, Any] | None:
-        if one is None:
-            return None
+    def path(icrs: Icrs) -> dict[str, Any]:
+        one = drive_wheels(table, run.in_gap, icrs)
         rows = places(one.north_m, one.east_m, extent / PATH_CELLS)
         north, east = one.north_m[rows] - origin[0], one.east_m[rows] - origin[1]
         return {"north": packed(north, "f32"), "east": packed(east, "f32"), "t": packed(table.t_s[rows], "f32")}
 
-    return {"icr": path(found.drive_icr()), "no_slip": path(found.drive_no_slip())}
+    return {"icr": path(table.icrs_at(-1)), "no_slip": None if b is None else path(no_slip_icrs(b))}
 
 
-class Path(NamedTuple):
+class ModelPath(NamedTuple):
     """The path of a model through the whole drive, at the steps of the page alone: a drive has many states and models.
 
     Attributes
@@ -205,15 +206,15 @@ class Path(NamedTuple):
     icrs: Sequence[float] | None = ()
 
 
-def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str, Any]]:
+def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[str, Any]]:
     """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
     labels = {one["name"]: one["label"] for one in report["models"]}
     b = run.track_width_m
-    icrs = {"icr": None, "no_slip": None if b is None else [b / 2, -b / 2, 0.0], "icr_final": _last_icrs(run)}
+    icrs = {"icr": None, "no_slip": None if b is None else no_slip_icrs(b), "icr_final": run.table.icrs_at(-1)}
     models: list[dict[str, Any]] = [
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
-    recording = cache(lambda kind: heading_recording_of(run, kind, width_m=2.0 * half_width_m(b)))
+    recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(b)))
     paths = list(_calibrated(recording, report, labels, steps.rows))
     paths += _compared(run, recording, report["ladder"], {*labels, *(one.name for one in paths)}, steps.rows)
     count = len(steps.rows)
@@ -230,13 +231,9 @@ def _models(run: Run, report: Mapping[str, Any], steps: Steps) -> list[dict[str,
     return models
 
 
-def _last_icrs(run: Run) -> list[float]:
-    return [float(getattr(run.table, column)[-1]) for column in ICR_COLUMNS]
-
-
 def _calibrated(
     recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str], rows: Ints
-) -> Iterator[Path]:
+) -> Iterator[ModelPath]:
     """Yield the path of each calibration of the report, its own first; with the gyro too where there is one."""
     wanted = [(one["name"], one["label"], one["calibration"], one["with_gyro"]) for one in report["calibrations"]]
     if (own := report["recommended"]) is not None and (label := labels.get("recommended")):
@@ -248,12 +245,12 @@ def _calibrated(
             # Too short a drive to find the delay of its wheels has no path.
             with suppress(DataError):
                 model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
-                yield Path(name, label, *predicted_path(recording, *model)(recording.t_s[rows]))
+                yield ModelPath(name, label, *predicted_path(recording, *model)(recording.t_s[rows]))
 
 
 def _compared(
     run: Run, recording_of: Callable[[str], Recording], ladder: Mapping[str, Any], known: set[str], rows: Ints
-) -> Iterator[Path]:
+) -> Iterator[ModelPath]:
     """Yield the path of each model of the comparison that is not `known`, as fitted to the whole drive."""
     if "left_out" in ladder:
         return
@@ -276,10 +273,10 @@ def _compared(
             if base in FAMILY:
                 fitted = _fitted(ladder, base, turned=turned)
                 own = own_constants(windows(), fitted, recording.width_m)
-                yield Path(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
+                yield ModelPath(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
             else:
-                icrs = None if base == "icr" else _last_icrs(run)
-                yield Path(name, row["label"], *path_turned(), icrs)
+                icrs = None if base == "icr" else run.table.icrs_at(-1)
+                yield ModelPath(name, row["label"], *path_turned(), icrs)
 
 
 def _fitted(ladder: Mapping[str, Any], row: str, *, turned: bool) -> FittedModel:

@@ -13,8 +13,8 @@ DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 def format_calibration(calibration: LogCalibration) -> Text:
     """Return the table of a calibration, no line end."""
     facts = calibration.facts
-    right, left = math.degrees(facts.turned_right_rad), math.degrees(facts.turned_left_rad)
-    speed = f"{facts.speed_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
+    right, left = facts.turned_right_deg, facts.turned_left_deg
+    speed = f"{facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
     head = [
         ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
         (

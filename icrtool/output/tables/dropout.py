@@ -17,6 +17,7 @@ from icrtool.output.text_format import (
     controller_error_text,
     controller_text,
     distance_text,
+    driven_text,
     duration_text,
     error_text,
     fitted_model_text,
@@ -43,9 +44,8 @@ Rows = list[list[str]]
 
 def format_dropout(report: DropoutReport) -> Text:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
-    drive = report.run_summary["drive"]
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
-    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    driven = driven_text(report.run_summary["drive"])
     starts = f"a trial from each {STARTS_TEXT[report.starts]}state of {report.states:,}"
     rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
     head = ("distance without GNSS", "", *_horizon_texts(report))
@@ -208,7 +208,10 @@ def _count_lines(report: DropoutReport) -> list[str]:
 
 def _event_lines(report: DropoutReport) -> list[str]:
     """Return what slip events cost, at the longest horizon with trials on both sides."""
-    cost, icr = report.event_cost, report.result("icr")
+    cost, icr, events = report.event_cost, report.result("icr"), report.run_summary["events"]
+    if cost is None and events:
+        lasted = duration_text(sum(event["end_s"] - event["begin_s"] for event in events))
+        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
     if cost is None or icr is None:
         return []
     if not cost.events:

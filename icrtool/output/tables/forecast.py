@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
+from icrtool.dropout_analysis.acceptance_limits import within_budget
 from icrtool.kernels.arrays import Floats
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, fitted_model_text
@@ -58,14 +57,9 @@ def measured_to_m(calibration: Calibration) -> float:
 
 
 def reach(forecast: Forecast, budget_m: float) -> float:
-    """Return the distance [m] up to which 95 % of the errors stay within a budget, interpolated from 0 m at 0 m."""
-    p95, distance = np.concatenate([[0.0], forecast.p95_m]), np.concatenate([[0.0], forecast.distance_m])
-    beyond = np.flatnonzero(p95 > budget_m)
-    if not len(beyond):
-        return float(distance[-1])
-    k = int(beyond[0])
-    share = (budget_m - p95[k - 1]) / (p95[k] - p95[k - 1])
-    return float(distance[k - 1] + share * (distance[k] - distance[k - 1]))
+    """Return the distance [m] up to which 95 % of the errors stay within a budget."""
+    found = within_budget(forecast.distance_m, forecast.p95_m, budget_m)
+    return math.nan if found is None else found[0]
 
 
 def format_forecast(

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from icrtool.calibration.controller_numbers import not_shown_sentences
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
@@ -52,10 +53,7 @@ def _parameter_blocks(calibration: Calibration) -> list[Block]:
     return [
         Table("l", rows, ("parameter", "value ± std", "meaning")),
         Table("l", numbers),
-        *(
-            f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
-            for name in calibration.fitted.not_shown
-        ),
+        *not_shown_sentences(calibration.fitted),
     ]
 
 

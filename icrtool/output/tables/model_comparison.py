@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from icrtool.calibration.model_comparison import ROWS, ModelComparison
-from icrtool.kernels.open_loop.trials import Summary
 from icrtool.motion.models import FittedModel, TypicalDrive
 from icrtool.output.text_blocks import Block, Table
 from icrtool.output.text_format import FITTED
-from icrtool.records.dropout import ModelScore
+from icrtool.records.dropout import ModelScore, error_columns
 from icrtool.records.plain_data import rows_of
 
 COMPARISON_COLUMNS = (
@@ -51,11 +50,6 @@ def comparison_rows(comparison: ModelComparison) -> Iterator[tuple[Any, ...]]:
         for row in rows_of({"horizon_m": comparison.horizons_m, **error_columns(score.summary)}):
             shares = (100.0 * row[name] / row["horizon_m"] for name in ("expected_error_m", "p95_m"))
             yield score.name, fitted, heading, *row.values(), *shares
-
-
-def error_columns(summary: Summary) -> dict[str, Any]:
-    """Return errors by horizon, under their names in files."""
-    return dict(zip(("trials", "expected_error_m", "p50_m", "p95_m", "max_m"), summary, strict=True))
 
 
 def comparison_document(comparison: ModelComparison) -> dict[str, Any]:

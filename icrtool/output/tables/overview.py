@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.output.tables.run import Row, excitation_row
-from icrtool.output.text_format import distance_text, duration_text
+from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.tables import RobotLog
 
@@ -32,8 +32,7 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     rows = [("recorded", f"{date}, {duration_text((end - begin) / 1e9)}")]
     if run is not None:
         drive = run.summary["drive"]
-        driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
-        rows.append(("driven", f"{driven}, {drive['speed_mean_mps']:.2f} m/s on average"))
+        rows.append(("driven", f"{driven_text(drive)}, {drive['speed_mean_mps']:.2f} m/s on average"))
     return rows + _extent_rows(log)
 
 

@@ -7,7 +7,7 @@ from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
 from icrtool.output.text_format import (
     controller_text,
-    distance_text,
+    driven_text,
     duration_text,
     error_text,
     event_kinds,
@@ -42,7 +42,6 @@ def format_run(run: Run) -> Text:
     Warnings are not in it: they belong to stderr.
     """
     drive = run.summary["drive"]
-    driven = f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
     speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s (mean ± std)"
     learned = [*_multiplier_rows(run), *_recommended_rows(run), excitation_row(run)]
     measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
@@ -53,7 +52,7 @@ def format_run(run: Run) -> Text:
             "",
             _stream_table(run),
             "",
-            *labelled([("drive", f"{driven}, {speed}")]),
+            *labelled([("drive", f"{driven_text(drive)}, {speed}")]),
             "",
             _icr_table(run),
             *labelled(learned),

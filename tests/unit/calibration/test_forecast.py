@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
-from icrtool.calibration.pooled import calibrate, predictor
+from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, IcrToolError
@@ -21,7 +21,7 @@ from icrtool.motion.models import MODELS, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
 from icrtool.output.files.csv_file import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
-from support.recordings import WIDTH_M, draw_parameters, make_recording
+from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 
 SIX = MODELS["six"]
 SEEDS = range(5)
@@ -32,7 +32,7 @@ ROUNDING = 1e-6
 def calibrated(seed: int) -> Calibration:
     parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
     logs = [make_recording(SIX, parameters, 10 * seed + k, 150.0, name=f"log {k}") for k in range(3)]
-    return calibrate(logs).calibration
+    return calibrate_recordings(logs).calibration
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_wheel_speeds_make_the_motion_asked_for(name: str) -> None:
 
 def test_a_drive_is_forecast_as_its_trials_from_the_start_are(calibration: Calibration) -> None:
     recording = make_recording(SIX, SIX.prior_mean, 4, 60.0)
-    trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
+    trials = trials_from_all(recording, (5.0, 10.0))
     _, p95 = forecast_trials(calibration, recording, trials)
     np.testing.assert_allclose(forecast_drive(calibration, recording).p95_m[[4, 9]], p95[0], rtol=1e-9)
 
@@ -200,7 +200,7 @@ def test_reverse_along_a_path_is_as_uncertain_as_forward(calibration: Calibratio
 def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     parameters = draw_parameters(SIX, np.random.default_rng([1, 3]))
     logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
-    found = calibrate(logs).calibration
+    found = calibrate_recordings(logs).calibration
     assert found.gyro_sources is not None
     assert calibration_of(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
@@ -216,7 +216,9 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
 def test_long_drives_measure_errors_further_than_short_ones(calibration: Calibration) -> None:
     assert calibration.sources is not None
     assert calibration.sources.measured_to_m == 20.0
-    longer = calibrate([make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]).calibration
+    longer = calibrate_recordings(
+        [make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]
+    ).calibration
     assert longer.sources is not None
     assert longer.sources.measured_to_m >= 50.0
 

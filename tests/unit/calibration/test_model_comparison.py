@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.model_comparison import ModelComparison, _errors_along, compare_models, turned_path
-from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_recording import recording_of
 from icrtool.config import parse_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit

@@ -12,14 +12,8 @@ import pytest
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
 from icrtool.calibration.model_choice import choose
-from icrtool.calibration.pooled import (
-    CalibrationResult,
-    calibrate,
-    held_out_predictor,
-    predictor,
-    recording_of,
-    with_turn_rate,
-)
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, held_out_predictor, predictor
+from icrtool.calibration.run_recording import recording_of, with_turn_rate
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
@@ -32,7 +26,7 @@ from icrtool.output.files.calibration_file import open_calibration, write_calibr
 from icrtool.output.tables.held_out import format_result
 from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
-from support.recordings import WIDTH_M, make_recording, table_errors
+from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
 
 SIX = MODELS["six"]
 TRUTH = np.array([0.96, -0.1, 0.6, -0.02, 0.1, -0.12])
@@ -45,7 +39,7 @@ def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def result() -> CalibrationResult:
-    return calibrate(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
+    return calibrate_recordings(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
 
 
 def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) -> None:
@@ -150,7 +144,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
 
 def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
     new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
-    trials = cut_trials(new, (5.0, 10.0), all_starts=True)
+    trials = trials_from_all(new, (5.0, 10.0))
     errors = predictor(result.calibration, new)(trials)
     np.testing.assert_array_equal(np.isfinite(errors), trials.ends >= 0)
     assert np.nanmean(errors[:, 1]) < 0.5
@@ -207,11 +201,11 @@ def test_a_trial_that_leaves_too_little_has_no_error_in_any_row() -> None:
 def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:
     one, two = logs(2)
     with pytest.raises(ConfigError, match="given twice"):
-        calibrate([one, two, one])
+        calibrate_recordings([one, two, one])
     with pytest.raises(ConfigError, match="one robot at a time"):
-        calibrate([one, replace(two, width_m=1.0)])
+        calibrate_recordings([one, replace(two, width_m=1.0)])
     with pytest.raises(DataError):
-        calibrate([make_recording(SIX, TRUTH, 0, 12.0)])
+        calibrate_recordings([make_recording(SIX, TRUTH, 0, 12.0)])
 
 
 @pytest.mark.parametrize("scales", [(0.95, 0.95), (0.96, 1.03)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.error_differences import compare_errors
-from icrtool.calibration.pooled import calibrate
+from icrtool.calibration.pooled import calibrate_recordings
 from icrtool.calibration.transfer import Transfer, compare_calibrations, compare_groups
 from icrtool.errors import ConfigError
 from icrtool.motion.models import MODELS
@@ -30,7 +30,7 @@ def group(parameters: np.ndarray, seeds: range, length_m: float = 150.0) -> list
 @pytest.fixture(scope="module")
 def transfer() -> Transfer:
     groups = {"old": group(OLD, range(3)), "new": group(NEW, range(3, 6)), "again": group(OLD, range(6, 7), 250.0)}
-    return compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
+    return compare_calibrations({name: calibrate_recordings(logs) for name, logs in groups.items()}, groups)
 
 
 def test_a_known_difference_is_found_within_its_standard_deviation(transfer: Transfer) -> None:
@@ -53,7 +53,7 @@ def test_the_wrong_calibration_costs_and_an_equal_one_does_not(transfer: Transfe
 
 def test_the_diagonal_is_the_held_out_score(transfer: Transfer) -> None:
     groups = group(OLD, range(3))
-    table = calibrate(groups).wheels
+    table = calibrate_recordings(groups).wheels
     together = table.score("recommended").together
     for h, horizon in enumerate(table.horizons_m):
         assert transfer.cell("old", "old", horizon).errors.p95_m == pytest.approx(together.p95[h], rel=1e-6)
@@ -75,7 +75,7 @@ def test_one_group_is_refused() -> None:
 def test_a_calibration_is_not_tested_on_another_robot() -> None:
     groups = {"small": group(OLD, range(1)), "again": group(OLD, range(1, 2)), "large": group(OLD, range(2, 3))}
     groups["large"] = [replace(groups["large"][0], width_m=2.0 * groups["small"][0].width_m)]
-    found = compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
+    found = compare_calibrations({name: calibrate_recordings(logs) for name, logs in groups.items()}, groups)
     assert np.isnan(found.cell("small", "large", 10.0).errors.p95_m)
     assert np.isnan(found.cell("large", "again", 10.0).errors.p95_m)
     assert all(found.cell(name, name, 10.0).errors.p95_m > 0.0 for name in groups)
@@ -113,6 +113,6 @@ def test_the_same_route_driven_twice_is_paired() -> None:
     first, second = (make_recording(FIVE, OLD, 1, 150.0, name=name) for name in ("one", "two"))
     second = replace(second, drive=second.drive._replace(north=second.drive.north + 0.2))
     groups = {"one": [first], "two": [second]}
-    found = compare_calibrations({name: calibrate(logs) for name, logs in groups.items()}, groups)
+    found = compare_calibrations({name: calibrate_recordings(logs) for name, logs in groups.items()}, groups)
     assert found.pairs[0].paired
     assert "the same route" in format_transfer(found)

@@ -12,17 +12,18 @@ import pandas as pd
 import pytest
 
 import icrtool
-from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.run_recording import recording_of
 from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.error_statistics import error_summary
-from icrtool.motion.trials import cut_trials
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.run import Run
+from support.recordings import trials_from_all
 
 HORIZONS = (5.0, 10.0, 20.0)
 
@@ -53,7 +54,7 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
     drive: Run, own: Calibration, report: DropoutReport
 ) -> None:
     recording = recording_of(drive)
-    expected = error_summary(predictor(own, recording)(cut_trials(recording, HORIZONS, all_starts=True)))
+    expected = error_summary(predictor(own, recording)(trials_from_all(recording, HORIZONS)))
     for name in ("calibration:own", "calibration:last.season"):
         result = report.result(name)
         assert result is not None

@@ -55,7 +55,7 @@ def test_what_is_configured_is_not_searched_for() -> None:
 def cost_of(run: Run, noise: ProcessNoise) -> float:
     summary = {**run.summary, "filter": {**run.summary["filter"], "process_position_mps": noise.position_mps}}
     setup = set_up_again(replace(run, summary=summary))
-    return innovation_cost(run_ekf(setup.data, setup.t0, setup.x0, setup.P0, setup.parameters))
+    return innovation_cost(run_ekf(*setup))
 
 
 def test_the_cost_is_least_near_the_noise_a_drive_was_made_with() -> None:

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.estimation.odometry import odometry
-from icrtool.records.run import Run
+from icrtool.estimation.odometry import drive_wheels
+from icrtool.records.run import Run, no_slip_icrs
 
 ROUNDING_M = 1e-9
 
@@ -41,7 +41,7 @@ def test_odometry_is_the_plain_integration_gaps_included(run: Run, gaps: tuple[i
     gappy = replace(run, in_gap=in_gap)
     table = run.table
     expected = plain_path(gappy, table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
-    found = odometry(gappy).drive_icr()
+    found = drive_wheels(table, in_gap, table.icrs_at(-1))
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
     end = np.hypot(expected[0, -1] - table.north_m[-1], expected[1, -1] - table.east_m[-1])
@@ -50,26 +50,22 @@ def test_odometry_is_the_plain_integration_gaps_included(run: Run, gaps: tuple[i
 
 def test_no_slip_drives_with_half_the_width_on_either_side(run: Run) -> None:
     expected = plain_path(run, 0.3, -0.3, 0.0)
-    found = odometry(run).drive_no_slip()
-    assert found is not None
+    found = drive_wheels(run.table, run.in_gap, no_slip_icrs(0.6))
     assert np.abs(found.north_m - expected[0]).max() < ROUNDING_M
     assert np.abs(found.east_m - expected[1]).max() < ROUNDING_M
 
 
 def test_learned_icrs_lead_closer_than_no_slip(run: Run) -> None:
-    no_slip = odometry(run).drive_no_slip()
-    assert no_slip is not None
-    assert odometry(run).drive_icr().end_error_m < 0.5 * no_slip.end_error_m
+    icrs = run.table.icrs_at(-1), no_slip_icrs(0.6)
+    learned, no_slip = (drive_wheels(run.table, run.in_gap, one).end_error_m for one in icrs)
+    assert learned < 0.5 * no_slip
 
 
 def test_without_width_there_is_no_no_slip_path(make_run: Callable[..., Run]) -> None:
-    assert odometry(make_run(track_width_m=None, duration_s=20.0)).drive_no_slip() is None
+    assert make_run(track_width_m=None, duration_s=20.0).summary["odometry"]["no_slip"] is None
 
 
 def test_the_summary_holds_the_end_errors(run: Run) -> None:
-    paths = odometry(run)
-    no_slip = paths.drive_no_slip()
-    assert no_slip is not None
     stored = run.summary["odometry"]
-    assert stored["icr"]["end_error_m"] == paths.drive_icr().end_error_m
-    assert stored["no_slip"]["end_error_m"] == no_slip.end_error_m
+    for name, icrs in (("icr", run.table.icrs_at(-1)), ("no_slip", no_slip_icrs(0.6))):
+        assert stored[name] == {"end_error_m": drive_wheels(run.table, run.in_gap, icrs).end_error_m}

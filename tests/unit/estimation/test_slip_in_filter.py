@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.align import align, sensors_as_sent
-from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.estimation.fit import fit
@@ -85,16 +85,14 @@ def test_an_outage_that_is_made_knows_no_event() -> None:
 
 def test_the_filter_through_slip_equals_the_matrix_form() -> None:
     setup = set_up_filter(with_event(held_sensors()), CONFIG)
-    arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
-    out, plain = run_ekf(*arguments), run_ekf_plain(*arguments)
+    out, plain = run_ekf(*setup), run_ekf_plain(*setup)
     for name in ("x", "variance", "distance", "P"):
         assert getattr(out, name) == pytest.approx(getattr(plain, name), abs=1e-9)
 
 
 def test_smoothing_ends_at_the_state_of_the_filter_through_slip() -> None:
     setup = set_up_filter(with_event(held_sensors()), CONFIG)
-    arguments = setup.data, setup.t0, setup.x0, setup.P0, setup.parameters
-    assert run_smoother(*arguments).x[-1] == pytest.approx(run_ekf(*arguments).x[-1], abs=1e-12)
+    assert run_smoother(*setup).x[-1] == pytest.approx(run_ekf(*setup).x[-1], abs=1e-12)
 
 
 def test_measurements_without_flags_have_no_slip() -> None:

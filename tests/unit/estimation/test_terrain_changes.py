@@ -14,8 +14,8 @@ from icrtool.estimation.fit import fit
 from icrtool.output.figures.icrs import icr_estimates
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import ICR_COLUMNS, Run
-from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, Icrs, Sensors, drive_plan, sense
+from icrtool.records.tables import Icrs, RobotLog
+from icrtool.simulation.drives import DrivePlan, Sensors, drive_plan, sense
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.study_runs import readings_log
 

@@ -187,6 +187,10 @@ def test_an_antenna_off_centre_moves_the_icrs_by_its_place_until_it_is_told(
     assert icrs(run) - expected == pytest.approx([-right, -right, -forward], abs=0.01)
     assert [one for one in run.warnings if "both ICRs lie 0.10 m to the right of the position sensor" in one]
     assert not [one for one in fit(clean, CONFIG).warnings if "both ICRs" in one]
+    ahead = with_fixes(
+        clean, clean.gnss.north_m + 2 * forward * np.cos(psi), clean.gnss.east_m + 2 * forward * np.sin(psi)
+    )
+    assert [one for one in fit(ahead, CONFIG).warnings if "is counted from the position sensor" in one]
     given = icrtool.load_config(
         robot="segway-rmp400", sets=[f"frames.antenna_forward_m={forward}", f"frames.antenna_right_m={right}"]
     )

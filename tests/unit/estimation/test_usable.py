@@ -81,6 +81,19 @@ def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, wo
     assert words in " ".join(reasons)
 
 
+def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> None:
+    """Its controller multiplies the width, or it is fused: the ICRs are those of the assumed width."""
+    log = make_log(seed=1)
+    of_twist = tuple(replace(one, message_type="nav_msgs/Odometry") for one in log.streams)
+    v, turn = (log.wheels.left + log.wheels.right) / 2, (log.wheels.left - log.wheels.right) / 2
+    known = replace(log, streams=of_twist, wheels=replace(log.wheels, left=v + turn / 1.75, right=v - turn / 1.75))
+    run = fit(known, load_config(sets=[WIDTH]))
+    assert not run.usable
+    assert "wheels.twist_width_m" in run.summary["unusable_because"]
+    assert fit(known, load_config(sets=[WIDTH, "wheels.twist_width_m=1.05"])).usable
+    assert fit(replace(log, streams=of_twist), load_config(sets=[WIDTH])).usable
+
+
 def test_the_rejected_share_counts_what_the_filter_saw() -> None:
     code = np.array([UNSEEN, UNSEEN, USED, GATED], np.uint8)
     none = np.zeros(4)

@@ -81,6 +81,20 @@ def test_an_enu_covariance_is_turned_to_north_and_east(name: str) -> None:
     assert source.usable.all()
 
 
+def test_a_pose_in_a_camera_s_optical_frame_is_no_position() -> None:
+    """Its z is forward and its y down; a slope and a narrow straight drive are level."""
+    t = np.linspace(0.0, 20.0, 200)
+    ahead, left, up = 4.0 * np.sin(0.4 * t) + t, 5.0 * np.cos(0.3 * t), 0.02 * np.sin(9.0 * t)
+
+    def problem(x: Any, y: Any, z: Any) -> str:
+        columns = {f"pose__position__{axis}": values for axis, values in zip("xyz", (x, y, z), strict=True)}
+        columns |= {f"pose__orientation__{axis}": values for axis, values in about(0.1 * t).items()}
+        return position("geometry_msgs/PoseStamped", "/slam/pose", **columns).problem
+
+    assert "optical frame" in problem(-left, up, ahead)
+    assert problem(ahead, left, up) == problem(ahead, left, 0.3 * ahead + up) == problem(ahead, up, 0.3 * t) == ""
+
+
 @pytest.mark.parametrize("name", ["sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix"])
 def test_a_negative_status_is_no_fix(name: str) -> None:
     source = position(name, **fix(status__status=[-1, 0, -2]))
@@ -99,7 +113,7 @@ def test_rows_at_0_0_and_not_finite_and_off_the_earth_are_dropped_with_the_reaso
     source = position("sensor_msgs/NavSatFix", **fix(latitude=[0.0, np.nan, 48.0], longitude=[0.0, 11.0, 1e9]))
     assert not source.usable.any()
     assert source.rejected == {"at 0, 0": 1, "not finite": 1, "not a place on earth": 1}
-    assert source.problem == "no usable fix"
+    assert source.problem.startswith("no usable fix (not finite 1,")
 
 
 def test_an_altitude_that_is_nan_or_absurd_becomes_the_usual_one() -> None:
@@ -481,3 +495,15 @@ def test_stamps_become_increasing_and_of_equals_the_last_stays() -> None:
     rows, backwards, dropped = increasing(np.array([10, 30, 20, 20, 40]))
     assert rows.tolist() == [0, 3, 1, 4]
     assert (backwards, dropped) == (1, 1)
+
+
+def test_an_orientation_that_is_not_known_yet_is_left_out() -> None:
+    """A moving base without a solution writes a variance of 1000; where all have one it means nothing."""
+    variance = {f"orientation_covariance_{i}_": [v, v, v] for i, v in ((0, 1e-4),)}
+    first = heading(
+        "sensor_msgs/Imu", **imu([2.0, 0.1, 0.2]), **variance, orientation_covariance_8_=[1000.0, 1e-4, 1e-4]
+    )
+    assert first.usable.tolist() == [False, True, True]
+    assert heading(
+        "sensor_msgs/Imu", **imu([0.0, 0.1, 0.2]), **variance, orientation_covariance_8_=[1e3] * 3
+    ).usable.all()

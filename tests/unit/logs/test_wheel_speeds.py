@@ -70,6 +70,16 @@ def test_a_gap_in_less_than_a_turn_is_no_wrap() -> None:
     assert sides[0].tolist() == positions[:, 0].tolist()
 
 
+def test_a_wheel_with_a_dead_encoder_is_left_out_of_its_side() -> None:
+    travel = np.cumsum(np.full(50, 0.1))
+    motion = joints_motion(np.column_stack([np.zeros(50), travel, 2.0 * travel, 2.0 * travel]))
+    assert motion.position is not None
+    assert motion.position[0] == pytest.approx(travel)
+    assert motion.note.startswith("front_left_wheel never turns")
+    parked = joints_motion(np.zeros((50, 4)))
+    assert (parked.note, parked.position is None) == ("", False)
+
+
 def joints_motion(positions: Floats) -> WheelMotion:
     names = ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"]
     rows = len(positions)

@@ -16,7 +16,7 @@ from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, WindowResiduals, 
 from icrtool.motion.models import MODELS, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_windows
 from icrtool.motion.trials import cut_trials, predicted_path
-from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors
+from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all
 
 EIGHT = MODELS["eight"]
 SEEDS = range(8)
@@ -57,7 +57,7 @@ def test_derivatives_are_those_of_differences(name: str) -> None:
 def test_window_ends_equal_the_direct_integration() -> None:
     parameters = draw_parameters(EIGHT, np.random.default_rng(2))
     recording = make_recording(EIGHT, parameters, seconds=60.0)
-    trials = cut_trials(recording, (5.0, 10.0), all_starts=True)
+    trials = trials_from_all(recording, (5.0, 10.0))
     path, drive = predicted_path(recording, fitted(EIGHT, parameters)), recording.drive
     errors = table_errors(recording, trials, path)
     rates = twist(EIGHT, parameters, wheel_motion(drive.v_left, drive.v_right, WIDTH_M))

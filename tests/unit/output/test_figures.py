@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.odometry import odometry
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
@@ -107,7 +107,7 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> N
     view = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     path = line_labelled(axes, "filter")
     assert np.allclose(path[[0, -1]], np.column_stack([run.table.east_m, run.table.north_m])[[0, -1]])
-    path_end = odometry(run).drive_icr()
+    path_end = drive_wheels(run.table, run.in_gap, run.table.icrs_at(-1))
     assert np.allclose(line_labelled(axes, "ICR odometry")[-1], [path_end.east_m[-1], path_end.north_m[-1]])
     for states, line in ((run.table.east_m, path[:, 0]), (run.table.north_m, path[:, 1])):
         assert abs(line.max() - states.max()) < CELL * view

@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import odometry
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, write_foxglove
 from icrtool.output.exports.foxglove_layout import foxglove_layout
@@ -177,7 +177,8 @@ def test_the_geojson_holds_states_fixes_events_and_outages(slipping: Run) -> Non
         layers.setdefault(feature["properties"]["layer"], []).append(feature)
     assert [line["properties"]["path"] for line in layers["path"]] == ["filter", "icr", "no_slip"]
     ends = [line["properties"]["end_error_m"] for line in layers["path"]]
-    assert ends[1] == pytest.approx(odometry(slipping).drive_icr().end_error_m)
+    driven = drive_wheels(slipping.table, slipping.in_gap, slipping.table.icrs_at(-1))
+    assert ends[1] == pytest.approx(driven.end_error_m)
     (outage,) = layers["outage"]
     assert outage["properties"]["duration_s"] == pytest.approx(OUTAGE_S[1] - OUTAGE_S[0], abs=0.2)
     (event,) = layers["event"]

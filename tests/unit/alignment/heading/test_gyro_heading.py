@@ -243,6 +243,16 @@ def test_a_gyro_that_shows_no_turn_gives_way_to_the_wheels() -> None:
     assert coverage(found.causal, truth) > 0.9
 
 
+def test_a_gyro_that_shows_no_turn_is_not_fused_with_a_poor_compass() -> None:
+    """Its means over a second would lag the robot by half a second."""
+    log, truth = without_heading(3)
+    dead = replace(log.gyros[0], rates_radps=np.zeros_like(log.gyros[0].rates_radps))
+    hard_iron = truth[1] + math.radians(14.0) * np.sin(truth[1])
+    samples = HeadingSamples(truth[0], np.angle(np.exp(1j * hard_iron)), np.full(len(hard_iron), 3e-4))
+    compass = replace(log, heading=samples, gyros=(dead,))
+    assert fuse_heading(compass, drive_arrays(compass)) is None
+
+
 ROBOTS = {"tracked_gyro.bag": "pentzer-tracked", "wheeled_two_antennas": "segway-rmp400"}
 
 

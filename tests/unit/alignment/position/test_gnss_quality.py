@@ -10,6 +10,7 @@ import pytest
 
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.position.gnss_quality import grade_fixes
+from icrtool.alignment.position.gnss_steps import without_frozen
 from icrtool.config import load_config
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
@@ -332,3 +333,16 @@ def test_poses_that_are_noisier_than_they_state_neither_lose_their_fixes_nor_spo
     assert list(run.summary["gnss"]["classes"]) == ["reference"]
     assert any("the poses state" in warning and "scatter by" in warning for warning in run.warnings)
     assert icrs(run) == pytest.approx(ICRS, abs=0.02)
+
+
+def test_fixes_that_a_driver_repeats_while_the_receiver_has_none_are_left_out() -> None:
+    log = clean()
+    row = np.arange(len(log.gnss.stamp_ns))
+    kept = np.where((row // 200) % 4 == 3, row // 200 * 200, row)  # 10 s of each 40 s
+    gnss = log.gnss
+    north, east = gnss.north_m[kept], gnss.east_m[kept]
+    frozen = fit(replace(log, gnss=replace(gnss, north_m=north, east_m=east)), CONFIG)
+    assert any("repeat the one before" in note for note in frozen.warnings)
+    assert icrs(frozen) == pytest.approx(icrs(fit(log, CONFIG)), abs=ICR_TOLERANCE_M)
+    stands = replace(log, gnss=replace(gnss, north_m=0.0 * gnss.north_m, east_m=0.0 * gnss.east_m))
+    assert without_frozen(stands) is stands

@@ -62,6 +62,10 @@ def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # ty
     ("spoil", "words"),
     [
         (lambda left, right: (0 * left, right), "left wheels hardly ever move"),
+        (
+            lambda left, right: (left, np.where(np.arange(len(right)) > 4000, 0.0, right)),
+            "right wheels hardly ever move from 80 s",
+        ),
         (lambda left, right: (left, left), "copy"),
         (lambda left, right: (3 * left, 3 * right), "check wheel radius"),
         (

@@ -1,0 +1,114 @@
+"""A run as a recording: what motion models are fitted to and tested on, with a turn rate where it has one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icrtool.errors import ConfigError
+from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.robust import robust_least_squares
+from icrtool.motion.recording import Recording
+from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.memory import give_back_freed
+from icrtool.records.run import Run, drive_of
+
+GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
+"""Turns over this time are compared, at least so many."""
+
+GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
+"""Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
+
+GYRO_SCALE_RANGE = 0.1
+"""A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
+
+
+def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
+    """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
+
+    Parameters
+    ----------
+    heading : a measured heading of the run, such as its gyro's; its turn rate is used where it turns as the reference
+        does
+    width_m : track width b to use; default the run's
+
+    Raises
+    ------
+    ConfigError
+        The robot's track width is not known.
+    """
+    width = width_m if width_m is not None else run.track_width_m
+    if width is None:
+        raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
+    drive, inputs = drive_of(run), run.summary.get("inputs", [])
+    left_scale, right_scale = run.wheel_scales
+    if (left_scale, right_scale) != (1.0, 1.0):
+        drive = drive._replace(v_left=drive.v_left / left_scale, v_right=drive.v_right / right_scale)
+    plain = Recording(
+        name=run.name,
+        t_s=run.table.t_s,
+        drive=drive,
+        gyro_radps=None,
+        width_m=width,
+        path=inputs[0]["path"] if inputs else "",
+        sha256=inputs[0]["sha256"] if inputs else "",
+        begin_ns=int(run.table.stamp_ns[0]),
+        slipping=run.slipping if run.sensors.events else None,
+    )
+    return plain if heading is None else with_turn_rate(plain, heading)
+
+
+def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
+    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
+    if not np.isfinite(heading.angle_rad).all():
+        return plain
+    t, dt = plain.t_s, plain.drive.dt_s
+
+    def rate(later_s: float) -> Floats:
+        turned = np.diff(np.interp(np.append(t, t[-1] + dt[-1]) + later_s, t, heading.angle_rad))
+        return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
+
+    slope, _, later_s = _gyro_line(plain, rate(0.0))
+    give_back_freed()
+    if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
+        return plain
+    return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
+
+
+def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
+    """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
+    return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
+
+
+def scaled_gyro(recording: Recording) -> Floats:
+    """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
+    if recording.gyro_radps is None:
+        return np.zeros(len(recording.t_s))
+    slope, bias, _ = _gyro_line(recording, recording.gyro_radps)
+    rate: Floats = slope * recording.gyro_radps
+    rate += bias
+    return rate
+
+
+def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]:
+    """Return scale, bias [rad/s] and lead [s] with which a turn rate (n,) makes the reference's turns over seconds."""
+    t = recording.t_s
+    every = rows_at_steps(t - t[0], GYRO_STEP_S)
+    if len(every) < FEWEST_GYRO_STEPS:
+        return float("nan"), float("nan"), 0.0
+    by_step, sums = recording.held_s, np.zeros(len(t))
+    by_step *= rate
+    np.cumsum(by_step[:-1], out=sums[1:])
+    del by_step
+    turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
+
+    def evaluate(x: Floats) -> tuple[Floats, Floats]:
+        at = t[every] + x[2]
+        by_scale, by_lead = (np.diff(np.interp(at, t, column)) for column in (sums, x[0] * rate))
+        return x[0] * by_scale + x[1] * lasting - turned, np.column_stack([by_scale, lasting, by_lead])
+
+    zero = np.zeros(3)
+    return tuple(robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
