@@ -70,13 +70,14 @@ def run(logs: Path, output: Path, *options: str, fresh: bool = True) -> dict[str
 
 
 def memory_mb(pid: int) -> float:
-    """Return the memory of a process and its children [MB]."""
+    """Return the memory of a process and its children [MB]; of what several processes share, each one's part."""
     try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        pss = Path(f"/proc/{pid}/smaps_rollup").read_text().partition("\nPss:")[2]
         children = [one for file in Path(f"/proc/{pid}/task").glob("*/children") for one in file.read_text().split()]
+        kilobytes = int(pss.split()[0])
     except (OSError, IndexError):  # it has ended
         return 0.0
-    return pages * resource.getpagesize() / 2**20 + sum(memory_mb(int(child)) for child in children)
+    return kilobytes / 2**10 + sum(memory_mb(int(child)) for child in children)
 
 
 def with_dask(logs: Path, output: Path) -> dict[str, float]:

@@ -210,9 +210,12 @@ def _turned_scores(
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    held, last = recording.held_s, len(recording.t_s) - 1
+    by_step, held, last = scaled_gyro(recording), recording.held_s, len(recording.t_s) - 1
+    by_step *= held
     psi, place = np.zeros(last + 1), np.zeros(last + 1, np.complex128)
-    np.cumsum((held * scaled_gyro(recording))[:-1], out=psi[1:])
+    np.cumsum(by_step[:-1], out=psi[1:])
+    del by_step
+    give_back_freed()
     for lo in range(0, last, ROWS_AT_ONCE):
         hi = min(lo + ROWS_AT_ONCE, last)
         moved = held[lo:hi] * (run.table.v_left_mps[lo:hi] + run.table.v_right_mps[lo:hi]) / 2.0

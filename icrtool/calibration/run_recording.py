@@ -13,6 +13,7 @@ from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.motion.recording import Recording
 from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, drive_of
 
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
@@ -71,6 +72,7 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
         return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
 
     slope, _, later_s = _gyro_line(plain, rate(0.0))
+    give_back_freed()
     if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
         return plain
     return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
@@ -86,7 +88,8 @@ def scaled_gyro(recording: Recording) -> Floats:
     if recording.gyro_radps is None:
         return np.zeros(len(recording.t_s))
     slope, bias, _ = _gyro_line(recording, recording.gyro_radps)
-    rate: Floats = slope * recording.gyro_radps + bias
+    rate: Floats = slope * recording.gyro_radps
+    rate += bias
     return rate
 
 
@@ -96,8 +99,10 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]
     every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan"), 0.0
-    sums = np.zeros(len(t))
-    np.cumsum((recording.held_s * rate)[:-1], out=sums[1:])
+    by_step, sums = recording.held_s, np.zeros(len(t))
+    by_step *= rate
+    np.cumsum(by_step[:-1], out=sums[1:])
+    del by_step
     turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:

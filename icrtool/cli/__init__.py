@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 
 from icrtool.cli.interrupts import INTERRUPTED, end_in_order
+from icrtool.records.memory import use_one_arena
 
 __all__ = ["main"]
 
@@ -16,8 +17,13 @@ def main() -> None:
     """Run the command line; the one place where errors become text and an exit code."""
     # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # What pyarrow frees is given back with the rest.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     # No figure is shown, and matplotlib cannot be imported where this names no backend.
     os.environ["MPLBACKEND"] = "agg"
+    if len(sys.argv) > 2:
+        # Before the first thread starts; not where only help is asked for, since it takes some milliseconds.
+        use_one_arena()
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing.
     gc.set_threshold(100_000)

@@ -6,7 +6,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
-from icrtool.kernels.arrays import Ints
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive
@@ -55,13 +55,22 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     if not len(moving):
         return ()
     last = ends[moving]
-    chord = np.hypot(drive.north[last] - drive.north[moving], drive.east[last] - drive.east[moving])
+    chord = np.hypot(*(_change(column, moving, last) for column in (drive.north, drive.east)))
     # Further than its wheels rolled: the reference jumped.
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
-    off = np.abs(np.abs(drive.heading[last] - drive.heading[moving]) - np.pi)
+    off = np.abs(_change(drive.heading, moving, last))
+    off -= np.pi
+    np.abs(off, out=off)
     groups = (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)])
     chosen = (_typical(drive, models[0], ends, group) for group in groups)
     return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def _change(column: Floats, starts: Ints, ends: Ints) -> Floats:
+    """Return by how much a column grew from the start of each trial to its end."""
+    change: Floats = column[ends]
+    change -= column[starts]
+    return change
 
 
 def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.dropout_analysis.starts import Starts, counted_ends
-from icrtool.dropout_analysis.trials import models_of
+from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_of_cells
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
@@ -33,17 +33,19 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
     ends = counted_ends(drive, SPLIT_HORIZON_M, starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
     straight = heading_range(drive, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
-    errors = {
-        model.name: open_loop_errors(drive, model.icrs, ends)[tried, 0]
-        for model in models_of(run)
-        if model.name in SPLIT_MODELS
-    }
-    found = []
-    for kind, part in ((True, straight), (False, ~straight)):
-        if part.any():
-            means = {name: float(e[part].mean()) for name, e in errors.items()}
-            found.append(TurningSplit(kind, SPLIT_HORIZON_M, int(np.count_nonzero(part)), means))
-    return tuple(found)
+    parts = {kind: part for kind, part in ((True, straight), (False, ~straight)) if part.any()}
+
+    def mean_errors(model: Model) -> dict[bool, float]:
+        errors = open_loop_errors(drive, model.icrs, ends)[tried, 0]
+        return {kind: float(errors[part].mean()) for kind, part in parts.items()}
+
+    of_model = {model.name: mean_errors(model) for model in models_of(run) if model.name in SPLIT_MODELS}
+    return tuple(
+        TurningSplit(
+            kind, SPLIT_HORIZON_M, int(np.count_nonzero(part)), {name: means[kind] for name, means in of_model.items()}
+        )
+        for kind, part in parts.items()
+    )
 
 
 def heading_range(drive: Drive, horizon_m: float) -> Floats:

@@ -172,12 +172,12 @@ class _Part(NamedTuple):
 
 def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     """Return the errors of all models at some horizons."""
-    give_back_freed()
     drive, learned, by_learning = asked.drive, asked.learned, None
     ends, counts = _ends(drive, horizons, asked.left_out, pool)
     blocks = _blocks(drive, horizons, ends, pool)
     results = []
     for model in asked.predictors:
+        give_back_freed()
         errors = _errors(drive, model, ends, pool)
         tested = blocks
         if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):

@@ -14,6 +14,7 @@ from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
 from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
+from icrtool.records.memory import give_back_freed
 from icrtool.records.tables import States
 
 WINDOW_M = 2.0
@@ -69,11 +70,17 @@ class StateWindows(NamedTuple):
 def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     """Return the windows of a drive, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
     dt = np.where(drive.gap, 0.0, drive.dt_s)
-    distance = np.concatenate([[0.0], np.cumsum(dt * (np.abs(drive.v_left) + np.abs(drive.v_right)) / 2)[:-1]])
+    driven, distance = np.abs(drive.v_left), np.zeros(len(dt))
+    driven += np.abs(drive.v_right)
+    driven *= dt
+    driven /= 2.0
+    np.cumsum(driven[:-1], out=distance[1:])
+    del driven
     rows = rows_at_steps(distance, WINDOW_M)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
+    give_back_freed()
     rate, sums, by = _sums(drive, dt, rows, parameters)
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
@@ -109,14 +116,14 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
 def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Floats, Floats, Floats]:
     """Return `rate`, `sums` and `by` of `sums_at_knots` at some rows (m,), by the wheels of a drive."""
     knots, terms = len(rows), len(parameters)
-    fixed, columns, none = np.zeros((3, len(dt))), np.empty((terms, len(dt))), np.zeros(len(dt))
+    fixed, columns = np.zeros((3, len(dt))), np.empty((terms, len(dt)))
     axes = np.empty(terms, np.int64)
     for lo in range(0, len(dt), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
         motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
         _, axes, columns[:, some] = model_columns(MODELS["full_linear"], motion)  # each of its terms is free
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-    sums_at_knots(fixed, columns, axes, parameters, dt, none, rows, np.zeros(knots), rate, sums, by)
+    sums_at_knots(fixed, columns, axes, parameters, dt, fixed[0], rows, np.zeros(knots), rate, sums, by)
     return rate, sums, by
 
 

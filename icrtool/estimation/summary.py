@@ -65,6 +65,7 @@ def summarise(
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
+    end_errors = _end_errors(table, filtered.in_gap, width)
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
@@ -92,7 +93,7 @@ def summarise(
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
             },
-            "odometry": _end_errors(table, filtered.in_gap, width),
+            "odometry": end_errors,
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
             "segments": segment_summary(table, changes_s),
             "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)

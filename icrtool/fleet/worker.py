@@ -34,8 +34,11 @@ GRACE_S = 0.3
 LONGEST_DETAILS = 4000
 """Letters kept of what a process printed before it died."""
 
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-"""One thread a log: the logs are what runs at the same time."""
+ENVIRONMENT = {
+    "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg",
+    "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
+}  # fmt: skip
+"""One thread a log: the logs are what runs at the same time. Memory as `icrtool.cli.main` has it."""
 
 NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
 """Dask sets it for its workers: memory then goes back to the system again and again, which doubles system time."""

@@ -245,8 +245,10 @@ def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
         in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
+    dt_s = np.zeros(len(table))
+    np.divide(np.diff(table.stamp_ns), 1e9, out=dt_s[:-1])
     return Drive(
-        dt_s=np.append(np.diff(table.stamp_ns) / 1e9, 0.0),
+        dt_s=dt_s,
         v_left=table.v_left_mps,
         v_right=table.v_right_mps,
         north=table.north_m,

@@ -45,7 +45,7 @@ class Samples:
 
 def thin(column: Floats) -> Floats:
     """Return a column that takes no memory where all its values are the same."""
-    return np.broadcast_to(column[:1], column.shape) if len(column) and (column == column[0]).all() else column
+    return np.broadcast_to(column[:1].copy(), column.shape) if len(column) and (column == column[0]).all() else column
 
 
 WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints
 
 SHARES = {"p50": 0.5, "p95": 0.95}
 
@@ -30,13 +30,13 @@ class Blocks(NamedTuple):
 
     Attributes
     ----------
-    rows : where the trials stand among all starts (m,)
+    rows : where the trials stand among all starts
     first : (s,) first trial of each segment
     kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
     per_segment : (s, 2) trials, and kept ones
     """
 
-    rows: slice | Ints
+    rows: slice | Bools
     first: Ints
     kept: Ints
     segments: Ints
@@ -114,8 +114,7 @@ def block_sums(
     first = blocks.first[-(-np.arange(k) * segments // k)]
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
-    beyond = [np.flatnonzero(errors > limit) for limit in (p50_m, p95_m)]
-    above = [np.diff(np.searchsorted(rows, first), append=len(rows)) for rows in beyond]
+    above = [np.add.reduceat(errors > limit, first, dtype=np.int64) for limit in (p50_m, p95_m)]
     growth = [
         _slope(ordered, share, np.asarray((count - (1.0 - share) * trials) / len(errors)))
         for share, count in zip(SHARES.values(), above, strict=True)

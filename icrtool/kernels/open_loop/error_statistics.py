@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 
@@ -24,7 +25,7 @@ MIN_BLOCKS = 3
 """With fewer blocks of path in all there is no confidence interval (NaN): resampling them is meaningless."""
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
-RESAMPLES, RESAMPLES_AT_ONCE = 300, 50
+RESAMPLES, RESAMPLES_AT_ONCE = 300, 10
 """Bounds memory: a long log has thousands of blocks."""
 BINS = 50
 """Of a histogram, up to its largest error or less."""
@@ -111,7 +112,7 @@ def cut_blocks(tried: Bools, path_m: Floats, block_m: float) -> Blocks | None:
         return None
     begin, end = int(np.argmax(tried)), len(tried) - int(np.argmax(tried[::-1]))
     # the usual case is one stretch, and a slice copies nothing
-    rows = slice(begin, end) if end - begin == count else np.flatnonzero(tried)
+    rows = slice(begin, end) if end - begin == count else tried
     path = path_m[rows]
     first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / block_m)))
     if len(first) < MIN_BLOCKS * BLOCK_PARTS:
@@ -154,7 +155,7 @@ def bootstrap_interval(
     order = np.argsort(kept)[::-1]
     per_segment = np.column_stack([np.add.reduceat(errors, blocks.first), blocks.per_segment])
     n_starts = len(per_segment) - BLOCK_PARTS + 1
-    sums = np.sum([per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)], axis=0)
+    sums = reduce(np.add, (per_segment[part : part + n_starts] for part in range(BLOCK_PARTS)))
     replicates, segments, ordered = np.empty((resamples, 2)), blocks.segments[order], kept[order]
     for some in np.split(replicates, range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)):
         starts = rng.integers(0, n_starts, size=(len(some), len(per_segment) // BLOCK_PARTS))

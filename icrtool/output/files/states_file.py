@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -108,7 +109,6 @@ def read_states(path: Path, states: StatesFormat) -> States:
     """
     import pyarrow as pa
 
-    pa.set_memory_pool(pa.system_memory_pool())  # what it frees is given back with the rest
     types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
     try:
         if states == "parquet":
@@ -120,7 +120,8 @@ def read_states(path: Path, states: StatesFormat) -> States:
                     raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
                 _check_columns(file.schema_arrow, types)
                 # One at a time: each one's memory is used again for the next.
-                return States(**{name: _array(file.read([name]).column(0)) for name in COLUMNS})
+                read = partial(file.read, use_threads=False)
+                return States(**{name: _array(read([name]).column(0)) for name in COLUMNS})
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
@@ -187,7 +188,6 @@ def _arrow(columns: dict[str, Floats | Ints]) -> pa.Table:
     """Return columns as an Arrow table that shares their memory; to convert them pyarrow would import pandas."""
     import pyarrow as pa
 
-    pa.set_memory_pool(pa.system_memory_pool())
     arrays = {
         name: pa.Array.from_buffers(
             pa.int64() if name in INTEGER_COLUMNS else pa.float64(),
