@@ -36,6 +36,7 @@ from icrtool.alignment.heading.heading_choice import (
     derive_heading,
     fuse_heading,
     stated_source,
+    without_heading,
 )
 from icrtool.alignment.position.gnss_steps import FixSteps, measure_steps
 from icrtool.alignment.stream_checks import check_streams
@@ -113,6 +114,11 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     else:
         if free:
             refuse_stuck(log)
+            if course.is_of_course:
+                why = (
+                    "the heading turns about where the robot drives backwards: it is a course over ground, and left out"
+                )
+                return align_streams(without_heading(as_sent, why), config)
             scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)

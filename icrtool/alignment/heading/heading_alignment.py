@@ -16,7 +16,7 @@ from icrtool.alignment.heading.heading_offset_cause import NO_NAME, OffsetName, 
 from icrtool.alignment.position.gnss_steps import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.records.tables import RobotLog
 
 FEWEST_WINDOWS = 8
@@ -47,12 +47,14 @@ class CourseAngles(NamedTuple):
     ----------
     angle : (w,) heading minus course over ground [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading of the other handedness
+    backwards : (w,) whether the wheels ran backwards
     scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
     duration_s : median duration of a window
     """
 
     angle: Floats
     mirrored: Floats
+    backwards: Bools
     scattered: int
     duration_s: float
 
@@ -67,6 +69,15 @@ class CourseAngles(NamedTuple):
         return _resultant_length(self.mirrored)
 
     @property
+    def is_of_course(self) -> bool:
+        """Whether the heading turns about where the robot drives backwards: it is itself a course over ground."""
+        ahead, back = self.angle[~self.backwards], self.angle[self.backwards]
+        if min(len(ahead), len(back)) < FEWEST_WINDOWS:
+            return False
+        about = np.cos(back - np.angle(np.exp(1j * ahead).mean())) < 0.0
+        return _resultant_length(ahead) > EXPLAINED and float(about.mean()) > EXPLAINED
+
+    @property
     def is_explained(self) -> bool:
         """Whether there are enough windows, and the heading follows the course over ground in one of the senses."""
         return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
@@ -79,11 +90,15 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
     seen = drive.fix[end] - drive.fix[begin]
     along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
     laid, other = (at[end] - at[begin] for at in (along, mirrored))
+    travel = drive.cumulate(v).real
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
+        (np.interp(drive.fix_t[end], drive.wheel_t, travel) < np.interp(drive.fix_t[begin], drive.wheel_t, travel))[
+            moved
+        ],
         int(np.count_nonzero(went & ~led)),
         float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
     )

@@ -236,19 +236,23 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
     rate = rate_of_heading(log)
     if rate is None:
         return None
-    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
-    streams = tuple(one for one in log.streams if one.role != "heading")
-    note = (
-        f"{log.name}: the heading drifts ({math.degrees(scatter_rad):.0f}° about the course over ground): "
-        "only turn rates are used"
+    why = (
+        f"the heading drifts ({math.degrees(scatter_rad):.0f}° about the course over ground): only turn rates are used"
     )
-    bare = replace(log, heading=nothing, gyros=(*log.gyros, rate), streams=streams, warnings=(*log.warnings, note))
+    bare = replace(without_heading(log, why), gyros=(*log.gyros, rate))
     try:
         found = derive_heading(bare, width_m)
     except DataError:
         return None
     std = found.estimate.median_std
     return bare if found.source != "wheels_course" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
+
+
+def without_heading(log: RobotLog, why: str) -> RobotLog:
+    """Return the log without its heading, so that one is estimated; `why` is reported."""
+    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    streams = tuple(one for one in log.streams if one.role != "heading")
+    return replace(log, heading=nothing, streams=streams, warnings=(*log.warnings, f"{log.name}: {why}"))
 
 
 def rate_of_heading(log: RobotLog) -> GyroAxes | None:

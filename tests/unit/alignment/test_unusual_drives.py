@@ -14,6 +14,8 @@ from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from support.drives import make_log
+from support.exact_drives import CONFIG as EXACT
+from support.exact_drives import ICRS, simulate
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])
 
@@ -85,3 +87,17 @@ def test_fixes_too_noisy_for_a_course_are_named_as_the_reason() -> None:
     none = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
     with pytest.raises(DataError, match=r"2\.\d m"):
         fit(replace(log, gnss=noisy, heading=none), CONFIG)
+
+
+def test_a_heading_that_is_a_course_over_ground_is_left_out() -> None:
+    """It turns about where the robot drives backwards, and means nothing where it stands."""
+    log = simulate(seconds=900.0, lever=(0.0, 0.0), scales=(1.0, 1.0))
+    place, t = log.gnss.north_m + 1j * log.gnss.east_m, (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    course = np.angle(np.gradient(np.convolve(place, np.ones(9) / 9, "same"), t))
+    of_course = replace(log, heading=HeadingSamples(log.gnss.stamp_ns, course, np.full(len(course), np.nan)))
+    found = align_streams(of_course, EXACT)
+    assert any("it is a course over ground" in warning for warning in found.log.warnings)
+    assert found.derived is not None
+    assert found.geometry is not None
+    assert found.geometry.values[:2] == pytest.approx(ICRS[:2], abs=0.02)
+    assert align_streams(log, EXACT).derived is None
