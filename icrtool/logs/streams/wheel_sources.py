@@ -245,8 +245,8 @@ def _by_place(
             raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
         return motion_of(
             WheelMotion(**of_topic(table, stamp), score=90.0, why=why),
-            _side_means(_unwound(position.astype(np.float64)), left, right),
-            _side_means(speed, left, right),
+            _side_means(_unwound(position.astype(np.float64)), left, right)[0],
+            _side_means(speed, left, right)[0],
         )
 
     return (f"{stamp}.sec", f"{stamp}.nanosec", *paths), read
