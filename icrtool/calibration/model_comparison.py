@@ -88,10 +88,11 @@ class ModelComparison:
 
 
 class ComparedModels(NamedTuple):
-    """The table, and what gives the errors of the recommended model in any trials (see `held_out_predictor`)."""
+    """The table, what gives the errors of the recommended model in any trials (see `held_out_predictor`), its drive."""
 
     table: ModelComparison
     recommended: ErrorsOf
+    drive: Drive
 
 
 def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> ComparedModels:
@@ -132,7 +133,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
         notes=notes,
         calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
     )
-    return ComparedModels(table, held_out_predictor([recording], wheels, 0))
+    return ComparedModels(table, held_out_predictor([recording], wheels, 0), recording.drive)
 
 
 def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:

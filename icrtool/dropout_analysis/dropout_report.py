@@ -89,7 +89,10 @@ def dropout_report(
         further = [ConstantModel("recommended", "recommended", found.recommended), *further]
 
     horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
-    report = dropout(compared, horizons, further=further, starts=starts, seed=seed, sink=sink)
+    report = dropout(
+        compared, horizons, further=further, starts=starts, seed=seed, sink=sink,
+        drive=None if found is None else found.drive,
+    )  # fmt: skip
     give_back_freed()
     if without_events:
         report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)

@@ -82,6 +82,7 @@ def dropout(
     further: Sequence[ConstantModel] = (),
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
+    drive: Drive | None = None,
 ) -> DropoutReport:
     """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
 
@@ -94,6 +95,7 @@ def dropout(
     further : models of constant parameters, in addition
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
+    drive : the states as input of the kernels, where they are at hand, with wheel speeds of any scale
 
     Returns
     -------
@@ -121,7 +123,9 @@ def dropout(
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
-    drive = drive_of(run)
+    if drive is None:
+        drive = drive_of(run)
+    drive = drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 HOURS_S = 36_000
-MOST_MB = 1450.0
+MOST_MB = 1250.0
 ROBOT = ("--robot", "segway-rmp400")
 
 LAUNCH = """

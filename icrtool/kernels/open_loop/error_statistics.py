@@ -41,7 +41,9 @@ def error_summary(errors_m: Floats) -> Summary:
     Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
     interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
-    return summary_of_sorted([sort_trials(column) for column in errors_m.T])
+    # One at a time: a column of a long log is large.
+    columns = [summary_of_sorted([sort_trials(column)]) for column in errors_m.T]
+    return Summary(*(np.concatenate(numbers) for numbers in zip(*columns, strict=True)))
 
 
 def sort_trials(errors_m: Floats) -> Floats:

@@ -104,8 +104,8 @@ def _nonzero(values: Floats) -> bool:
     return bool(np.any(values[np.isfinite(values)] != 0.0))
 
 
-def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Sides:
-    """Return the mean over the joints of each side that have finite values; None where none has.
+def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> tuple[Sides, list[int]]:
+    """Return the mean over the joints of each side that have finite values, None where none has; and the dead joints.
 
     A joint that never changes while another one of its side does has a dead encoder, and is left out.
     """
@@ -117,7 +117,7 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> Side
             means.append(values[:, finite[0]].astype(np.float64, copy=False))
         else:
             means.append(values.T[finite].astype(np.float64, copy=False).mean(axis=0) if finite else None)
-    return means[0], means[1]
+    return (means[0], means[1]), dead
 
 
 def _dead_joints(values: NDArray[Any], left: list[int], right: list[int]) -> list[int]:
@@ -170,14 +170,14 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     if not alike.all():
         table, wheels = table.rows(alike), wheels[alike]
     sides = [*range(lefts)], [*range(lefts, lefts + rights)]
-    positions = _unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights))
-    speeds = _by_wheel(table.find(paths[2]), wheels, lefts + rights)
+    # One after the other: the columns of all wheels of a long log are large.
+    position, stuck = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
+    speed, still = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-    dead = {place for values in (positions, speeds) for place in _dead_joints(values, *sides)}
-    names = some_of([texts[(left + right)[place]] for place in sorted(dead)])
+    dead = sorted({*stuck, *still})
+    names = some_of([texts[(left + right)[place]] for place in dead])
     note = f"{names} never turns while the other wheels of its side do: left out" if dead else ""
-    base = WheelMotion(**of_topic(table), score=score, why=why, note=note)
-    return motion_of(base, _side_means(positions, *sides), _side_means(speeds, *sides))
+    return motion_of(WheelMotion(**of_topic(table), score=score, why=why, note=note), position, speed)
 
 
 def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
@@ -245,8 +245,8 @@ def _by_place(
             raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
         return motion_of(
             WheelMotion(**of_topic(table, stamp), score=90.0, why=why),
-            _side_means(_unwound(position.astype(np.float64)), left, right),
-            _side_means(speed, left, right),
+            _side_means(_unwound(position.astype(np.float64)), left, right)[0],
+            _side_means(speed, left, right)[0],
         )
 
     return (f"{stamp}.sec", f"{stamp}.nanosec", *paths), read
