@@ -88,7 +88,7 @@ class ModelComparison:
 
 
 class ComparedModels(NamedTuple):
-    """The table, what gives the errors of the recommended model in any trials (see `held_out_predictor`), its drive."""
+    """The table, what gives the errors of the recommended model in any trials, and the run's drive."""
 
     table: ModelComparison
     recommended: ErrorsOf
@@ -133,7 +133,8 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
         notes=notes,
         calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
     )
-    return ComparedModels(table, held_out_predictor([recording], wheels, 0), recording.drive)
+    drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
+    return ComparedModels(table, held_out_predictor([recording], wheels, 0), drive)
 
 
 def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:
@@ -211,12 +212,9 @@ def _turned_scores(
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    by_step, held, last = scaled_gyro(recording), recording.held_s, len(recording.t_s) - 1
-    by_step *= held
-    psi, place = np.zeros(last + 1), np.zeros(last + 1, np.complex128)
-    np.cumsum(by_step[:-1], out=psi[1:])
-    del by_step
+    psi, last = recording.cumulate(scaled_gyro(recording)), len(recording.t_s) - 1
     give_back_freed()
+    held, place = recording.held_s, np.zeros(last + 1, np.complex128)
     for lo in range(0, last, ROWS_AT_ONCE):
         hi = min(lo + ROWS_AT_ONCE, last)
         moved = held[lo:hi] * (run.table.v_left_mps[lo:hi] + run.table.v_right_mps[lo:hi]) / 2.0

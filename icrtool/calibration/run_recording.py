@@ -99,10 +99,7 @@ def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]
     every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan"), 0.0
-    by_step, sums = recording.held_s, np.zeros(len(t))
-    by_step *= rate
-    np.cumsum(by_step[:-1], out=sums[1:])
-    del by_step
+    sums = recording.cumulate(rate)
     turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:

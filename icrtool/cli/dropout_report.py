@@ -198,9 +198,12 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
             source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
             overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
+    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
     from icrtool.fleet.fit_and_report import report_and_write
 
     directory = source if place is None else place
+    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
+        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
     baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
     with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
         report = report_and_write(

@@ -111,11 +111,15 @@ def dropout_report(
     )
 
 
+def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> Sequence[float]:
+    """Return the lengths of outages to force: those given, else those of the run's configuration."""
+    return outage_s if outage_s is not None else run.config.dropout.forced_outage_s
+
+
 def _force(run: Run, outage_s: Sequence[float] | None, outage_at_s: Sequence[float]) -> list[Outage]:
-    """Return the outages of the lengths given, else of those in the run's configuration."""
-    lengths = outage_s if outage_s is not None else run.config.dropout.forced_outage_s
+    lengths = forced_lengths_s(run, outage_s)
     if outage_at_s and not lengths:
-        raise ConfigError("outage", "its begin is given without its length", "give outage_s (--outage) too")
+        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
     plans = [plan_outages(run, length, outage_at_s) for length in lengths]
     return [outage for plan in plans for outage in force_outages(run, plan)]
 

@@ -95,7 +95,7 @@ def dropout(
     further : models of constant parameters, in addition
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
-    drive : the states as input of the kernels, where they are at hand, with wheel speeds of any scale
+    drive : `icrtool.records.run.drive_of` the run, where it is at hand: of a long log it is large
 
     Returns
     -------
@@ -123,9 +123,7 @@ def dropout(
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
-    if drive is None:
-        drive = drive_of(run)
-    drive = drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
+    drive = drive if drive is not None else drive_of(run)
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(drive), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)

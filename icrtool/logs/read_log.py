@@ -40,6 +40,7 @@ from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.logs.table_file import is_table, read_table
 from icrtool.records.samples import (
+    NO_HEADINGS,
     Datum,
     HeadingSamples,
     InputFile,
@@ -53,8 +54,6 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
 
 Progress = Callable[[float], None]
-
-NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)

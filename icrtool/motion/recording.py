@@ -77,6 +77,13 @@ class Recording:
         held[-1] = 0.0
         return held
 
+    def cumulate(self, rate: Floats) -> Floats:
+        """Return the integral of a rate (n,) until each wheel sample (n,)."""
+        by_step, sums = self.held_s, np.zeros(len(self.t_s))
+        by_step *= rate
+        np.cumsum(by_step[:-1], out=sums[1:])
+        return sums
+
     def motions(self) -> Iterator[tuple[WheelMotion, Floats]]:
         """Yield the motion of the wheels and how long each sample holds [s], some samples at a time."""
         drive, held = self.drive, self.held_s

@@ -123,6 +123,9 @@ class HeadingSamples(Samples):
     var_rad2: Floats
 
 
+NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+
 @dataclass(frozen=True, slots=True)
 class GyroSamples(Samples):
     """Turn rates, clockwise positive.

@@ -184,7 +184,7 @@ def test_no_run_at_all_is_said_in_one_line(tmp_path: Path) -> None:
         (("--gate", "magic.p95@1m <= 1"), 1, "no model magic"),
         (("--horizons", "1,x"), 2, "--horizons"),
         (("--horizons", "0"), 2, "--horizons"),
-        (("--outage-at", "5"), 1, "--outage"),
+        (("--outage-at", "5"), 2, "--outage"),
         (("--outage", "1e6"), 1, "too long"),
         (("--budget", "-1"), 2, "--budget"),
         (("--budget", "nan"), 1, "budget"),

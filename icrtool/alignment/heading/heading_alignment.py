@@ -90,15 +90,13 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
     seen = drive.fix[end] - drive.fix[begin]
     along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
     laid, other = (at[end] - at[begin] for at in (along, mirrored))
-    travel = drive.cumulate(v).real
+    travel = drive.until_fixes(v).real
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
-        (np.interp(drive.fix_t[end], drive.wheel_t, travel) < np.interp(drive.fix_t[begin], drive.wheel_t, travel))[
-            moved
-        ],
+        (travel[end] < travel[begin])[moved],
         int(np.count_nonzero(went & ~led)),
         float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
     )

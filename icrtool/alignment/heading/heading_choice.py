@@ -16,7 +16,7 @@ from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading,
 from icrtool.alignment.heading.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
-from icrtool.records.samples import GyroAxes, GyroSamples, HeadingSamples, StreamChoice, thin
+from icrtool.records.samples import NO_HEADINGS, GyroAxes, GyroSamples, HeadingSamples, StreamChoice, thin
 from icrtool.records.tables import RobotLog
 
 Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
@@ -250,9 +250,8 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 
 def without_heading(log: RobotLog, why: str) -> RobotLog:
     """Return the log without its heading, so that one is estimated; `why` is reported."""
-    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
     streams = tuple(one for one in log.streams if one.role != "heading")
-    return replace(log, heading=nothing, streams=streams, warnings=(*log.warnings, f"{log.name}: {why}"))
+    return replace(log, heading=NO_HEADINGS, streams=streams, warnings=(*log.warnings, f"{log.name}: {why}"))
 
 
 def rate_of_heading(log: RobotLog) -> GyroAxes | None:

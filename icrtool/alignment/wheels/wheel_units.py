@@ -13,7 +13,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
-from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples, WheelUnit
+from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 
 FEWEST_WINDOWS = 8
@@ -139,8 +139,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
-    nothing = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
-    chords = cut_chords(join_streams(WheelSamples(stamps, left, right), gnss, nothing, same_clock=False))
+    chords = cut_chords(join_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False))
     sides, chord = (np.abs(chords.left), np.abs(chords.right)), np.abs(chords.step)
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
     usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)

@@ -17,7 +17,6 @@ SHARES = {"p50": 0.5, "p95": 0.95}
 MOST_BLOCKS = 16
 """More would narrow an interval by less than 2 %: the factor of Student's distribution is 2.13, without limit 1.96."""
 
-
 LEVEL = 0.95
 """An interval holds the truth with this probability, as far as blocks of the horizon's length are independent."""
 

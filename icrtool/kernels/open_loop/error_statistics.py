@@ -26,7 +26,7 @@ MIN_BLOCKS = 3
 TRIALS_PER_BLOCK = 8
 """Trials kept of a block when p95 is resampled: an error changes little while a start moves by this part of it."""
 RESAMPLES, RESAMPLES_AT_ONCE = 300, 10
-"""Bounds memory: a long log has thousands of blocks."""
+"""For an interval; those drawn at once are few, since a long log has thousands of blocks."""
 BINS = 50
 """Of a histogram, up to its largest error or less."""
 MIN_KEPT_TRIALS = 20_000

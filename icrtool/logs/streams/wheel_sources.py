@@ -127,6 +127,10 @@ def _dead_joints(values: NDArray[Any], left: list[int], right: list[int]) -> lis
     return [place for side in (left, right) for place in side if not changes[place] and changes[side].any()]
 
 
+def _dead_note(names: Sequence[str]) -> str:
+    return f"{some_of(names)} never turns while the other wheels of its side do: left out" if names else ""
+
+
 def _unwound(positions: Floats) -> Floats:
     """Return joint positions [rad] (n, k); those recorded modulo one turn are unwrapped.
 
@@ -174,9 +178,7 @@ def _joints(table: TopicTable, config: Config, paths: _Paths, score: float, what
     position, stuck = _side_means(_unwound(_by_wheel(table.find(paths[1]), wheels, lefts + rights)), *sides)
     speed, still = _side_means(_by_wheel(table.find(paths[2]), wheels, lefts + rights), *sides)
     why = f"{what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-    dead = sorted({*stuck, *still})
-    names = some_of([texts[(left + right)[place]] for place in dead])
-    note = f"{names} never turns while the other wheels of its side do: left out" if dead else ""
+    note = _dead_note([texts[(left + right)[place]] for place in sorted({*stuck, *still})])
     return motion_of(WheelMotion(**of_topic(table), score=score, why=why, note=note), position, speed)
 
 
@@ -243,11 +245,10 @@ def _by_place(
         position, speed = (table.column(path) for path in paths)
         if min(position.shape[1], speed.shape[1]) < length:
             raise DefinitionError(table.topic, f"{paths[0]} holds fewer than {length} elements")
-        return motion_of(
-            WheelMotion(**of_topic(table, stamp), score=90.0, why=why),
-            _side_means(_unwound(position.astype(np.float64)), left, right)[0],
-            _side_means(speed, left, right)[0],
-        )
+        travelled, stuck = _side_means(_unwound(position.astype(np.float64)), left, right)
+        turning, still = _side_means(speed, left, right)
+        note = _dead_note([f"wheel {place}" for place in sorted({*stuck, *still})])
+        return motion_of(WheelMotion(**of_topic(table, stamp), score=90.0, why=why, note=note), travelled, turning)
 
     return (f"{stamp}.sec", f"{stamp}.nanosec", *paths), read
 

@@ -12,7 +12,7 @@ from icrtool.alignment.wheels.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.records.samples import HeadingSamples, PositionFixes
+from icrtool.records.samples import NO_HEADINGS, HeadingSamples, PositionFixes
 from support.drives import make_log
 from support.exact_drives import CONFIG as EXACT
 from support.exact_drives import ICRS, simulate
@@ -64,7 +64,7 @@ def test_a_robot_on_a_stand_is_named_so_without_heading_or_unit(unit: str) -> No
     stand = replace(
         log,
         gnss=still,
-        heading=HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0)),
+        heading=NO_HEADINGS,
         wheels=replace(log.wheels, unit=unit),  # type: ignore[arg-type]
         streams=(replace(log.streams[0], role="wheels"),),
     )
@@ -84,9 +84,8 @@ def test_fixes_too_noisy_for_a_course_are_named_as_the_reason() -> None:
         noisy, north_m=noisy.north_m + rng.normal(0.0, 2.0, n), east_m=noisy.east_m + rng.normal(0.0, 2.0, n),
         var_north_m2=np.full(n, 4.0), var_east_m2=np.full(n, 4.0),
     )  # fmt: skip
-    none = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
     with pytest.raises(DataError, match=r"2\.\d m"):
-        fit(replace(log, gnss=noisy, heading=none), CONFIG)
+        fit(replace(log, gnss=noisy, heading=NO_HEADINGS), CONFIG)
 
 
 def test_a_heading_that_is_a_course_over_ground_is_left_out() -> None:

@@ -33,9 +33,25 @@ def test_the_icrs_of_a_known_robot_are_learned_within_their_own_sigmas() -> None
         assert final[column] == pytest.approx(truth, abs=min(4 * std[column], ICR_TOLERANCE_M))
 
 
-def test_the_summary_is_plain_json() -> None:
+def test_the_summary_is_plain_json_with_the_contracts_keys() -> None:
     summary = fit(make_log(), load_config(sets=[WIDTH])).summary
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    assert {
+        "schema",
+        "tool_version",
+        "inputs",
+        "config",
+        "streams",
+        "warnings",
+        "drive",
+        "icr",
+        "gnss",
+        "filter",
+    } <= set(summary)
+    assert {"duration_s", "distance_m", "speed_mean_mps", "speed_std_mps"} <= set(summary["drive"])
+    assert {"used", "rejected", "mean_difference_m", "max_difference_m", "datum"} <= set(summary["gnss"])
+    for part in ("final", "mean", "std", "convergence_s"):
+        assert set(summary["icr"][part]) == {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}
 
 
 def test_states_are_a_frame_with_a_row_per_wheel_sample_and_an_unwrapped_heading() -> None:

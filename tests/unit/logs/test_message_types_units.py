@@ -113,7 +113,7 @@ def test_rows_at_0_0_and_not_finite_and_off_the_earth_are_dropped_with_the_reaso
     source = position("sensor_msgs/NavSatFix", **fix(latitude=[0.0, np.nan, 48.0], longitude=[0.0, 11.0, 1e9]))
     assert not source.usable.any()
     assert source.rejected == {"at 0, 0": 1, "not finite": 1, "not a place on earth": 1}
-    assert source.problem.startswith("no usable fix (not finite 1,")
+    assert source.problem == "no usable fix (not finite 1, not a place on earth 1, at 0, 0 1)"
 
 
 def test_an_altitude_that_is_nan_or_absurd_becomes_the_usual_one() -> None:

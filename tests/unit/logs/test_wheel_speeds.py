@@ -12,7 +12,7 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
 from icrtool.logs.streams.wheel_speeds import wheel_samples
-from icrtool.records.samples import HeadingSamples, PositionFixes
+from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 
 RADIUS_M, STEP_NS = 0.1, 20_000_000
@@ -25,8 +25,7 @@ def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[s
     empty = WheelMotion(topic="/wheels", message_type="some/Type", stamps=StampedRows(None, stamps, "", 0))
     motion = motion_of(empty, position=(left, right))
     raw, _ = wheel_samples(motion, stamps, CONFIG, "log")
-    headings = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
-    log = with_wheel_speeds(RobotLog("log", raw, NOTHING, headings, None, (), (), {}, ()), CONFIG)
+    log = with_wheel_speeds(RobotLog("log", raw, NOTHING, NO_HEADINGS, None, (), (), {}, ()), CONFIG)
     return log.wheels.stamp_ns, log.wheels.v_left_mps, log.wheels.v_right_mps, list(log.warnings)
 
 
@@ -78,6 +77,16 @@ def test_a_wheel_with_a_dead_encoder_is_left_out_of_its_side() -> None:
     assert motion.note.startswith("front_left_wheel never turns")
     parked = joints_motion(np.zeros((50, 4)))
     assert (parked.note, parked.position is None) == ("", False)
+
+
+def test_a_dead_encoder_is_named_where_messages_do_not_name_wheels() -> None:
+    travel = np.cumsum(np.full(50, 0.1))
+    columns = {"position[*]": np.column_stack([travel, travel, travel, np.zeros(50)]), "velocity[*]": np.zeros((50, 4))}
+    table = TopicTable("/wheels", "leo_msgs/WheelStates", STEP_NS * np.arange(50, dtype=np.int64), columns, {}, 0)
+    motion = WHEEL_TYPES["leo_msgs/WheelStates"][1](table, CONFIG)
+    assert motion.position is not None
+    assert motion.position[1] == pytest.approx(travel)
+    assert motion.note.startswith("wheel 3 never turns")
 
 
 def joints_motion(positions: Floats) -> WheelMotion:

@@ -63,6 +63,17 @@ def written(content: DropoutReport, tmp_path_factory: pytest.TempPathFactory) ->
 def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: DropoutReport) -> None:
     read = pd.read_csv(written / "summary.csv")
     pd.testing.assert_frame_equal(read, content.summary, check_exact=True, check_dtype=False)
+    assert list(read.columns)[:9] == [
+        "model",
+        "horizon_m",
+        "trials",
+        "expected_error_m",
+        "p50_m",
+        "p95_m",
+        "max_m",
+        "expected_pct",
+        "p95_pct",
+    ]
     assert len(read) == 3 * len(HORIZONS_M)
     text = (written / "summary.csv").read_text(encoding="utf-8")
     assert "nan" not in text.lower()

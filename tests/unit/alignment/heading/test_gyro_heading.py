@@ -18,7 +18,7 @@ from icrtool.alignment.heading.gyro_heading import estimate_heading
 from icrtool.alignment.heading.heading_choice import DerivedHeading, derive_heading, fuse_heading
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.estimation.fit import fit
-from icrtool.records.samples import GyroAxes, HeadingSamples, OtherReceiver
+from icrtool.records.samples import NO_HEADINGS, GyroAxes, HeadingSamples, OtherReceiver
 from icrtool.records.tables import RobotLog
 from support.exact_drives import CONFIG, simulate
 
@@ -26,7 +26,6 @@ LARGEST_RMS_DEG = 0.3
 FIRST_S = 10.0
 WIDTH_M = 0.6
 BIAS_RADPS, GYRO_STD_RADPS = 0.004, 0.003
-NO_HEADING = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
 Truth = tuple[np.ndarray, np.ndarray]
 
@@ -39,7 +38,7 @@ def without_heading(seed: int, axis: int = 2, sign: float = -1.0) -> tuple[Robot
     rate = np.gradient(psi, (stamps - stamps[0]) / 1e9)
     axes = rng.normal(0.0, GYRO_STD_RADPS, (len(rate), 3))
     axes[:, axis] += sign * (rate + BIAS_RADPS)
-    return replace(log, heading=NO_HEADING, gyros=(GyroAxes("/imu", stamps, axes),)), (stamps, psi)
+    return replace(log, heading=NO_HEADINGS, gyros=(GyroAxes("/imu", stamps, axes),)), (stamps, psi)
 
 
 def error_deg(samples: HeadingSamples, truth: Truth) -> np.ndarray:
