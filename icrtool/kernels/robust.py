@@ -122,7 +122,7 @@ class RobustFit(Linearised):
     x : (k + p c,) parameters, those of the parts behind the k shared ones
     own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
         follow the shared ones
-    gain : (p, c, k) how much each part's own parameters fall while a shared one rises by one
+    gain : (p, c, k) negative derivative of each part's own parameters by the shared ones
     """
 
     x: Floats
