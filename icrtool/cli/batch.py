@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from icrtool.fleet.roll_up import PooledCalibration
     from icrtool.fleet.row import Row
 
-LONGEST_STAGE, LEAST_NAME = 14, 12
+LONGEST_STAGE, LEAST_NAME = 28, 12
 """Characters of the live line for the stage of a log with its separators, and for its name at least."""
 
 
