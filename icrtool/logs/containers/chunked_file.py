@@ -4,23 +4,35 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from threading import Lock
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space
+from icrtool.logs.containers.decompress import (
+    LARGEST_CHUNK_BYTES,
+    DecompressionError,
+    Inflation,
+    Packed,
+    decompress,
+)
+
+Item = TypeVar("Item")
 
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
 
-BLOCKS_AHEAD = 2
-"""Made while one is used: the thread that makes them does not wait for the one that uses them."""
+THREADS, BLOCKS_AHEAD = 2, 3
+"""That make blocks from chunks, and blocks made while one is used: threads do not wait for one another."""
+
+JOINED_BYTES = 1 << 22
+"""Chunks that have so many bytes together make one block: each has a cost of its own."""
 
 MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
 """Messages that a scan finds at a time; a record has more bytes than this."""
@@ -31,12 +43,12 @@ class Chunk(NamedTuple):
 
     Attributes
     ----------
-    at, length : where its content is in the file; of a bag only where its record begins
+    at, length : where its content is in the file; of a bag's index where its record begins
     channels : those it holds, None without an entry
     begin_ns, end_ns : first and last log time in it, 0 where they are not known
     index_length : of the message index records that follow it
-    size : of its records, decompressed
-    stored : they are not compressed
+    size : of its records, decompressed; -1 where there is no chunk in its place
+    compression : as the log calls it
     """
 
     at: int
@@ -46,36 +58,39 @@ class Chunk(NamedTuple):
     end_ns: int = 0
     index_length: int = 0
     size: int = 0
-    stored: bool = False
-
-
-class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for records of several chunks."""
-
-    packed: Space
-    records: Space
-    joined: Space
+    compression: str = ""
 
 
 class ChunkedFile(ABC):
     """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
 
     _chunks: Sequence[Chunk] | None = None
+    _chunk_head = 0
+    """Bytes before the content of a chunk, in which its record begins."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.files = [path]
         self.problems = Problems(path.name)
         self._inflation = Inflation()
-        # One block is used while the next ones are made.
-        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
         self._stream = path.open("rb")
+        self._lock = Lock()
         self._at = 0
         self._size = path.stat().st_size
 
     @abstractmethod
-    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the wanted channels in some chunks."""
+    def _packed(self, chunk: Chunk, *, cut: bool = False) -> Packed:
+        """Read a chunk from the file.
+
+        Parameters
+        ----------
+        cut : it is cut off
+
+        Raises
+        ------
+        DecompressionError
+            Its header is damaged.
+        """
 
     @abstractmethod
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -87,7 +102,7 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
         """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
 
     @abstractmethod
@@ -99,28 +114,80 @@ class ChunkedFile(ABC):
         if not wanted:
             return
         if self._chunks is None:
-            blocks = self._read_in_order()
+            with ThreadPoolExecutor(1) as pool:
+                in_order = self._read_in_order()
+                pending = pool.submit(next, in_order, None)
+                while (block := pending.result()) is not None:
+                    pending = pool.submit(next, in_order, None)
+                    yield block
         else:
-            needed = [one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted)]
-            blocks = self._indexed(needed, wanted)
-        with ThreadPoolExecutor(1) as pool:
-            pending = deque(pool.submit(next, blocks, None) for _ in range(BLOCKS_AHEAD))
-            while (block := pending.popleft().result()) is not None:
-                pending.append(pool.submit(next, blocks, None))
-                yield block
-        self._free()
+            needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
+            yield from self._indexed(map(self._located, needed), wanted)
+
+    def _indexed(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
+        """Yield the messages of the wanted channels in some chunks."""
+        with ThreadPoolExecutor(THREADS) as pool:
+            begun = ((group, pool.submit(self._joined, group, wanted)) for group in _groups(chunks))
+            for group, pending in ahead(begun, BLOCKS_AHEAD):
+                self._at = group[-1].at
+                try:
+                    block, inflation = pending.result()
+                except DecompressionError:
+                    for chunk in group:
+                        yield from self._read_chunk(chunk)
+                else:
+                    self._inflation.left += inflation.left
+                    yield with_possible_times(block, self.problems)
+
+    def _joined(self, group: Sequence[Chunk], wanted: frozenset[int]) -> tuple[Block, Inflation]:
+        """Return the wanted messages of some chunks, others among them, and how much less than allowed they inflate.
+
+        Raises
+        ------
+        DecompressionError
+            Something is damaged, or not as the index states.
+        """
+        size = sum(chunk.size for chunk in group)
+        if not 0 <= size <= LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {size} bytes")
+        inflation = Inflation(0)
+        records = np.empty(size + 1, np.uint8)
+        messages, others = _tables(size)
+        data, count, stop = records[:0], 0, 0
+        for chunk in group:
+            begin = stop
+            data = records[: begin + self._unpack(chunk, wanted, records[begin:], inflation)]
+            data.flags.writeable = False
+            count, _, stop = self._scan(data, begin, messages, others, count)
+            if stop < len(data):
+                raise DecompressionError("damaged")
+        return Block(data, *messages[:, :count]), inflation
+
+    def _unpack(self, chunk: Chunk, wanted: frozenset[int], space: Bytes, inflation: Inflation) -> int:  # noqa: ARG002 - a subclass may take less
+        """Decompress the records of a chunk, and return how many bytes they have.
+
+        Raises
+        ------
+        DecompressionError
+            As `decompress`, or they have more than `space`.
+        """
+        packed = self._packed(chunk)
+        inflation.count(len(packed.data), packed.claimed)
+        if packed.claimed >= len(space):
+            raise DecompressionError("larger than the index states")
+        data = decompress(packed, space)
+        if not np.may_share_memory(data, space):
+            space[: len(data)] = data
+        return len(data)
+
+    def _located(self, chunk: Chunk) -> Chunk:
+        """Return a chunk of the index with the place of its content."""
+        return chunk
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels."""
         for _ in self._read_in_order(learn=True):
             pass
-        self._free()
-
-    def _free(self) -> None:
-        """Give back the memory of chunks: a directory holds many files open."""
-        for spaces in self._spaces:
-            for space in spaces:
-                space.free()
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -137,34 +204,30 @@ class ChunkedFile(ABC):
 
     def _bytes(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
-        self._stream.seek(at)
-        return self._stream.read(count)
+        with self._lock:
+            self._stream.seek(at)
+            return self._stream.read(count)
 
-    def _read(self, at: int, length: int) -> Bytes:
-        """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
-        space = self._spaces[0].packed.of(max(min(length, self._size - at), 0))
-        self._at = min(at, self._size)
-        self._stream.seek(self._at)
-        found = space[: self._stream.readinto(space.data)]
-        found.flags.writeable = False  # as what is decompressed: the kernels are compiled once
-        return found
+    def _content(self, at: int, length: int) -> Bytes:
+        """Return bytes of a chunk, as many as there are.
 
-    def _chunk(
-        self, at: int, length: int, place: int, unpack: Callable[[Bytes], Bytes], *, learn: bool, cut: bool
-    ) -> Iterator[Block]:
-        """Yield the messages of a chunk.
-
-        Parameters
-        ----------
-        at, length : of its content in the file
-        place : byte of the file at which its record begins
-        unpack : returns the records in its content
-        cut : the content is cut off
+        Raises
+        ------
+        DecompressionError
+            They are more than a chunk may have.
         """
+        if length > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {length} bytes")
+        return np.frombuffer(self._bytes(at, max(min(length, self._size - at), 0)), np.uint8)
+
+    def _read_chunk(self, chunk: Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        """Yield the messages of a chunk; `cut`: it is cut off."""
+        place = chunk.at - self._chunk_head
+        self._at = min(chunk.at, self._size)
         try:
-            if length > LARGEST_CHUNK_BYTES:
-                raise DecompressionError(f"it claims {length} bytes")
-            data = unpack(self._read(at, length))
+            packed = self._packed(chunk, cut=cut)
+            self._inflation.count(len(packed.data), packed.claimed)
+            data = decompress(packed, np.empty(packed.claimed + 1, np.uint8))
         except DecompressionError as err:
             if not cut:
                 self.problems.add(f"chunk at byte {place} left out: {err.args[0]}")
@@ -174,15 +237,43 @@ class ChunkedFile(ABC):
             begin = stop
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
-        self._spaces.rotate(1)
         if stop < len(data) and not cut:
             self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        most = min((len(data) - begin) // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
-        messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
-        count, other, stop = self._scan(data, begin, messages, others)
+        messages, others = _tables(len(data) - begin, learn=learn)
+        count, other, stop = self._scan(data, begin, messages, others, 0)
         for row in others[:, :other].T:
             self._learn(row, data)
         return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop
+
+
+def _tables(size: int, *, learn: bool = False) -> tuple[Ints, Ints]:
+    """Return tables for the messages in so many bytes, and for other records, which take no space unless wanted."""
+    most = min(size // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+    return np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
+
+
+def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:
+    """Yield the chunks in groups of up to `JOINED_BYTES`, or of one chunk."""
+    group: list[Chunk] = []
+    size = 0
+    for chunk in chunks:
+        size += max(chunk.size, 0)
+        if group and size > JOINED_BYTES:
+            yield group
+            group, size = [], max(chunk.size, 0)
+        group.append(chunk)
+    if group:
+        yield group
+
+
+def ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
+    """Yield items, each once `count` more of them have been made."""
+    made: deque[Item] = deque()
+    for item in items:
+        made.append(item)
+        if len(made) > count:
+            yield made.popleft()
+    yield from made
