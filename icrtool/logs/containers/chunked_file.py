@@ -19,6 +19,7 @@ from icrtool.logs.containers.decompress import (
     DecompressionError,
     Inflation,
     Packed,
+    Space,
     decompress,
 )
 
@@ -49,6 +50,7 @@ class Chunk(NamedTuple):
     index_length : of the message index records that follow it
     size : of its records, decompressed; -1 where there is no chunk in its place
     compression : as the log calls it
+    ranges : begin and end (2, n) of its wanted records, where only those are read
     """
 
     at: int
@@ -59,6 +61,20 @@ class Chunk(NamedTuple):
     index_length: int = 0
     size: int = 0
     compression: str = ""
+    ranges: Ints | None = None
+
+    @property
+    def wanted_bytes(self) -> int:
+        """Bytes of the records that are read."""
+        return max(self.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
+
+
+class Spaces(NamedTuple):
+    """Memory for a chunk as it is in the file, for its records, and for those of several chunks."""
+
+    packed: Space
+    records: Space
+    joined: Space
 
 
 class ChunkedFile(ABC):
@@ -73,17 +89,20 @@ class ChunkedFile(ABC):
         self.files = [path]
         self.problems = Problems(path.name)
         self._inflation = Inflation()
+        self._spaces: deque[Spaces] = deque()
+        self._free()
         self._stream = path.open("rb")
         self._lock = Lock()
         self._at = 0
         self._size = path.stat().st_size
 
     @abstractmethod
-    def _packed(self, chunk: Chunk, *, cut: bool = False) -> Packed:
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
         """Read a chunk from the file.
 
         Parameters
         ----------
+        space : for the chunk as it is in the file
         cut : it is cut off
 
         Raises
@@ -122,72 +141,84 @@ class ChunkedFile(ABC):
                     yield block
         else:
             needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
-            yield from self._indexed(map(self._located, needed), wanted)
+            yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
+        self._free()
 
-    def _indexed(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the wanted channels in some chunks."""
+    def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
+        """Yield the messages in some chunks."""
         with ThreadPoolExecutor(THREADS) as pool:
-            begun = ((group, pool.submit(self._joined, group, wanted)) for group in _groups(chunks))
-            for group, pending in ahead(begun, BLOCKS_AHEAD):
+            groups = ((group, self._next_spaces()) for group in _groups(chunks))
+            begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
+            for group, spaces, pending in ahead(begun, BLOCKS_AHEAD):
                 self._at = group[-1].at
                 try:
                     block, inflation = pending.result()
                 except DecompressionError:
                     for chunk in group:
-                        yield from self._read_chunk(chunk)
+                        yield from self._read_chunk(chunk, spaces)
                 else:
                     self._inflation.left += inflation.left
                     yield with_possible_times(block, self.problems)
 
-    def _joined(self, group: Sequence[Chunk], wanted: frozenset[int]) -> tuple[Block, Inflation]:
-        """Return the wanted messages of some chunks, others among them, and how much less than allowed they inflate.
+    def _joined(self, group: Sequence[Chunk], spaces: Spaces) -> tuple[Block, Inflation]:
+        """Return the messages of some chunks, and how much less than allowed these inflate.
 
         Raises
         ------
         DecompressionError
             Something is damaged, or not as the index states.
         """
-        size = sum(chunk.size for chunk in group)
-        if not 0 <= size <= LARGEST_CHUNK_BYTES:
+        size = sum(chunk.wanted_bytes for chunk in group)
+        if size > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {size} bytes")
         inflation = Inflation(0)
-        records = np.empty(size + 1, np.uint8)
+        joined = spaces.joined.of(size + 1)
         messages, others = _tables(size)
-        data, count, stop = records[:0], 0, 0
+        data, count, stop = joined[:0], 0, 0
         for chunk in group:
             begin = stop
-            data = records[: begin + self._unpack(chunk, wanted, records[begin:], inflation)]
+            data = joined[: begin + self._unpack(chunk, spaces, joined[begin:], inflation)]
             data.flags.writeable = False
             count, _, stop = self._scan(data, begin, messages, others, count)
             if stop < len(data):
                 raise DecompressionError("damaged")
         return Block(data, *messages[:, :count]), inflation
 
-    def _unpack(self, chunk: Chunk, wanted: frozenset[int], space: Bytes, inflation: Inflation) -> int:  # noqa: ARG002 - a subclass may take less
-        """Decompress the records of a chunk, and return how many bytes they have.
+    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
+        """Decompress the wanted records of a chunk, and return how many bytes they have.
 
         Raises
         ------
         DecompressionError
-            As `decompress`, or they have more than `space`.
+            As `decompress`, or they have more than the index states.
         """
-        packed = self._packed(chunk)
+        packed = self._packed(chunk, spaces.packed)
         inflation.count(len(packed.data), packed.claimed)
-        if packed.claimed >= len(space):
+        if packed.claimed >= len(target):
             raise DecompressionError("larger than the index states")
-        data = decompress(packed, space)
-        if not np.may_share_memory(data, space):
-            space[: len(data)] = data
+        data = decompress(packed, target)
+        if not np.may_share_memory(data, target):
+            target[: len(data)] = data
         return len(data)
 
-    def _located(self, chunk: Chunk) -> Chunk:
-        """Return a chunk of the index with the place of its content."""
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
+        """Return a chunk of the index with what reading its wanted records needs."""
         return chunk
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels."""
         for _ in self._read_in_order(learn=True):
             pass
+        self._free()
+
+    def _free(self) -> None:
+        """Give back the memory of chunks: a directory holds many files open."""
+        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
+
+    def _next_spaces(self) -> Spaces:
+        """Return the memory of the block that was used first."""
+        self._spaces.rotate(1)
+        return self._spaces[0]
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -208,7 +239,7 @@ class ChunkedFile(ABC):
             self._stream.seek(at)
             return self._stream.read(count)
 
-    def _content(self, at: int, length: int) -> Bytes:
+    def _content(self, at: int, length: int, space: Space) -> Bytes:
         """Return bytes of a chunk, as many as there are.
 
         Raises
@@ -218,16 +249,19 @@ class ChunkedFile(ABC):
         """
         if length > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {length} bytes")
-        return np.frombuffer(self._bytes(at, max(min(length, self._size - at), 0)), np.uint8)
+        content = space.of(max(min(length, self._size - at), 0))
+        with self._lock:
+            self._stream.seek(min(at, self._size))
+            return content[: self._stream.readinto(content.data)]
 
-    def _read_chunk(self, chunk: Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: it is cut off."""
         place = chunk.at - self._chunk_head
         self._at = min(chunk.at, self._size)
         try:
-            packed = self._packed(chunk, cut=cut)
+            packed = self._packed(chunk, spaces.packed, cut=cut)
             self._inflation.count(len(packed.data), packed.claimed)
-            data = decompress(packed, np.empty(packed.claimed + 1, np.uint8))
+            data = decompress(packed, spaces.records.of(packed.claimed + 1))
         except DecompressionError as err:
             if not cut:
                 self.problems.add(f"chunk at byte {place} left out: {err.args[0]}")
@@ -256,14 +290,14 @@ def _tables(size: int, *, learn: bool = False) -> tuple[Ints, Ints]:
 
 
 def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:
-    """Yield the chunks in groups of up to `JOINED_BYTES`, or of one chunk."""
+    """Yield the chunks in groups of up to `JOINED_BYTES` of wanted records, or of one chunk."""
     group: list[Chunk] = []
     size = 0
     for chunk in chunks:
-        size += max(chunk.size, 0)
+        size += chunk.wanted_bytes
         if group and size > JOINED_BYTES:
             yield group
-            group, size = [], max(chunk.size, 0)
+            group, size = [], chunk.wanted_bytes
         group.append(chunk)
     if group:
         yield group

@@ -33,6 +33,19 @@ class DecompressionError(Exception):
     """A chunk that cannot be decompressed; `args[0]` is the reason."""
 
 
+class Space:
+    """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
+
+    def __init__(self) -> None:
+        self._bytes: Bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before where there are as many."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size, np.uint8)
+        return self._bytes[:size]
+
+
 class Packed(NamedTuple):
     """What is compressed in a chunk.
 

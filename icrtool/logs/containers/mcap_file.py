@@ -13,13 +13,14 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile
+from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile, Spaces
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     STORED,
     DecompressionError,
     Inflation,
     Packed,
+    Space,
     decompress,
     unpack_messages,
 )
@@ -87,43 +88,40 @@ class McapFile(ChunkedFile):
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
-    def _unpack(self, chunk: Chunk, wanted: frozenset[int], space: Bytes, inflation: Inflation) -> int:
-        """Decompress the records of a chunk, by its message index only the wanted ones where they are its smaller part.
+    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
+        """Decompress the wanted records of a chunk.
 
         What is compressed is read up to the last of them, what is not from the first to the last.
         """
-        ranges = self._wanted_ranges(chunk, wanted)
-        if not ranges.size:
-            return super()._unpack(chunk, wanted, space, inflation)
+        if chunk.ranges is None:
+            return super()._unpack(chunk, spaces, target, inflation)
         from icrtool.logs.containers.record_table import copy_ranges
 
-        first, needed = int(ranges[0, 0]), int(ranges[1, -1])
+        first, needed = int(chunk.ranges[0, 0]), int(chunk.ranges[1, -1])
         if chunk.compression in STORED and chunk.size <= chunk.length:
             at = chunk.at + chunk.length - chunk.size + first
-            packed = Packed(self._content(at, needed - first), "", needed - first)
+            packed = Packed(self._content(at, needed - first, spaces.packed), "", needed - first)
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
-            packed = self._packed(chunk, needed=needed)
+            packed = self._packed(chunk, spaces.packed, needed=needed)
         inflation.count(len(packed.data), packed.claimed)
-        data = decompress(packed, np.empty(packed.claimed + 1, np.uint8))
+        data = decompress(packed, spaces.records.of(packed.claimed + 1))
         if len(data) < needed - first:
             raise DecompressionError("smaller than the index states")
-        copy_ranges(data, first, ranges, space)
-        return int((ranges[1] - ranges[0]).sum())
+        copy_ranges(data, first, chunk.ranges, target)
+        return chunk.wanted_bytes
 
-    def _wanted_ranges(self, chunk: Chunk, wanted: frozenset[int]) -> Ints:
-        """Return begin and end (2, n) of a chunk's wanted records by its message index.
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
+        """Return a chunk with the ranges of its wanted records by its message index.
 
-        There are none where most of the chunk is wanted, or the index cannot be right.
+        It has none where most of the chunk is wanted, or the index cannot be right.
         """
         from icrtool.logs.containers.record_table import read_message_index, wanted_ranges
 
-        none = np.empty((2, 0), np.int64)
-        if chunk.channels is None or chunk.channels <= wanted:
-            return none
-        if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
-            return none
+        is_whole = chunk.channels is None or chunk.channels <= wanted
+        if is_whole or max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
+            return chunk
         flags = np.zeros(1 << 16, np.bool_)
         flags[list(wanted)] = True
         index = np.frombuffer(self._bytes(chunk.at + chunk.length, chunk.index_length), np.uint8)
@@ -132,7 +130,7 @@ class McapFile(ChunkedFile):
         places[:count].sort()
         ranges = np.empty((2, wanted_count), np.int64)
         count, size = wanted_ranges(places[:count], chunk.size, ranges)
-        return np.ascontiguousarray(ranges[:, :count]) if size < SMALL_PART * chunk.size else none
+        return chunk._replace(ranges=ranges[:, :count].copy()) if 0 < size < SMALL_PART * chunk.size else chunk
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -258,7 +256,7 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, left))
-                yield from self._read_chunk(chunk, learn=learn, cut=length > left)
+                yield from self._read_chunk(chunk, self._next_spaces(), learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
                 if block is not None:
@@ -280,15 +278,17 @@ class McapFile(ChunkedFile):
         self.problems.add(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _packed(self, chunk: Chunk, *, cut: bool = False, needed: int = 0) -> Packed:
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
         """Read a chunk from the file.
 
         Parameters
         ----------
+        space : for the chunk as it is in the file
         cut : it is cut off; what can be decompressed is not checked
         needed : where not 0, so many bytes of its records are enough, and are not checked
         """
-        content = self._content(chunk.at, min(chunk.length, needed + _LARGEST_BLOCK_BYTES if needed else chunk.length))
+        length = min(chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else chunk.length
+        content = self._content(chunk.at, length, space)
         if len(content) < 40:
             raise DecompressionError("its header is cut off")
         size = int.from_bytes(content[16:24], "little")
@@ -297,11 +297,11 @@ class McapFile(ChunkedFile):
         compression = bytes(content[32 : min(name_end, 32 + 64)]).decode("ascii", "replace")
         if name_end + 8 > len(content):
             raise DecompressionError("its header is damaged")
-        length = int.from_bytes(content[name_end : name_end + 8], "little")
-        data = content[name_end + 8 : name_end + 8 + length]
+        packed = int.from_bytes(content[name_end : name_end + 8], "little")
+        data = content[name_end + 8 : name_end + 8 + packed]
         if cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        if len(data) < length:
+        if len(data) < packed:
             raise DecompressionError("its header is damaged")
         return Packed(data, compression, size, checksum=checksum)
 

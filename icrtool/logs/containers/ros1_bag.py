@@ -12,8 +12,8 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile
-from icrtool.logs.containers.decompress import Packed
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile, Spaces
+from icrtool.logs.containers.decompress import DecompressionError, Packed, Space
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -69,7 +69,7 @@ class Ros1Bag(ChunkedFile):
             raise
         self.channels = list(self._connections.values())
 
-    def _located(self, chunk: Chunk) -> Chunk:
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
         record = self._record(chunk.at)
         return _chunk_of(record) if record is not None and record.op == _CHUNK else chunk._replace(size=-1)
 
@@ -135,7 +135,7 @@ class Ros1Bag(ChunkedFile):
                 break
             cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(_chunk_of(record), learn=learn, cut=cut)
+                yield from self._read_chunk(_chunk_of(record), self._next_spaces(), learn=learn, cut=cut)
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
@@ -145,14 +145,16 @@ class Ros1Bag(ChunkedFile):
         if at < self._size:
             self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_chunk(self, chunk: Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         if chunk.size < 0:
             self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
         else:
-            yield from super()._read_chunk(chunk, learn=learn, cut=cut)
+            yield from super()._read_chunk(chunk, spaces, learn=learn, cut=cut)
 
-    def _packed(self, chunk: Chunk, *, cut: bool = False) -> Packed:
-        return Packed(self._content(chunk.at, chunk.length), chunk.compression, chunk.size, partial=cut)
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
+        if chunk.size < 0:
+            raise DecompressionError("no chunk")
+        return Packed(self._content(chunk.at, chunk.length, space), chunk.compression, chunk.size, partial=cut)
 
     def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_bag
