@@ -107,6 +107,7 @@ def survey_log(
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
+                candidates = find_candidates(tables, config, unread)
                 inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
             except BaseException:
                 # The pool waits for its threads before it passes on Ctrl-C or an error.
@@ -115,7 +116,6 @@ def survey_log(
         channels = tuple(container.channels)
     finally:
         container.close()
-    candidates = find_candidates(tables, config, unread)
     drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),

@@ -30,10 +30,10 @@ BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
 
 THREADS, BLOCKS_AHEAD = 2, 3
-"""That make blocks from chunks, and blocks made while one is used: threads do not wait for one another."""
+"""Threads that make blocks of chunks, and blocks that they make while one is used."""
 
 JOINED_BYTES = 1 << 22
-"""Chunks that have so many bytes together make one block: each has a cost of its own."""
+"""Of the wanted records of chunks that are made one block: each block has a cost of its own."""
 
 MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
 """Messages that a scan finds at a time; a record has more bytes than this."""
@@ -129,7 +129,7 @@ class ChunkedFile(ABC):
         """Remember a record that is no message; `row` is its column in `others` of the scan of `data`."""
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
-        """Yield the messages of the wanted channels, chunk by chunk; the next is made while one is used."""
+        """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
         if not wanted:
             return
         if self._chunks is None:
@@ -145,7 +145,7 @@ class ChunkedFile(ABC):
         self._free()
 
     def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
-        """Yield the messages in some chunks."""
+        """Yield the messages in some chunks; where anything is damaged, these are read one after the other."""
         with ThreadPoolExecutor(THREADS) as pool:
             groups = ((group, self._next_spaces()) for group in _groups(chunks))
             begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
@@ -153,12 +153,12 @@ class ChunkedFile(ABC):
                 self._at = group[-1].at
                 try:
                     block, inflation = pending.result()
-                except DecompressionError:
+                except (DecompressionError, MemoryError):
                     for chunk in group:
                         yield from self._read_chunk(chunk, spaces)
                 else:
                     self._inflation.left += inflation.left
-                    yield with_possible_times(block, self.problems)
+                    yield block
 
     def _joined(self, group: Sequence[Chunk], spaces: Spaces) -> tuple[Block, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
@@ -182,7 +182,10 @@ class ChunkedFile(ABC):
             count, _, stop = self._scan(data, begin, messages, others, count)
             if stop < len(data):
                 raise DecompressionError("damaged")
-        return Block(data, *messages[:, :count]), inflation
+        block = Block(data, *messages[:, :count])
+        if with_possible_times(block, Problems("")) is not block:
+            raise DecompressionError("impossible log times")
+        return block, inflation
 
     def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
@@ -262,9 +265,9 @@ class ChunkedFile(ABC):
             packed = self._packed(chunk, spaces.packed, cut=cut)
             self._inflation.count(len(packed.data), packed.claimed)
             data = decompress(packed, spaces.records.of(packed.claimed + 1))
-        except DecompressionError as err:
+        except (DecompressionError, MemoryError) as err:
             if not cut:
-                self.problems.add(f"chunk at byte {place} left out: {err.args[0]}")
+                self.problems.add(f"chunk at byte {place} left out: {err}")
             return
         stop, begin = 0, -1
         while begin < stop < len(data):
