@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple, TypeVar
@@ -145,20 +146,29 @@ class ChunkedFile(ABC):
         self._free()
 
     def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
-        """Yield the messages in some chunks; where anything is damaged, these are read one after the other."""
+        """Yield the messages in some chunks."""
         with ThreadPoolExecutor(THREADS) as pool:
             groups = ((group, self._next_spaces()) for group in _groups(chunks))
             begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
             for group, spaces, pending in ahead(begun, BLOCKS_AHEAD):
                 self._at = group[-1].at
-                try:
-                    block, inflation = pending.result()
-                except (DecompressionError, MemoryError):
-                    for chunk in group:
-                        yield from self._read_chunk(chunk, spaces)
-                else:
-                    self._inflation.left += inflation.left
-                    yield block
+                yield from self._sound(group, spaces, pending.result)
+
+    def _sound(
+        self, group: Sequence[Chunk], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
+    ) -> Iterator[Block]:
+        """Yield the block that is made of some chunks; where anything is damaged, one for each, then what is sound."""
+        try:
+            block, inflation = made()
+        except (DecompressionError, MemoryError):
+            if len(group) == 1:
+                yield from self._read_chunk(group[0], spaces)
+            else:
+                for chunk in group:
+                    yield from self._sound([chunk], spaces, partial(self._joined, [chunk], spaces))
+        else:
+            self._inflation.left += inflation.left
+            yield with_possible_times(block, self.problems)
 
     def _joined(self, group: Sequence[Chunk], spaces: Spaces) -> tuple[Block, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
@@ -182,10 +192,7 @@ class ChunkedFile(ABC):
             count, _, stop = self._scan(data, begin, messages, others, count)
             if stop < len(data):
                 raise DecompressionError("damaged")
-        block = Block(data, *messages[:, :count])
-        if with_possible_times(block, Problems("")) is not block:
-            raise DecompressionError("impossible log times")
-        return block, inflation
+        return Block(data, *messages[:, :count]), inflation
 
     def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
