@@ -70,6 +70,10 @@ class Chunk(NamedTuple):
         return max(self.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
 
 
+class _PartError(DecompressionError):
+    """Damaged records, read without their checksum: those of the chunks beside them are computed, too."""
+
+
 class Spaces(NamedTuple):
     """Memory for a chunk as it is in the file, for its records, and for those of several chunks."""
 
@@ -157,14 +161,14 @@ class ChunkedFile(ABC):
     def _sound(
         self, group: Sequence[Chunk], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
     ) -> Iterator[Block]:
-        """Yield the block that is made of some chunks; where anything is damaged, one for each, then what is sound."""
+        """Yield the block that is made of some chunks; where anything is damaged, one for each, or what is sound."""
         try:
             block, inflation = made()
-        except (DecompressionError, MemoryError):
-            if len(group) == 1:
-                yield from self._read_chunk(group[0], spaces)
-            else:
-                for chunk in group:
+        except (DecompressionError, MemoryError) as err:
+            for chunk in group:
+                if len(group) == 1 or isinstance(err, _PartError):
+                    yield from self._read_chunk(chunk, spaces)
+                else:
                     yield from self._sound([chunk], spaces, partial(self._joined, [chunk], spaces))
         else:
             self._inflation.left += inflation.left
@@ -191,7 +195,7 @@ class ChunkedFile(ABC):
             data.flags.writeable = False
             count, _, stop = self._scan(data, begin, messages, others, count)
             if stop < len(data):
-                raise DecompressionError("damaged")
+                raise DecompressionError if chunk.ranges is None else _PartError
         return Block(data, *messages[:, :count]), inflation
 
     def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
