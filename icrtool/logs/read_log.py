@@ -36,6 +36,7 @@ from icrtool.logs.streams.select import (
 )
 from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
+from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.logs.table_file import is_table, read_table
@@ -222,7 +223,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages do not fit their message type; left out"
-        for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
+        for topic in dict.fromkeys(topic_of_side(name) for stream in streams for name in stream.topic.split(" + "))
         if topic in unreadable
     ]
     stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
