@@ -100,10 +100,9 @@ def path_errors(
     # the sources act all along the path, not at the ends of windows alone
     of_start, of_end = begin_s + own.wheels_later_s, end_s + own.wheels_later_s
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    row, share = steps.locate(at)
-    knots, k = len(row), len(fitted.parameters)
+    knots, k = len(at), len(fitted.parameters)
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
-    sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, row, share, rate, sums, by)
+    sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, steps.t, at, rate, sums, by)
     theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
     back = np.exp(-1j * theta[s])

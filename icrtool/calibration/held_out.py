@@ -9,7 +9,6 @@ reported score of the recommended model is honest.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -40,8 +39,6 @@ SHORTEST_BLOCK_M, FEWEST_BLOCKS, MOST_BLOCKS = 25.0, 3, 5
 
 STRIP_M, MOST_STRIPS = 5.0, 2
 """Trials from one strip of distance to another are predicted by one fit: strips at least so long, so many a block."""
-
-AT_ONCE = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +211,7 @@ def hold_out(
             found.append(_Tested(both, tester.errors(both.without)))
         return found
 
-    with ThreadPoolExecutor(AT_ONCE) as threads:
-        tested = list(threads.map(job, tuple(MODELS.values()) if models is None else models))
+    tested = [job(model) for model in (MODELS.values() if models is None else models)]
     choice = tester.choose([one[0].fit for one in tested])
     wheels = tester.table([one[0] for one in tested], choice)
     if not gyro:
@@ -250,8 +246,7 @@ def recommend(recordings: Sequence[Recording]) -> Recommendation:
         Too short a drive, or too little left beside a fold.
     """
     tester = _Tester(recordings)
-    with ThreadPoolExecutor(AT_ONCE) as threads:
-        fits = list(threads.map(tester.pool.fit, MODELS.values()))
+    fits = [tester.pool.fit(model) for model in MODELS.values()]
     choice = tester.choose(fits)
     by_name = {fit.model.name: fit for fit in fits}
     return Recommendation(by_name[choice.recommended], by_name[CONTROLLER], choice.why, tester.typical)
@@ -282,7 +277,7 @@ class _Tester:
             if np.count_nonzero(self.pool.clear_of(fold)) < FEWEST_RESIDUALS:
                 why = "too short to fit on one part and test on another"
                 raise DataError(fold.name, "too few windows beside it", why)
-        self._trials = [cut_trials(one, horizons_m) for one in recordings] if len(horizons_m) else []
+        self._trials = [cut_trials(one, horizons_m, pooled) for one in recordings] if len(horizons_m) else []
         self.typical = typical_drive(motion for one in recordings for motion in one.motions())
 
     def errors(self, without: Callable[[Fold], Prediction | None]) -> Floats:
@@ -316,9 +311,9 @@ class _Tester:
         """Return the table of models that were tested in the same trials."""
         by_name = {one.fit.model.name: one for one in tested}
         fold_of = np.concatenate([self._fold_of(i, trials.starts) for i, trials in enumerate(self._trials)])
-        chosen = np.full_like(tested[0].errors, np.nan)
-        for f, name in enumerate(choice.chosen):
-            chosen[fold_of == f] = by_name[name].errors[fold_of == f]
+        first = np.searchsorted(fold_of, np.arange(1, len(self._folds)))
+        parts = (np.split(by_name[name].errors, first)[f] for f, name in enumerate(choice.chosen))
+        chosen = np.concatenate(list(parts))
         rows = [(name, one.fit.model.label, one.errors) for name, one in by_name.items()]
         rows.append(("recommended", "recommended", chosen))
         fits = {name: one.fit for name, one in by_name.items()}
@@ -330,7 +325,7 @@ class _Tester:
             rows = [(n, label, self.errors(found.expressed) if n == CONTROLLER else one) for n, label, one in rows]
         scores = []
         for name, label, errors in rows:
-            by_fold = tuple(error_summary(errors[fold_of == f]) for f in range(len(self._folds)))
+            by_fold = tuple(error_summary(some) for some in np.split(errors, first))
             scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
         return replace(found, scores=tuple(scores))
 

@@ -81,7 +81,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     give_back_freed()
-    rate, sums, by = _sums(drive, dt, rows, parameters)
+    rate, sums, by = _sums(drive, dt, table.t_s, rows, parameters)
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
     missed, jacobian = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
@@ -113,8 +113,8 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     )
 
 
-def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return `rate`, `sums` and `by` of `sums_at_knots` at some rows (m,), by the wheels of a drive."""
+def _sums(drive: Drive, dt: Floats, t_s: Floats, rows: Ints, parameters: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return `rate`, `sums` and `by` of `sums_at_knots` at some rows (m,) of times (n,), by the wheels of a drive."""
     knots, terms = len(rows), len(parameters)
     fixed, columns = np.zeros((3, len(dt))), np.empty((terms, len(dt)))
     axes = np.empty(terms, np.int64)
@@ -123,7 +123,7 @@ def _sums(drive: Drive, dt: Floats, rows: Ints, parameters: Floats) -> tuple[Flo
         motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
         _, axes, columns[:, some] = model_columns(MODELS["full_linear"], motion)  # each of its terms is free
     rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-    sums_at_knots(fixed, columns, axes, parameters, dt, fixed[0], rows, np.zeros(knots), rate, sums, by)
+    sums_at_knots(fixed, columns, axes, parameters, dt, fixed[0], t_s, t_s[rows], rate, sums, by)
     return rate, sums, by
 
 

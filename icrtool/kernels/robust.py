@@ -122,11 +122,13 @@ class RobustFit(Linearised):
     x : (k + p c,) parameters, those of the parts behind the k shared ones
     own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
         follow the shared ones
+    gain : (p, c, k) negative derivative of each part's own parameters by the shared ones
     """
 
     x: Floats
     own_prior: Floats
     own_pull: Floats
+    gain: Floats
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
@@ -197,7 +199,7 @@ def robust_least_squares(
     prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
     return RobustFit(
         residuals=residuals, jacobian=jacobian, scale=scale, prior=prior, overlap=overlap, x=x, own_prior=own_prior,
-        own_pull=own_pull,
+        own_pull=own_pull, gain=found.gain,
     )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ def _derive_step(
 @njit
 def sums_at_knots(
     fixed: Floats, columns: Floats, axis: Ints, parameters: Floats, held: Floats, into: Floats,
-    row: Ints, share: Floats, rate: Floats, sums: Floats, by: Floats,
+    t: Floats, at: Floats, rate: Floats, sums: Floats, by: Floats,
 ) -> None:  # fmt: skip
     """Fill heading, place and their derivatives at knots.
 
@@ -46,13 +46,13 @@ def sums_at_knots(
     ----------
     fixed : (3, n) twist without the free terms, v_x, v_y [m/s], omega [rad/s]
     columns : (k, n) twist per unit parameter of each free term, on its `axis` (k,); parameters : (k,)
-    held : (n,) duration of each step [s]; into : (n,) how far into the step its heading is taken [s]
-    row, share : (m,) ascending: step of each knot, and how much of the step has passed before it
+    held : (n,) duration of each step [s], 0 over gaps; into : (n,) how far into the step its heading is taken [s]
+    t, at : (n,), (m,) begin of each step and time of each knot [s], both ascending
     rate : (m, 3) filled with the velocity [m/s], forward and right in the frame of the path, and omega; 0 over gaps
     sums : (m, 3) filled with heading [rad] and place [m]
     by : (k, m, 3) filled with their derivatives
     """
-    k, m, n = len(parameters), len(row), len(held)
+    k, m, n = len(parameters), len(at), len(held)
     theta, x, y, knot = 0.0, 0.0, 0.0, 0
     state = np.zeros((k, 3))
     step = np.zeros((k, 3))
@@ -71,9 +71,9 @@ def sums_at_knots(
         c, s = math.cos(theta + omega * into[i]), math.sin(theta + omega * into[i])
         north, east = v_x * c - v_y * s, v_x * s + v_y * c
         _derive_step(columns, axis, i, held[i], into[i], c, s, north, east, state, step)
-        while knot < m and row[knot] == i:
-            part = share[knot]
-            moving = 1.0 if held[i] > 0.0 else 0.0
+        moving = 1.0 if held[i] > 0.0 else 0.0
+        while knot < m and (i == n - 1 or at[knot] < t[i + 1]):
+            part = min(max(at[knot] - t[i], 0.0), held[i]) / held[i] if held[i] > 0.0 else 0.0
             rate[knot, 0], rate[knot, 1], rate[knot, 2] = moving * north, moving * east, moving * omega
             sums[knot, 0] = theta + part * omega * held[i]
             sums[knot, 1] = x + part * north * held[i]

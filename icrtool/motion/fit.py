@@ -101,19 +101,20 @@ class PooledFit(FittedModel):
 
     def constants(self, recording: int) -> LogConstants:
         """Return the constants of a recording."""
-        return self._constants(self.solution.x, recording)
+        return LogConstants(*self._own(self.solution.x, recording).tolist())
 
-    def _constants(self, x: Floats, recording: int) -> LogConstants:
+    def _own(self, x: Floats, recording: int) -> Floats:
         own = len(constant_std(self.model))
         first = len(self.parameters) + own * recording
-        return LogConstants(*x[first : first + own].tolist())
+        return x[first : first + own]
 
     def without(self, fold: Fold) -> Prediction | None:
         """Return the model as fitted without a fold, and the constants of the fold's recording for that.
 
         Returns
         -------
-        None where too little is left. The constants of a recording that is left out whole are found in it.
+        None where too little is left. The constants of a recording that is left out whole are found in it, of many to
+        first order of the parameters' change.
         """
         if fold not in self._left_out:
             self._left_out[fold] = self._fit_without(fold)
@@ -134,10 +135,12 @@ class PooledFit(FittedModel):
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
             covariance = self._covariance(self.curvature, np.linalg.inv(self.curvature - curvature))
-            fitted = FittedModel(self.model, self.parameters + self._steps(gradient, curvature), covariance, wheels)
-            return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
+            steps = self._steps(gradient, curvature)
+            fitted = FittedModel(self.model, self.parameters + steps, covariance, wheels)
+            own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
+            return fitted, LogConstants(*own.tolist())
         x, covariance = self._reweighted(clear)
-        return FittedModel(self.model, x[:k], covariance, wheels), self._constants(x, i)
+        return FittedModel(self.model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
 
     def refit_without(self, recording: int) -> PooledFit:
         """Return a fit of the model to the other recordings."""
@@ -186,12 +189,15 @@ class PooledFit(FittedModel):
         """
         at, rows = self.solution, self.pool.rows(fold.recording)
         if fold.whole:
-            out = [list({fold.recording, other.recording}) for other in others]
-            removed = [tuple(of_each[some].sum(axis=0) for of_each in self._by_recording) for some in out]
+            out = np.array([other.recording for other in others])
+            twice = out == fold.recording
+            gradients, curvatures = (of_each[fold.recording] + of_each[out] for of_each in self._by_recording)
+            gradients[twice] /= 2.0
+            curvatures[twice] /= 2.0
         else:
             clear = self.pool.clear_of(fold)
             removed = [self._derivatives(~(clear & self.pool.clear_of(other))) for other in others]
-        gradients, curvatures = (np.array(one) for one in zip(*removed, strict=True))
+            gradients, curvatures = (np.array(one) for one in zip(*removed, strict=True))
         residuals: Floats = at.residuals[rows] + self._steps(gradients, curvatures) @ at.jacobian[rows].T
         return residuals
 
@@ -290,10 +296,10 @@ class WindowResiduals:
             fixed[OMEGA] += shift
             columns[:k] += self._gains[:, None] * shift
             columns[-1] = (1.0 + parameters @ self._gains) * self._gyro_change
-        row, share = steps.locate(windows.knot_t + delay)
-        terms, knots, count = len(axes), len(row), len(windows.start)
+        at = windows.knot_t + delay
+        terms, knots, count = len(axes), len(at), len(windows.start)
         rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-        sums_at_knots(fixed, columns, axes, values, steps.held, steps.into, row, share, rate, sums, by)
+        sums_at_knots(fixed, columns, axes, values, steps.held, steps.into, steps.t, at, rate, sums, by)
         residual, jacobian = np.empty(2 * count), np.empty((2 * count, terms + OF_WHEELS))
         window_residuals(
             rate, sums, by, windows.start, windows.end, self._reference, offset, self._root, residual, jacobian

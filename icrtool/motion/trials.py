@@ -16,6 +16,7 @@ from icrtool.motion.recording import (
     LogConstants,
     Recording,
     Steps,
+    Totals,
     joined_steps,
     moving_states,
     samples_a_step,
@@ -37,14 +38,19 @@ class Trials(NamedTuple):
     ends: Ints
 
 
-def cut_trials(recording: Recording, horizons_m: Sequence[float]) -> Trials:
+def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals | None = None) -> Trials:
     """Return the trials of a recording from states in which it moves.
 
     They are as far apart as the steps of the fits are long, about `MOST_STARTS` of a long drive: nearer ones are copies
     of one another.
+
+    Parameters
+    ----------
+    pooled : of all that is fitted together, default the recording
     """
     moving = np.flatnonzero(moving_states(recording.drive))
-    starts = moving[:: max(samples_a_step(recording), len(moving) // MOST_STARTS)].copy()
+    step = samples_a_step(recording, None if pooled is None else pooled.seconds)
+    starts = moving[:: max(step, len(moving) // MOST_STARTS)].copy()
     return Trials(starts, ends_from(recording.drive, np.array(horizons_m, np.float64), starts))
 
 

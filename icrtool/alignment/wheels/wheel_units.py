@@ -169,6 +169,9 @@ def _metres_per_unit(
         if counts is not None:
             known["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
+    if unit == "rad" and unit in known and _is_metric(wheels, gnss, known[unit]):
+        why = f"{topic} is read in m{per}, not rad{per}: the position reference goes as far as its numbers do"
+        return 1.0, f" in m{per} (by the position reference)", [why]
     if unit in known:
         return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -193,6 +196,14 @@ def _metres_per_unit(
     how += " (estimated from the position reference)"
     why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
     return scale.value, f", {how}", [f"{why}: {how}"]
+
+
+def _is_metric(wheels: WheelSamples, gnss: PositionFixes, radius_m: float) -> bool:
+    """Return whether speeds of a type that has rad/s are in m/s: they are far too small for the distance otherwise."""
+    if wheels.from_position or abs(math.log(radius_m)) < 2 * UNIT_TOLERANCE:
+        return False
+    scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
+    return scale is not None and abs(math.log(scale.value)) < UNIT_TOLERANCE
 
 
 _SCALE_WORDS: dict[WheelUnit, str] = {"rad": "wheel radius", "counts": "travel of a count"}

@@ -17,6 +17,9 @@ from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
+READ_ENCODINGS = ("cdr", "ros1")
+"""Serializations of messages that are read: of ROS 2 and of ROS 1."""
+
 _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
 
@@ -159,7 +162,7 @@ class TopicCollector:
     def _compile(self) -> None:
         definitions = self.definitions if self.definitions is not None else definitions_of(self.channel)
         encoding = self.channel.encoding
-        if encoding not in ("cdr", "ros1"):
+        if encoding not in READ_ENCODINGS:
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
         layout = compile_layout(
             definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity

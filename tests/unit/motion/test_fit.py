@@ -158,6 +158,7 @@ def test_leaving_a_recording_out_is_near_a_fit_to_the_others(count: int, grown: 
     assert np.all((quick.std > new.std / 1.4) & (quick.std < new.std * grown))
     alone = own_constants(cut_windows(recordings[-1]), new, WIDTH_M)
     assert own.heading_offset_rad == pytest.approx(alone.heading_offset_rad, abs=1e-3)
+    assert own.wheels_later_s == pytest.approx(alone.wheels_later_s, abs=2e-3)
 
 
 def test_a_pooled_fit_is_that_of_the_dense_least_squares() -> None:
