@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 
@@ -98,11 +97,9 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
     """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
     topics = config.topics
-    with ThreadPoolExecutor(1) as pool:  # headings take as long as the other two
-        pending = pool.submit(_read_all, tables, HEADING_TYPES, topics.heading, HeadingSource)
-        gnss = _read_all(tables, POSITION_TYPES, topics.gnss, PositionSource)
-        wheels = _wheel_candidates(tables, config)
-        heading = pending.result()
+    gnss = _read_all(tables, POSITION_TYPES, topics.gnss, PositionSource)
+    heading = _read_all(tables, HEADING_TYPES, topics.heading, HeadingSource)
+    wheels = _wheel_candidates(tables, config)
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
 
     def completeness(topic: str) -> float:
