@@ -75,11 +75,12 @@ class _PartError(DecompressionError):
 
 
 class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for those of several chunks."""
+    """Memory for a chunk as it is in the file, for its records, and for those of several chunks and their table."""
 
     packed: Space
     records: Space
     joined: Space
+    rows: Space
 
 
 class ChunkedFile(ABC):
@@ -187,7 +188,8 @@ class ChunkedFile(ABC):
             raise DecompressionError(f"it claims {size} bytes")
         inflation = Inflation(0)
         joined = spaces.joined.of(size + 1)
-        messages, others = _tables(size)
+        most = _most_rows(size)
+        messages, others = spaces.rows.of(32 * most).view(np.int64).reshape(4, most), np.empty((4, 0), np.int64)
         data, count, stop = joined[:0], 0, 0
         for chunk in group:
             begin = stop
@@ -227,7 +229,7 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
+        self._spaces = deque(Spaces(Space(), Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
 
     def _next_spaces(self) -> Spaces:
         """Return the memory of the block that was used first."""
@@ -290,17 +292,17 @@ class ChunkedFile(ABC):
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        messages, others = _tables(len(data) - begin, learn=learn)
+        most = _most_rows(len(data) - begin)
+        messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
         count, other, stop = self._scan(data, begin, messages, others, 0)
         for row in others[:, :other].T:
             self._learn(row, data)
         return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop
 
 
-def _tables(size: int, *, learn: bool = False) -> tuple[Ints, Ints]:
-    """Return tables for the messages in so many bytes, and for other records, which take no space unless wanted."""
-    most = min(size // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
-    return np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
+def _most_rows(size: int) -> int:
+    """Return how many messages a scan of so many bytes finds at most."""
+    return min(size // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
 
 
 def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:
