@@ -89,7 +89,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
         if one.reason:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue
-        multiplier = f"multiplier {one.multiplier:.3f} ± {one.multiplier_std:.3f}"
+        multiplier = f"multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}"
         parts.append(f"{head}: recommended model {one.recommended}, {multiplier}, in {one.file}\n{one.table}")
     return "\n\n".join(parts) + "\n"
 
