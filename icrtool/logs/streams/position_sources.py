@@ -60,6 +60,9 @@ LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
 """Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
 
+FARTHEST_M = 200_000.0
+"""No robot drives further from the middle of its fixes."""
+
 STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
 """A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
 
@@ -113,6 +116,7 @@ def _geodetic(
         ("not finite", ~np.isfinite(latitude) | ~np.isfinite(longitude)),
         ("not a place on earth", ~possible),
         ("at 0, 0", (latitude == 0) & (longitude == 0)),
+        ("far from the others", _far_away(geodetic, possible & ~no_fix & np.isfinite(geodetic[:, :2]).all(axis=1))),
     )
     for reason, bad in reasons:
         count = int(np.count_nonzero(bad & usable))
@@ -138,6 +142,17 @@ def _geodetic(
         rejected=rejected, score=score, why=f"{what}{stated}", problem=problem,
         stated_class=stated_class,
     )  # fmt: skip
+
+
+def _far_away(geodetic: Floats, known: Bools) -> Bools:
+    """Return the fixes (n,) of another place: a receiver that was switched on may send where it was last."""
+    if not known.any():
+        return known
+    away_deg = geodetic[:, :2] - geodetic[np.argmax(known), :2]
+    away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
+    away_deg -= np.median(away_deg[known], axis=0)
+    away_deg[:, 1] *= math.cos(math.radians(float(np.median(geodetic[known, 0]))))
+    return np.asarray((np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1))
 
 
 def _is_still(geodetic: Floats) -> bool:

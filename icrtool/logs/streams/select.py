@@ -342,8 +342,8 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
     entries: dict[str, str] = {}
     for channel in channels:
         reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
-        if channel.encoding not in READ_ENCODINGS:
-            reason = f": serialization {channel.encoding or 'unknown'} is not read"
+        if not reason and channel.encoding not in READ_ENCODINGS:
+            reason = f": serialization {str(channel.encoding)!r} is not read"
         entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
     ordered = [*(entries[t] for t in entries if t in reasons), *(entries[t] for t in entries if t not in reasons)]
     more = len(ordered) - MOST_LISTED

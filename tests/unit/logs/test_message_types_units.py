@@ -135,6 +135,16 @@ def test_a_negative_status_is_no_fix(name: str) -> None:
     assert source.rejected == {"no fix": 2}
 
 
+@pytest.mark.parametrize("longitude", [11.0, 180.0])
+def test_fixes_of_the_place_where_a_receiver_was_last_are_left_out(longitude: float) -> None:
+    """The local plane would be laid there. At the date line fixes on both sides are of one place."""
+    longitudes = [114.05, *[longitude, -longitude if longitude == 180.0 else longitude] * 5]
+    columns = {"status__status": [0] * 11, "latitude": [22.54, *[48.0] * 10], "longitude": longitudes}
+    source = position("sensor_msgs/NavSatFix", **columns, altitude=[500.0] * 11, position_covariance_type=[0] * 11)
+    assert source.usable.tolist() == [False, *[True] * 10]
+    assert source.rejected == {"far from the others": 1}
+
+
 def test_a_status_that_is_never_told_refuses_nothing() -> None:
     assert position("sensor_msgs/NavSatFix", **fix(status__status=[-2] * 3)).usable.all()
     never = fix()
