@@ -134,7 +134,8 @@ def _fields_of(channel: Channel) -> list[str]:
         return ["data"]
     if channel.message_type in ARRAY_TYPES:
         return ["data[*]"] if _of_wheels(channel.topic) and not _OTHER_WORDS.search(channel.topic) else []
-    if not _SIDE_WORDS.search(f"{channel.topic} {channel.definition}"):
+    words = f"{channel.topic} {channel.message_type} {channel.definition}"
+    if not (_SIDE_WORDS.search(words) and _of_wheels(words)):
         return []
     return [path for path in number_fields(channel) if _may_be_side(channel.topic, channel.message_type, path)]
 
