@@ -48,7 +48,8 @@ _OTHER_WORDS = re.compile(
 """Fields of a motor driver's messages that are no motion."""
 
 _SIDE_WORDS = re.compile("left|right", re.IGNORECASE)
-_ENCODER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm", re.IGNORECASE)
+_DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE)
+"""Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 _KNOWN = {*WHEEL_TYPES, *POSITION_TYPES, *HEADING_TYPES}
 _HOLD_NS = 500_000_000
@@ -134,7 +135,8 @@ def _fields_of(channel: Channel) -> list[str]:
         return ["data"]
     if channel.message_type in ARRAY_TYPES:
         return ["data[*]"] if _of_wheels(channel.topic) and not _OTHER_WORDS.search(channel.topic) else []
-    if not _SIDE_WORDS.search(f"{channel.topic} {channel.definition}"):
+    words = f"{channel.topic} {channel.message_type} {channel.definition}"
+    if not (_SIDE_WORDS.search(words) and _of_wheels(words)):
         return []
     return [path for path in number_fields(channel) if _may_be_side(channel.topic, channel.message_type, path)]
 
@@ -149,7 +151,7 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
 
 
 def _of_wheels(name: str) -> bool:
-    return bool(WHEEL_WORDS.search(name) or _ENCODER_WORDS.search(name))
+    return bool(WHEEL_WORDS.search(name) or _DRIVER_WORDS.search(name))
 
 
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:

@@ -86,11 +86,12 @@ def test_ticks_of_both_sides_in_a_message_of_an_unknown_type_are_wheels(tmp_path
     assert motion.stamps.header_ns[0] == START_NS - 7_000_000
 
 
-def test_drivers_with_a_topic_for_each_side_are_paired_by_header(tmp_path: Path) -> None:
+@pytest.mark.parametrize("topic", ["/driver/{}/feedback", "/{}_vesc/core", "/{}/wheel"])
+def test_drivers_with_a_topic_for_each_side_are_paired_by_header(tmp_path: Path, topic: str) -> None:
     motor = STORE.types["rover_msgs/msg/Motor"]
     publishers = [
         (
-            f"/driver/{side}/feedback",
+            topic.format(side),
             "rover_msgs/msg/Motor",
             [motor(header(i, delay_ns), 2.0, 40.0, 9.0, float(v)) for i, v in enumerate(speed)],
         )
