@@ -109,6 +109,7 @@ def survey_log(
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
+                candidates = find_candidates(tables, config, unread)
                 inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
             except BaseException:
                 # The pool waits for its threads before it passes on Ctrl-C or an error.
@@ -117,7 +118,6 @@ def survey_log(
         channels = tuple(container.channels)
     finally:
         container.close()
-    candidates = find_candidates(tables, config, unread)
     drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),
@@ -276,7 +276,8 @@ def _collect(
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
-            for number in np.unique(block.channel).tolist():
+            numbers = np.sort(block.channel)  # np.unique takes four times as long
+            for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
                     continue
                 try:
