@@ -36,6 +36,8 @@ from icrtool.logs.streams.select import (
 )
 from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
+from icrtool.logs.streams.transform_pose import transform_channels, transform_pose
+from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.logs.table_file import is_table, read_table
@@ -107,6 +109,7 @@ def survey_log(
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
+                candidates = find_candidates(tables, config, unread)
                 inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
             except BaseException:
                 # The pool waits for its threads before it passes on Ctrl-C or an error.
@@ -115,7 +118,6 @@ def survey_log(
         channels = tuple(container.channels)
     finally:
         container.close()
-    candidates = find_candidates(tables, config, unread)
     drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),
@@ -222,7 +224,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     warnings += [
         f"{name}: {topic}: {unreadable[topic]} messages do not fit their message type; left out"
-        for topic in dict.fromkeys(topic for stream in streams for topic in stream.topic.split(" + "))
+        for topic in dict.fromkeys(topic_of_side(name) for stream in streams for name in stream.topic.split(" + "))
         if topic in unreadable
     ]
     stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
@@ -268,12 +270,14 @@ def _collect(
     by_id = {channel.id: channel for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
     static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
-    wanted |= static
+    moving = transform_channels(container.channels, config.topics)
+    wanted |= static | moving
     cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
-            for number in np.unique(block.channel).tolist():
+            numbers = np.sort(block.channel)  # np.unique takes four times as long
+            for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
                     continue
                 try:
@@ -289,7 +293,14 @@ def _collect(
     tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
     silent = [by_id[number] for number in wanted if number not in collectors]
     tables += [_empty_table(channel) for channel in silent]
-    return merge_tables(tables), unread
+    tables = merge_tables(tables)
+    for place, table in enumerate(tables):
+        if table.topic in {by_id[number].topic for number in moving} and len(table):
+            try:
+                tables[place] = transform_pose(table)
+            except DefinitionError as err:
+                unread[table.topic] = err.why
+    return tables, unread
 
 
 def _empty_table(channel: Channel) -> TopicTable:

@@ -35,6 +35,10 @@ UNIT_TOLERANCE = 0.35
 """A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
 
 
+OTHER_UNIT_TOLERANCE = 0.1
+"""A unit other than that of the message type is recognised within this share: slip of 90 % would look like rpm."""
+
+
 class Scale(NamedTuple):
     """Metres by the position reference per unit of the wheels: median, and its standard deviation."""
 
@@ -169,6 +173,9 @@ def _metres_per_unit(
         if counts is not None:
             known["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
+    if unit == "rad" and unit in known and (other := _other_unit(wheels, gnss, known[unit])):
+        why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
+        return _factors(known[unit])[other], f" in {other} (by the position reference)", [why]
     if unit in known:
         return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -193,6 +200,20 @@ def _metres_per_unit(
     how += " (estimated from the position reference)"
     why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
     return scale.value, f", {how}", [f"{why}: {how}"]
+
+
+def _other_unit(wheels: WheelSamples, gnss: PositionFixes, radius_m: float) -> str:
+    """Return the unit of speeds whose message type has rad/s, where another is right and rad/s far off; else empty."""
+    scale = None if wheels.from_position else reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
+    if scale is None or scale.value <= 0.0 or abs(math.log(scale.value / radius_m)) < 2 * UNIT_TOLERANCE:
+        return ""
+    factors = _factors(radius_m)
+    return next((name for name in factors if abs(math.log(scale.value / factors[name])) < OTHER_UNIT_TOLERANCE), "")
+
+
+def _factors(radius_m: float) -> dict[str, float]:
+    """Return metres per second of the units in which drivers fill speeds of joints."""
+    return {"m/s": 1.0, "rpm": 2 * math.pi * radius_m / 60, "deg/s": math.radians(radius_m)}
 
 
 _SCALE_WORDS: dict[WheelUnit, str] = {"rad": "wheel radius", "counts": "travel of a count"}

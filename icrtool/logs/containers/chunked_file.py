@@ -4,23 +4,37 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from threading import Lock
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Space
+from icrtool.logs.containers.decompress import (
+    LARGEST_CHUNK_BYTES,
+    DecompressionError,
+    Inflation,
+    Packed,
+    Space,
+    decompress,
+)
+
+Item = TypeVar("Item")
 
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
 """Operation codes of records."""
 
-BLOCKS_AHEAD = 2
-"""Made while one is used: the thread that makes them does not wait for the one that uses them."""
+THREADS, BLOCKS_AHEAD = 2, 3
+"""Threads that make blocks of chunks, and blocks that they make while one is used."""
+
+JOINED_BYTES = 1 << 22
+"""Of the wanted records of chunks that are made one block: each block has a cost of its own."""
 
 MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
 """Messages that a scan finds at a time; a record has more bytes than this."""
@@ -31,12 +45,13 @@ class Chunk(NamedTuple):
 
     Attributes
     ----------
-    at, length : where its content is in the file; of a bag only where its record begins
+    at, length : where its content is in the file; of a bag's index where its record begins
     channels : those it holds, None without an entry
     begin_ns, end_ns : first and last log time in it, 0 where they are not known
     index_length : of the message index records that follow it
-    size : of its records, decompressed
-    stored : they are not compressed
+    size : of its records, decompressed; -1 where there is no chunk in its place
+    compression : as the log calls it
+    ranges : begin and end (2, n) of its wanted records, where only those are read
     """
 
     at: int
@@ -46,36 +61,61 @@ class Chunk(NamedTuple):
     end_ns: int = 0
     index_length: int = 0
     size: int = 0
-    stored: bool = False
+    compression: str = ""
+    ranges: Ints | None = None
+
+    @property
+    def wanted_bytes(self) -> int:
+        """Bytes of the records that are read."""
+        return max(self.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
+
+
+class _PartError(DecompressionError):
+    """Damaged records, read without their checksum: those of the chunks beside them are computed, too."""
 
 
 class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for records of several chunks."""
+    """Memory for a chunk as it is in the file, for its records, and for those of several chunks and their table."""
 
     packed: Space
     records: Space
     joined: Space
+    rows: Space
 
 
 class ChunkedFile(ABC):
     """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
 
     _chunks: Sequence[Chunk] | None = None
+    _chunk_head = 0
+    """Bytes before the content of a chunk, in which its record begins."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.files = [path]
         self.problems = Problems(path.name)
         self._inflation = Inflation()
-        # One block is used while the next ones are made.
-        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
+        self._spaces: deque[Spaces] = deque()
+        self._free()
         self._stream = path.open("rb")
+        self._lock = Lock()
         self._at = 0
         self._size = path.stat().st_size
 
     @abstractmethod
-    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
-        """Yield the messages of the wanted channels in some chunks."""
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
+        """Read a chunk from the file.
+
+        Parameters
+        ----------
+        space : for the chunk as it is in the file
+        cut : it is cut off
+
+        Raises
+        ------
+        DecompressionError
+            Its header is damaged.
+        """
 
     @abstractmethod
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -87,7 +127,7 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
         """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
 
     @abstractmethod
@@ -95,20 +135,91 @@ class ChunkedFile(ABC):
         """Remember a record that is no message; `row` is its column in `others` of the scan of `data`."""
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
-        """Yield the messages of the wanted channels, chunk by chunk; the next is made while one is used."""
+        """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
         if not wanted:
             return
         if self._chunks is None:
-            blocks = self._read_in_order()
+            with ThreadPoolExecutor(1) as pool:
+                in_order = self._read_in_order()
+                pending = pool.submit(next, in_order, None)
+                while (block := pending.result()) is not None:
+                    pending = pool.submit(next, in_order, None)
+                    yield block
         else:
-            needed = [one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted)]
-            blocks = self._indexed(needed, wanted)
-        with ThreadPoolExecutor(1) as pool:
-            pending = deque(pool.submit(next, blocks, None) for _ in range(BLOCKS_AHEAD))
-            while (block := pending.popleft().result()) is not None:
-                pending.append(pool.submit(next, blocks, None))
-                yield block
+            needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
+            yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
         self._free()
+
+    def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
+        """Yield the messages in some chunks."""
+        with ThreadPoolExecutor(THREADS) as pool:
+            groups = ((group, self._next_spaces()) for group in _groups(chunks))
+            begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
+            for group, spaces, pending in ahead(begun, BLOCKS_AHEAD):
+                self._at = group[-1].at
+                yield from self._sound(group, spaces, pending.result)
+
+    def _sound(
+        self, group: Sequence[Chunk], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
+    ) -> Iterator[Block]:
+        """Yield the block that is made of some chunks; where anything is damaged, one for each, or what is sound."""
+        try:
+            block, inflation = made()
+        except (DecompressionError, MemoryError) as err:
+            for chunk in group:
+                if len(group) == 1 or isinstance(err, _PartError):
+                    yield from self._read_chunk(chunk, spaces)
+                else:
+                    yield from self._sound([chunk], spaces, partial(self._joined, [chunk], spaces))
+        else:
+            self._inflation.left += inflation.left
+            yield with_possible_times(block, self.problems)
+
+    def _joined(self, group: Sequence[Chunk], spaces: Spaces) -> tuple[Block, Inflation]:
+        """Return the messages of some chunks, and how much less than allowed these inflate.
+
+        Raises
+        ------
+        DecompressionError
+            Something is damaged, or not as the index states.
+        """
+        size = sum(chunk.wanted_bytes for chunk in group)
+        if size > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {size} bytes")
+        inflation = Inflation(0)
+        joined = spaces.joined.of(size + 1)
+        most = _most_rows(size)
+        messages, others = spaces.rows.of(32 * most).view(np.int64).reshape(4, most), np.empty((4, 0), np.int64)
+        data, count, stop = joined[:0], 0, 0
+        for chunk in group:
+            begin = stop
+            data = joined[: begin + self._unpack(chunk, spaces, joined[begin:], inflation)]
+            data.flags.writeable = False
+            count, _, stop = self._scan(data, begin, messages, others, count)
+            if stop < len(data):
+                raise DecompressionError if chunk.ranges is None else _PartError
+        return Block(data, *messages[:, :count]), inflation
+
+    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
+        """Decompress the wanted records of a chunk, and return how many bytes they have.
+
+        Raises
+        ------
+        DecompressionError
+            As `decompress`, or they have more than the index states.
+        """
+        packed = self._packed(chunk, spaces.packed)
+        inflation.count(len(packed.data), packed.claimed)
+        if packed.claimed >= len(target):
+            raise DecompressionError("larger than the index states")
+        data = decompress(packed, target)
+        if not np.may_share_memory(data, target):
+            target[: len(data)] = data
+        return len(data)
+
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
+        """Return a chunk of the index with what reading its wanted records needs."""
+        return chunk
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels."""
@@ -118,9 +229,12 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        for spaces in self._spaces:
-            for space in spaces:
-                space.free()
+        self._spaces = deque(Spaces(Space(), Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
+
+    def _next_spaces(self) -> Spaces:
+        """Return the memory of the block that was used first."""
+        self._spaces.rotate(1)
+        return self._spaces[0]
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -137,52 +251,79 @@ class ChunkedFile(ABC):
 
     def _bytes(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
-        self._stream.seek(at)
-        return self._stream.read(count)
+        with self._lock:
+            self._stream.seek(at)
+            return self._stream.read(count)
 
-    def _read(self, at: int, length: int) -> Bytes:
-        """Return bytes of the file, as many as there are, in the space for chunks as they are there."""
-        space = self._spaces[0].packed.of(max(min(length, self._size - at), 0))
-        self._at = min(at, self._size)
-        self._stream.seek(self._at)
-        found = space[: self._stream.readinto(space.data)]
-        found.flags.writeable = False  # as what is decompressed: the kernels are compiled once
-        return found
+    def _content(self, at: int, length: int, space: Space) -> Bytes:
+        """Return bytes of a chunk, as many as there are.
 
-    def _chunk(
-        self, at: int, length: int, place: int, unpack: Callable[[Bytes], Bytes], *, learn: bool, cut: bool
-    ) -> Iterator[Block]:
-        """Yield the messages of a chunk.
-
-        Parameters
-        ----------
-        at, length : of its content in the file
-        place : byte of the file at which its record begins
-        unpack : returns the records in its content
-        cut : the content is cut off
+        Raises
+        ------
+        DecompressionError
+            They are more than a chunk may have.
         """
+        if length > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {length} bytes")
+        content = space.of(max(min(length, self._size - at), 0))
+        with self._lock:
+            self._stream.seek(min(at, self._size))
+            return content[: self._stream.readinto(content.data)]
+
+    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        """Yield the messages of a chunk; `cut`: it is cut off."""
+        place = chunk.at - self._chunk_head
+        self._at = min(chunk.at, self._size)
         try:
-            if length > LARGEST_CHUNK_BYTES:
-                raise DecompressionError(f"it claims {length} bytes")
-            data = unpack(self._read(at, length))
-        except DecompressionError as err:
+            packed = self._packed(chunk, spaces.packed, cut=cut)
+            self._inflation.count(len(packed.data), packed.claimed)
+            data = decompress(packed, spaces.records.of(packed.claimed + 1))
+        except (DecompressionError, MemoryError) as err:
             if not cut:
-                self.problems.add(f"chunk at byte {place} left out: {err.args[0]}")
+                self.problems.add(f"chunk at byte {place} left out: {err}")
             return
         stop, begin = 0, -1
         while begin < stop < len(data):
             begin = stop
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
-        self._spaces.rotate(1)
         if stop < len(data) and not cut:
             self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        most = min((len(data) - begin) // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+        most = _most_rows(len(data) - begin)
         messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
-        count, other, stop = self._scan(data, begin, messages, others)
+        count, other, stop = self._scan(data, begin, messages, others, 0)
         for row in others[:, :other].T:
             self._learn(row, data)
         return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop
+
+
+def _most_rows(size: int) -> int:
+    """Return how many messages a scan of so many bytes finds at most."""
+    return min(size // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+
+
+def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:
+    """Yield the chunks in groups of up to `JOINED_BYTES` of wanted records, or of one chunk."""
+    group: list[Chunk] = []
+    size = 0
+    for chunk in chunks:
+        size += chunk.wanted_bytes
+        if group and size > JOINED_BYTES:
+            yield group
+            group, size = [], chunk.wanted_bytes
+        group.append(chunk)
+    if group:
+        yield group
+
+
+def ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
+    """Yield items, each once `count` more of them have been made."""
+    made: deque[Item] = deque()
+    for item in items:
+        made.append(item)
+        if len(made) > count:
+            yield made.popleft()
+    yield from made

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import bz2
+import zlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,13 +13,16 @@ from icrtool.kernels.arrays import Bytes
 from icrtool.logs.containers.channel import Block
 
 LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
-"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; three are in memory at a time."""
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are in memory at a time."""
 
 LARGEST_RATIO = 100
 """A log may take this many times its size when decompressed, and `FREE_BYTES` more.
 
 Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
 """
+
+STORED = ("", "none")
+"""What logs call no compression."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE_BYTES = 1 << 24
@@ -35,65 +39,87 @@ class Space:
     def __init__(self) -> None:
         self._bytes: Bytes = np.empty(0, np.uint8)
 
-    def of(self, size: int, kept: int = 0) -> Bytes:
-        """Return `size` bytes (size,), the same ones as before as far as they reach; the first `kept` ones stay."""
+    def of(self, size: int) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before where there are as many."""
         if len(self._bytes) < size:
-            before, self._bytes = self._bytes, np.empty(max(size, 2 * kept), np.uint8)
-            self._bytes[:kept] = before[:kept]
+            self._bytes = np.empty(size, np.uint8)
         return self._bytes[:size]
 
-    def free(self) -> None:
-        """Give the memory back."""
-        self._bytes = np.empty(0, np.uint8)
+
+class Packed(NamedTuple):
+    """What is compressed in a chunk.
+
+    Attributes
+    ----------
+    compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
+    size : decompressed size stated in the log [bytes]
+    partial : the data is cut off, or `size` is only a part of it: what can be decompressed is wanted
+    checksum : CRC-32 of the decompressed bytes, 0 where that is not checked
+    """
+
+    data: Bytes
+    compression: str
+    size: int
+    partial: bool = False
+    checksum: int = 0
+
+    @property
+    def claimed(self) -> int:
+        """The bytes that it takes when decompressed, as stated."""
+        return len(self.data) if self.compression in STORED else self.size
+
+
+def decompress(packed: Packed, space: Bytes) -> Bytes:
+    """Decompress a chunk.
+
+    Parameters
+    ----------
+    space : for what is decompressed; one byte more than that
+
+    Returns
+    -------
+    uint8, not to be written to; in `space`, in the chunk's data, or in memory of its own.
+
+    Raises
+    ------
+    DecompressionError
+        Damaged data, a size or checksum other than stated, or an unknown compression.
+    """
+    data, compression, size, partial, checksum = packed
+    try:
+        match compression:
+            case "" | "none":
+                out = data
+            case "zstd":
+                out = _zstd(data, space[:size] if partial else space[: size + 1])
+            case "lz4":
+                import lz4.frame
+
+                out = _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
+            case "bz2":
+                out = _in_pieces(bz2.BZ2Decompressor(), data, size)
+            case _:
+                raise DecompressionError(f"compression {compression!r} is not known")
+    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
+        raise DecompressionError(str(err) or "not enough memory") from err
+    if len(out) != packed.claimed and not partial:
+        raise DecompressionError(f"{len(out)} bytes instead of {size}")
+    if checksum and zlib.crc32(out.data) != checksum:
+        raise DecompressionError("its checksum is wrong")
+    out.flags.writeable = False  # as that of a database: the kernels are compiled once
+    return out
 
 
 class Inflation:
-    """Decompresses the chunks of a log, and limits them all to a multiple of their size in the file."""
+    """Limits what the chunks of a log are decompressed to, to a multiple of their size in the file.
 
-    def __init__(self) -> None:
-        self._left = FREE_BYTES
+    Attributes
+    ----------
+    left : bytes that the next ones may take in addition
+    """
 
-    def decompress(self, data: Bytes, compression: str, size: int, space: Space, *, partial: bool = False) -> Bytes:
-        """Decompress a chunk.
-
-        Parameters
-        ----------
-        compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-        size : decompressed size stated in the log [bytes]
-        space : for what is decompressed
-        partial : the data is cut off, or `size` is only a part of it; return what can be decompressed
-
-        Returns
-        -------
-        uint8, not to be written to; in `space`, in `data`, or in memory of its own.
-
-        Raises
-        ------
-        DecompressionError
-            Damaged data, a size other than `size`, an unknown compression, or more than the log may take.
-        """
-        stored = compression in ("", "none")
-        self.count(len(data), len(data) if stored else size)
-        try:
-            match compression:
-                case "" | "none":
-                    out = data.view()
-                case "zstd":
-                    out = _zstd(data, size, space, partial=partial)
-                case "lz4":
-                    import lz4.frame
-
-                    out = _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
-                case "bz2":
-                    out = _in_pieces(bz2.BZ2Decompressor(), data, size)
-                case _:
-                    raise DecompressionError(f"compression {compression!r} is not known")
-        except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as err:
-            raise DecompressionError(str(err) or "not enough memory") from err
-        if len(out) != size and not partial and not stored:
-            raise DecompressionError(f"{len(out)} bytes instead of {size}")
-        out.flags.writeable = False  # as that of a database: the kernels are compiled once
-        return out
+    def __init__(self, left: int = FREE_BYTES) -> None:
+        self.left = left
 
     def count(self, packed: int, unpacked: int) -> None:
         """Count what is decompressed [bytes].
@@ -105,22 +131,21 @@ class Inflation:
         """
         if unpacked > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {unpacked} bytes")
-        left = self._left + LARGEST_RATIO * packed - unpacked
+        left = self.left + LARGEST_RATIO * packed - unpacked
         if left < 0:
             raise DecompressionError(
                 f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
             )
-        self._left = left
+        self.left = left
 
 
-def _zstd(data: Bytes, size: int, space: Space, *, partial: bool) -> Bytes:
+def _zstd(data: Bytes, space: Bytes) -> Bytes:
     import zstandard
 
-    out = space.of(size + 1)
     try:
         # Where the space holds all of a frame, zstd decompresses straight into it.
         with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data.data) as reader:
-            return out[: reader.readinto(out if not partial else out[:size])]
+            return space[: reader.readinto(space)]
     except zstandard.ZstdError as err:
         raise DecompressionError(str(err)) from err
 

@@ -11,10 +11,19 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.kernels.arrays import Bools, Bytes, Ints
+from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, unpack_messages
+from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile, Spaces
+from icrtool.logs.containers.decompress import (
+    LARGEST_CHUNK_BYTES,
+    STORED,
+    DecompressionError,
+    Inflation,
+    Packed,
+    Space,
+    decompress,
+    unpack_messages,
+)
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -39,9 +48,6 @@ SMALL_PART = 0.5
 Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
 """
 
-JOINED_BYTES = 1 << 20
-"""Such parts are handed on together once they have so many bytes: each block has a cost of its own."""
-
 
 class McapFile(ChunkedFile):
     """One MCAP file.
@@ -55,6 +61,8 @@ class McapFile(ChunkedFile):
     LogError
         Not an MCAP file.
     """
+
+    _chunk_head = _HEAD_BYTES
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
         super().__init__(path)
@@ -80,74 +88,49 @@ class McapFile(ChunkedFile):
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
-    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:
-        flags = np.isin(np.arange(1 << 16), list(wanted))
-        group: list[Chunk] = []
-        held = 0
-        for chunk in chunks:
-            is_small = chunk.channels is not None and not chunk.channels <= wanted
-            if added := self._join_wanted(chunk, flags, held) if is_small else 0:
-                group.append(chunk)
-                held += added
-            if not added or held > JOINED_BYTES:
-                yield from self._read_group(group, held)
-                group, held = [], 0
-            if not added:
-                yield from self._read_chunk(chunk)
-        yield from self._read_group(group, held)
+    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
+        """Decompress the wanted records of a chunk.
 
-    def _join_wanted(self, chunk: Chunk, flags: Bools, held: int) -> int:
-        """Add a chunk's wanted records, by its index, to the joined ones; return how many bytes they have.
-
-        They are not added where most of the chunk is wanted, or the index cannot be right. What is compressed is read
-        up to the last of them, what is not from the first to the last.
-
-        Parameters
-        ----------
-        flags : (65536,) whether a channel is wanted
-        held : bytes of the joined records
+        What is compressed is read up to the last of them, what is not from the first to the last.
         """
-        from icrtool.logs.containers.record_table import copy_ranges, read_message_index, wanted_ranges
+        if chunk.ranges is None:
+            return super()._unpack(chunk, spaces, target, inflation)
+        from icrtool.logs.containers.record_table import copy_ranges
 
-        if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
-            return 0
+        first, needed = int(chunk.ranges[0, 0]), int(chunk.ranges[1, -1])
+        if chunk.compression in STORED and chunk.size <= chunk.length:
+            at = chunk.at + chunk.length - chunk.size + first
+            packed = Packed(self._content(at, needed - first, spaces.packed), "", needed - first)
+        else:
+            # A whole frame is decompressed in one step.
+            first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
+            packed = self._packed(chunk, spaces.packed, needed=needed)
+        inflation.count(len(packed.data), packed.claimed)
+        data = decompress(packed, spaces.records.of(packed.claimed + 1))
+        if len(data) < needed - first:
+            raise DecompressionError("smaller than the index states")
+        copy_ranges(data, first, chunk.ranges, target)
+        return chunk.wanted_bytes
+
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
+        """Return a chunk with the ranges of its wanted records by its message index.
+
+        It has none where most of the chunk is wanted, or the index cannot be right.
+        """
+        from icrtool.logs.containers.record_table import read_message_index, wanted_ranges
+
+        is_whole = chunk.channels is None or chunk.channels <= wanted
+        if is_whole or max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
+            return chunk
+        flags = np.zeros(1 << 16, np.bool_)
+        flags[list(wanted)] = True
         index = np.frombuffer(self._bytes(chunk.at + chunk.length, chunk.index_length), np.uint8)
         places = np.empty(len(index) // 16, np.int64)
         count, wanted_count = read_message_index(index, flags, places)
         places[:count].sort()
         ranges = np.empty((2, wanted_count), np.int64)
         count, size = wanted_ranges(places[:count], chunk.size, ranges)
-        if not 0 < size < SMALL_PART * chunk.size:
-            return 0
-        first, needed = int(ranges[0, 0]) if chunk.stored else 0, int(ranges[1, count - 1])
-        try:
-            if chunk.stored:
-                records = self._read(chunk.at + chunk.length - chunk.size + first, needed - first)
-            else:
-                # A whole frame is decompressed in one step.
-                needed = chunk.size if 2 * needed > chunk.size else needed
-                content = self._read(chunk.at, min(needed + _LARGEST_BLOCK_BYTES, chunk.length))
-                records = self._chunk_records(content, cut=True, needed=needed)
-        except DecompressionError:
-            return 0
-        if len(records) < needed - first:
-            return 0
-        copy_ranges(records, first, ranges, count, self._spaces[0].joined.of(held + size, held), held)
-        return size
-
-    def _read_group(self, chunks: list[Chunk], size: int) -> Iterator[Block]:
-        """Yield the messages of the joined records of some chunks; of the whole chunks where those are damaged."""
-        if not chunks:
-            return
-        records = self._spaces[0].joined.of(size)
-        records.flags.writeable = False
-        block, stop = self._scanned(records)
-        if stop == size:
-            yield block
-            self._spaces.rotate(1)
-        else:
-            for chunk in chunks:
-                yield from self._read_chunk(chunk)
+        return chunk._replace(ranges=ranges[:, :count].copy()) if 0 < size < SMALL_PART * chunk.size else chunk
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -273,7 +256,7 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, left))
-                yield from self._read_chunk(chunk, learn=learn, cut=length > left)
+                yield from self._read_chunk(chunk, self._next_spaces(), learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
                 if block is not None:
@@ -295,20 +278,17 @@ class McapFile(ChunkedFile):
         self.problems.add(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _read_chunk(self, chunk: Chunk, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        def unpack(content: Bytes) -> Bytes:
-            return self._chunk_records(content, cut=cut)
-
-        return self._chunk(chunk.at, chunk.length, chunk.at - _HEAD_BYTES, unpack, learn=learn, cut=cut)
-
-    def _chunk_records(self, content: Bytes, *, cut: bool, needed: int = LARGEST_CHUNK_BYTES) -> Bytes:
-        """Return the records of a chunk record's content, decompressed and checked against its checksum.
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
+        """Read a chunk from the file.
 
         Parameters
         ----------
-        cut : the content is cut off; what can be decompressed is not checked
-        needed : so many bytes of a content that is cut off are enough
+        space : for the chunk as it is in the file
+        cut : it is cut off; what can be decompressed is not checked
+        needed : where not 0, so many bytes of its records are enough, and are not checked
         """
+        length = min(chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else chunk.length
+        content = self._content(chunk.at, length, space)
         if len(content) < 40:
             raise DecompressionError("its header is cut off")
         size = int.from_bytes(content[16:24], "little")
@@ -317,20 +297,18 @@ class McapFile(ChunkedFile):
         compression = bytes(content[32 : min(name_end, 32 + 64)]).decode("ascii", "replace")
         if name_end + 8 > len(content):
             raise DecompressionError("its header is damaged")
-        length = int.from_bytes(content[name_end : name_end + 8], "little")
-        packed = content[name_end + 8 : name_end + 8 + length]
-        if len(packed) < length and not cut:
+        packed = int.from_bytes(content[name_end : name_end + 8], "little")
+        data = content[name_end + 8 : name_end + 8 + packed]
+        if cut or needed:
+            return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
+        if len(data) < packed:
             raise DecompressionError("its header is damaged")
-        space = self._spaces[0].records
-        data = self._inflation.decompress(packed, compression, min(size, needed) if cut else size, space, partial=cut)
-        if checksum and not cut and zlib.crc32(data.data) != checksum:
-            raise DecompressionError("its checksum is wrong")
-        return data
+        return Packed(data, compression, size, checksum=checksum)
 
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_mcap
 
-        return scan_mcap(data, begin, messages, others)
+        return scan_mcap(data, begin, messages, others, filled)
 
     def _learn(self, row: Ints, data: Bytes) -> None:
         from mcap.records import Channel as McapChannel
@@ -360,8 +338,8 @@ def _chunk_of_index(content: bytes) -> Chunk | None:
     except struct.error:
         return None
     at, length = start + _HEAD_BYTES, length - _HEAD_BYTES
-    is_stored = content[48 + map_bytes : name_end] in (b"", b"none") and size <= length
-    return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, is_stored)
+    compression = content[48 + map_bytes : name_end].decode("ascii", "replace")
+    return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, compression)
 
 
 def _parse(opcode: int, content: bytes) -> _Parsed | None:

@@ -29,13 +29,13 @@ def little_endian(data: Bytes, at: int, size: int) -> int:
 
 
 @njit
-def scan_mcap(data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+def scan_mcap(data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
     """Find schema, channel and message records.
 
     Parameters
     ----------
     data : chunk or piece of a file; scanning starts at `begin`
-    messages : (4, capacity), filled with channel id, log time [ns], start and end of content
+    messages : (4, capacity), filled with channel id, log time [ns], start and end of content, from column `filled` on
     others : (4, capacity), filled for other records with opcode, an unused number, start and end of content; where it
         has no columns they are passed over
 
@@ -45,7 +45,7 @@ def scan_mcap(data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[in
     stop : the first byte not consumed: an incomplete record, another kind of record, or the end; or one of the tables
         is full
     """
-    at, count, other, size = begin, 0, 0, len(data)
+    at, count, other, size = begin, filled, 0, len(data)
     while at + 9 <= size and count < messages.shape[1]:
         opcode, length, content = data[at], little_endian(data, at + 1, _EIGHT), at + 9
         if length < 0 or length > size - content or opcode < MCAP_SCHEMA or opcode > MCAP_MESSAGE:
@@ -67,13 +67,13 @@ def scan_mcap(data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[in
 
 
 @njit
-def scan_bag(data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+def scan_bag(data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
     """Find message and connection records of a ROS 1 bag chunk.
 
     Parameters and returns as `scan_mcap`; for a connection the range is that of its data (the header its publisher
     sent), its number is the connection, and in place of the opcode is the position of the record's own header.
     """
-    at, count, other, size = begin, 0, 0, len(data)
+    at, count, other, size = begin, filled, 0, len(data)
     while at + 4 <= size and count < messages.shape[1]:
         header_length = little_endian(data, at, _FOUR)
         header = at + 4
@@ -173,10 +173,11 @@ def wanted_ranges(places: Ints, size: int, ranges: Ints) -> tuple[int, int]:
 
 
 @njit
-def copy_ranges(source: Bytes, first: int, ranges: Ints, count: int, target: Bytes, at: int) -> None:
-    """Copy some ranges to the target, one behind the other from `at` on; `first` is the place of the source's begin."""
-    for k in range(count):
+def copy_ranges(source: Bytes, first: int, ranges: Ints, target: Bytes) -> None:
+    """Copy ranges to the target, one behind the other; `first` is the place of the source's begin."""
+    at = np.uint64(0)
+    for k in range(ranges.shape[1]):
         begin, size = np.uint64(ranges[0, k] - first), np.uint64(ranges[1, k] - ranges[0, k])
         for i in range(size):  # an assignment of slices takes seconds to compile
-            target[np.uint64(at) + i] = source[begin + i]
-        at += int(size)
+            target[at + np.uint64(i)] = source[begin + np.uint64(i)]
+        at += size

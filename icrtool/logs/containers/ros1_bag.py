@@ -12,7 +12,8 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile
+from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile, Spaces
+from icrtool.logs.containers.decompress import DecompressionError, Packed, Space
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -68,13 +69,9 @@ class Ros1Bag(ChunkedFile):
             raise
         self.channels = list(self._connections.values())
 
-    def _indexed(self, chunks: list[Chunk], wanted: frozenset[int]) -> Iterator[Block]:  # noqa: ARG002 - whole chunks
-        for chunk in chunks:
-            record = self._record(chunk.at)
-            if record is None or record.op != _CHUNK:
-                self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
-                continue
-            yield from self._read_chunk(record)
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
+        record = self._record(chunk.at)
+        return _chunk_of(record) if record is not None and record.op == _CHUNK else chunk._replace(size=-1)
 
     def _check_start(self) -> None:
         start = self._stream.read(len(MAGIC))
@@ -92,9 +89,9 @@ class Ros1Bag(ChunkedFile):
         header_length = int.from_bytes(self._bytes(at, 4), "little")
         if header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
             return None
-        fields = _header_fields(self._stream.read(header_length))
-        length = int.from_bytes(self._stream.read(4), "little")
-        return _Record(fields, at + header_length + 8, length)
+        header = self._bytes(at + 4, header_length + 4)
+        length = int.from_bytes(header[header_length:], "little")
+        return _Record(_header_fields(header[:header_length]), at + header_length + 8, length)
 
     def _read_index(self) -> list[Chunk] | None:
         """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
@@ -138,7 +135,7 @@ class Ros1Bag(ChunkedFile):
                 break
             cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(record, learn=learn, cut=cut)
+                yield from self._read_chunk(_chunk_of(record), self._next_spaces(), learn=learn, cut=cut)
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
@@ -148,17 +145,21 @@ class Ros1Bag(ChunkedFile):
         if at < self._size:
             self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_chunk(self, record: _Record, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        def unpack(content: Bytes) -> Bytes:
-            size, compression = record.number(b"size"), record.text(b"compression")
-            return self._inflation.decompress(content, compression, size, self._spaces[0].records, partial=cut)
+    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        if chunk.size < 0:
+            self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
+        else:
+            yield from super()._read_chunk(chunk, spaces, learn=learn, cut=cut)
 
-        return self._chunk(record.at, record.length, record.at, unpack, learn=learn, cut=cut)
+    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
+        if chunk.size < 0:
+            raise DecompressionError("no chunk")
+        return Packed(self._content(chunk.at, chunk.length, space), chunk.compression, chunk.size, partial=cut)
 
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints) -> tuple[int, int, int]:
+    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
         from icrtool.logs.containers.record_table import scan_bag
 
-        return scan_bag(data, begin, messages, others)
+        return scan_bag(data, begin, messages, others, filled)
 
     def _learn(self, row: Ints, data: Bytes) -> None:
         header, number, start, end = row.tolist()
@@ -177,6 +178,10 @@ class Ros1Bag(ChunkedFile):
             encoding=LogText("ros1"),
             definition=fields.get(b"message_definition", ""),
         )
+
+
+def _chunk_of(record: _Record) -> Chunk:
+    return Chunk(record.at, record.length, size=record.number(b"size"), compression=record.text(b"compression"))
 
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:

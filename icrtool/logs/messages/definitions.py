@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from functools import cache, lru_cache
 from importlib import resources
+from itertools import islice
 from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Channel
-from icrtool.logs.messages.schema import BASE, NAME, Definitions
+from icrtool.logs.messages.schema import BASE, NAME, SIZES, Definitions
 from icrtool.records.text import LONGEST_NAME, shortened
 
 _SEPARATOR = "=" * 80 + "\n"
@@ -17,6 +19,9 @@ LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
 """Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
 LONGEST_IDL, MOST_NUMBERS = 1 << 16, 512
 """Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
+
+MOST_NESTED = 3
+"""Messages within one another in which a field of an unknown type is looked for."""
 
 _COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
@@ -50,6 +55,23 @@ def definitions_of(channel: Channel) -> Definitions:
     if name in standard_definitions():
         return standard_definitions()
     raise DefinitionError(channel.message_type, "its definition is not in the log and not bundled")
+
+
+def number_fields(channel: Channel) -> list[str]:
+    """Return the paths of the plain numbers in a channel's messages; empty where its type is not known."""
+    try:
+        definitions = definitions_of(channel)
+    except DefinitionError:
+        return []
+    return list(islice(_numbers_in(definitions, full_name(channel.message_type), "", 0), MOST_NUMBERS))
+
+
+def _numbers_in(definitions: Definitions, name: str, prefix: str, depth: int) -> Iterator[str]:
+    for field, (node, detail) in definitions[name][1] if name in definitions else ():
+        if int(node) == BASE and detail[0] in SIZES:
+            yield f"{prefix}{field}"
+        elif int(node) == NAME and depth < MOST_NESTED:
+            yield from _numbers_in(definitions, detail, f"{prefix}{field}.", depth + 1)
 
 
 def _is_complete(types: Definitions) -> bool:

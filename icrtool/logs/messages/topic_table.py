@@ -17,6 +17,9 @@ from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
+READ_ENCODINGS = ("cdr", "ros1")
+"""Serializations of messages that are read: of ROS 2 and of ROS 1."""
+
 _FIRST_CAPACITY = 8
 _LARGEST_CAPACITY = 256
 
@@ -54,6 +57,9 @@ HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
 
 NEAR_NS = 2_000_000_000
 """Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
+
+OUT_OF_ORDER_NS = 200_000_000
+"""Messages of one topic are rarely stored further out of order than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +165,7 @@ class TopicCollector:
     def _compile(self) -> None:
         definitions = self.definitions if self.definitions is not None else definitions_of(self.channel)
         encoding = self.channel.encoding
-        if encoding not in ("cdr", "ros1"):
+        if encoding not in READ_ENCODINGS:
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
         layout = compile_layout(
             definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity
@@ -282,9 +288,10 @@ def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
     if not (steps < 0).any():
         return NOT_SET_BACK, None
     order = np.argsort(times, kind="stable")
-    stretch = np.concatenate([[0], np.cumsum(steps < -NEAR_NS)])
+    step_ns = int(-steps.min())
+    stretch = np.concatenate([[0], np.cumsum(steps < -(NEAR_NS if step_ns > NEAR_NS else OUT_OF_ORDER_NS))])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
-    return SetBack(int(-steps.min()), float(pieces / (stretch[-1] + 1))), order
+    return SetBack(step_ns, float(pieces / (stretch[-1] + 1))), order
 
 
 def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:

@@ -239,6 +239,7 @@ HEADING_TYPES: dict[str, Entry] = {
     "sensor_msgs/Imu": _orientation(
         "orientation", "orientation_covariance", 8, 100.0, "orientation of the inertial unit", rate="angular_velocity.z"
     ),
+    "geographic_msgs/GeoPoseStamped": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
     "geometry_msgs/PoseStamped": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
     "geometry_msgs/PoseWithCovarianceStamped": _orientation(
         "pose.pose.orientation", "pose.covariance", 35, 50.0, "orientation of the pose"

@@ -18,16 +18,17 @@ from icrtool.logs.streams.fix_class import (
     class_by_status,
     class_by_type,
 )
-from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
+from icrtool.logs.streams.source import NEVER_MOVES, NO_ROWS, Source, of_topic
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
     r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
     re.IGNORECASE,
 )
-"""Names of odometry and pose topics that are a reference, not the robot's own dead reckoning."""
+"""In names of odometry and pose topics, or of their frames: a reference, not the robot's own dead reckoning."""
 
-REFERENCE_FRAMES = {"map", "world", "utm", "earth", "ecef", "gps", "local_enu", "enu", "mocap", "vicon"}
+REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
+"""Names of frames that are no such words; FAST-LIO and LOAM call their map ``camera_init``."""
 
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
 
@@ -55,6 +56,15 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 
 LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
 """A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
+
+LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
+"""Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
+
+FARTHEST_M = 200_000.0
+"""No robot drives further from the middle of its fixes."""
+
+STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
+"""A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
 
 GOOD_STD_M = 0.3
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
@@ -106,6 +116,7 @@ def _geodetic(
         ("not finite", ~np.isfinite(latitude) | ~np.isfinite(longitude)),
         ("not a place on earth", ~possible),
         ("at 0, 0", (latitude == 0) & (longitude == 0)),
+        ("far from the others", _far_away(geodetic, possible & ~no_fix & np.isfinite(geodetic[:, :2]).all(axis=1))),
     )
     for reason, bad in reasons:
         count = int(np.count_nonzero(bad & usable))
@@ -121,6 +132,7 @@ def _geodetic(
     )
     if std > GOOD_STD_M:
         score -= 35.0
+    what, score = (f"{what} that never moves", score - NEVER_MOVES) if _is_still(geodetic[usable]) else (what, score)
     stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
     problem = (
         "" if usable.any() else f"no usable fix ({', '.join(f'{why} {count}' for why, count in rejected.items())})"
@@ -130,6 +142,25 @@ def _geodetic(
         rejected=rejected, score=score, why=f"{what}{stated}", problem=problem,
         stated_class=stated_class,
     )  # fmt: skip
+
+
+def _far_away(geodetic: Floats, known: Bools) -> Bools:
+    """Return the fixes (n,) of another place: a receiver that was switched on may send where it was last."""
+    if not known.any():
+        return known
+    away_deg = geodetic[:, :2] - geodetic[np.argmax(known), :2]
+    away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
+    away_deg -= np.median(away_deg[known], axis=0)
+    away_deg[:, 1] *= math.cos(math.radians(float(np.median(geodetic[known, 0]))))
+    return np.asarray((np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1))
+
+
+def _is_still(geodetic: Floats) -> bool:
+    """Return whether 95 % of the fixes (n, 3) lie within `STILL_M`, whatever the latitude."""
+    if len(geodetic) < 2:
+        return False
+    ends = np.percentile(geodetic[:, :2], [2.5, 97.5], axis=0)
+    return bool((np.diff(ends, axis=0) * METRES_PER_DEGREE < (STILL_M, STILL_M)).all())
 
 
 def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
@@ -153,6 +184,12 @@ def _without_fix(table: TopicTable) -> Bools:
     """
     status = table.floats("status.status")
     return np.zeros(len(table), np.bool_) if np.all(status == STATUS_UNKNOWN) else np.asarray(status < 0)
+
+
+def _geopose(table: TopicTable) -> PositionSource:
+    geodetic = _place(table, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude")))
+    unknown = np.full((len(table), 3), np.nan)
+    return _geodetic(table, geodetic, unknown, _nowhere(table), 80.0, "position of an autopilot or navigation filter")
 
 
 def _navsatfix(table: TopicTable) -> PositionSource:
@@ -264,17 +301,21 @@ def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bo
             positive = (var_x > 0) & (var_y > 0)
             variance[positive] = np.column_stack([var_y, var_x, cov])[positive]
         usable = np.isfinite(x) & np.isfinite(y)
-        named = (
-            bool(REFERENCE_WORDS.search(table.topic)) or table.text("header.frame_id").lstrip("/") in REFERENCE_FRAMES
-        )
+        frame = table.text("header.frame_id").lstrip("/")
+        named = bool(REFERENCE_WORDS.search(f"{table.topic} {frame}")) or frame in REFERENCE_FRAMES
         problem = "" if usable.any() else "no finite position"
-        if not _is_level(np.column_stack([x, y, table.floats(f"{pose}position.z")])[usable]):
+        places = np.column_stack([x, y, table.floats(f"{pose}position.z")])[usable]
+        if len(places) and LEAST_RADIUS_M < np.linalg.norm(np.median(places, axis=0)) < LARGEST_RADIUS_M:
+            problem = "its positions are counted from the centre of the earth (ECEF), which is not read"
+        elif not _is_level(places):
             problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
         if GOAL_WORDS.search(table.topic):
             problem = problem or "its name is that of a goal, not of a measurement"
         elif not named and (odometry or "odom" in table.topic.lower()):
             problem = (
-                problem or "its name and frame do not show a position reference: it may be the wheels' dead reckoning"
+                problem
+                or "its name and frame do not show a position reference: it may be the wheels' dead reckoning; "
+                "topics.gnss names it if it is a reference"
             )
         count = int(np.count_nonzero(~usable))
         return PositionSource(
@@ -300,6 +341,7 @@ def _is_level(places_m: Floats) -> bool:
 
 _COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))
 _FIX = (*HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
+_GEO = "pose.position."
 _WORD, _NUMBER = "position_type", "pos_type.type"
 _OEM7_BESTPOS = _novatel(
     ("lat", "lon", "hgt"), ("lat_stdev", "lon_stdev"), "sol_status.status", SOLVED_CODES, _NUMBER,
@@ -332,6 +374,9 @@ POSITION_TYPES: dict[str, Entry] = {
     "novatel_oem7_msgs/INSPVAX": _novatel(
         ("latitude", "longitude", "height"), ("latitude_stdev", "longitude_stdev"), "ins_status.status",
         INS_SOLVED_CODES, _NUMBER, "NovAtel INS position", 84.0,
+    ),
+    "geographic_msgs/GeoPoseStamped": (
+        (*HEADER, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude"))), _geopose
     ),
     "geometry_msgs/PoseStamped": _metric("pose.", "", 70.0, "metric pose"),
     "geometry_msgs/PoseWithCovarianceStamped": _metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),

@@ -10,14 +10,13 @@ from typing import Literal, TypeVar
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logs.containers.channel import Channel, some_of
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import READ_ENCODINGS, TopicTable
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
 from icrtool.logs.streams.joint_names import check_joints
 from icrtool.logs.streams.position_sources import POSITION_TYPES, PositionSource
 from icrtool.logs.streams.source import of_topic
-from icrtool.logs.streams.wheel_names import right_twin
-from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_motion
+from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
@@ -25,7 +24,8 @@ from icrtool.records.text import did_you_mean
 Kind = TypeVar("Kind", WheelMotion, PositionSource, HeadingSource)
 
 NEEDS: dict[Role, str] = {
-    "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist",
+    "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist; of messages of other types "
+    "topics.wheel_left and wheel_right name the fields (/topic.field)",
     "gnss": "a GNSS fix, or a pose of a reference (total station, lidar, motion capture)",
     "heading": "an orientation (AHRS), a compass or a dual antenna heading",
 }
@@ -76,7 +76,7 @@ class Choice:
 def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
     """Return, by channel id, the fields that some role may need; other channels are absent."""
     topics, wanted = config.topics, {}
-    pairs = _pairs(channels, topics)
+    sides = side_fields(channels, topics)
     for channel in channels:
         kind = channel.message_type
         paths: list[str] = []
@@ -88,25 +88,10 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
             paths += HEADING_TYPES[kind][0]
         if kind == GYRO_TYPE:
             paths += GYRO_FIELDS
-        if kind in PAIR_TYPES and channel.topic in pairs:
-            paths.append("data")
+        paths += sorted(sides.get(channel.id, ()))
         if paths:
             wanted[channel.id] = tuple(dict.fromkeys(paths))
     return wanted
-
-
-def _pairs(channels: Sequence[Channel], topics: TopicsConfig) -> set[str]:
-    """Return the topics that may be one side of a pair."""
-    if topics.wheels is not None:
-        return set()
-    if topics.wheel_left is not None and topics.wheel_right is not None:
-        return {topics.wheel_left, topics.wheel_right}
-    names = dict.fromkeys(channel.topic for channel in channels if channel.message_type in PAIR_TYPES)
-    found: set[str] = set()
-    for left in names:
-        right = right_twin(left, names)
-        found |= {left, right} if right is not None else set()
-    return found
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
@@ -158,21 +143,15 @@ def _read_all(
 
 def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
     topics = config.topics
-    by_topic: dict[str, TopicTable] = {table.topic: table for table in tables if table.message_type in PAIR_TYPES}
-    if topics.wheel_left is not None and topics.wheel_right is not None:
-        left, right = by_topic.get(topics.wheel_left), by_topic.get(topics.wheel_right)
-        return [pair_motion(left, right, config)] if left is not None and right is not None else []
+    pairs = pair_candidates(tables, config)
+    if topics.wheel_left is not None:
+        return pairs
 
     def bound(read: Callable[[TopicTable, Config], WheelMotion]) -> Callable[[TopicTable], WheelMotion]:
         return lambda table: read(table, config)
 
     readers = {name: (paths, bound(read)) for name, (paths, read) in WHEEL_TYPES.items()}
-    found = _read_all(tables, readers, topics.wheels, WheelMotion)
-    for name, left in by_topic.items() if topics.wheels is None else ():
-        right = by_topic.get(right_twin(name, by_topic) or "")
-        if right is not None and right.message_type == left.message_type:
-            found.append(pair_motion(left, right, config))
-    return found
+    return _read_all(tables, readers, topics.wheels, WheelMotion) + pairs
 
 
 def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:
@@ -290,11 +269,12 @@ def _pair_name(topics: TopicsConfig) -> str | None:
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured pair of wheel topics that the log does not have or that cannot be used."""
     for side in ("left", "right"):
-        topic = getattr(topics, f"wheel_{side}")
-        if topic is None:
+        name = getattr(topics, f"wheel_{side}")
+        if name is None:
             continue
-        key, needed = f"topics.wheel_{side}", f"a side's topic is one of {', '.join(sorted(PAIR_TYPES))}"
-        if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES:
+        topic = topic_of_side(name)
+        key, needed = f"topics.wheel_{side}", f"name the field of one side as {topic}.left or {topic}.data[0]"
+        if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES and topic == name:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
         if topic in found.unread:
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
@@ -352,7 +332,7 @@ def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
     problems: dict[str, dict[str, None]] = {}
     for role in roles:
         for source in found.by_role()[role]:
-            for topic in source.topic.split(" + "):
+            for topic in map(topic_of_side, source.topic.split(" + ")):
                 problems.setdefault(topic, {})[source.problem] = None
     return {topic: ", ".join(reasons) for topic, reasons in problems.items()}
 
@@ -362,6 +342,8 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
     entries: dict[str, str] = {}
     for channel in channels:
         reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
+        if not reason and channel.encoding not in READ_ENCODINGS:
+            reason = f": serialization {str(channel.encoding)!r} is not read"
         entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
     ordered = [*(entries[t] for t in entries if t in reasons), *(entries[t] for t in entries if t not in reasons)]
     more = len(ordered) - MOST_LISTED

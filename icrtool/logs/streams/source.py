@@ -11,6 +11,9 @@ from icrtool.kernels.arrays import Bools
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows
 
+NEVER_MOVES = 60.0
+"""Subtracted from the score of what never moves: another topic that moves is preferred."""
+
 NO_ROWS: Bools = np.zeros(0, np.bool_)
 
 

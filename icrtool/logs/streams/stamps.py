@@ -80,10 +80,16 @@ def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
     DataError
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
-    if rows.set_back.pieces > MOST_PIECES:
-        why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
+    again, far = rows.set_back.pieces > MOST_PIECES, rows.set_back.step_ns > NEAR_NS
+    why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
+    if again and far:
         raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
-    if rows.set_back.step_ns > NEAR_NS:
+    if again:
+        yield (
+            f"{name}: {why}: the clock was set while recording, and samples of that time are mixed, which makes errors "
+            "there too large; fit each part alone (--from, --to)"
+        )
+    elif far:
         yield (
             f"{name}: log time goes back by {rows.set_back.step_ns / 1e9:.0f} s; messages are sorted; if the clock was "
             "set while recording, fit each part alone (--from, --to)"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import lru_cache
 
-_WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
+WHEEL_WORDS = re.compile(r"wheel|track|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
 _OTHER_JOINTS = re.compile(
     r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
@@ -47,7 +47,7 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
 def _side_of_wheel(name: str) -> tuple[str, bool]:
     """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
     elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
-    return "" if elsewhere else side_of(name), bool(_WHEEL_WORDS.search(name))
+    return "" if elsewhere else side_of(name), bool(WHEEL_WORDS.search(name))
 
 
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:

@@ -1,101 +1,287 @@
-"""Wheels recorded as one topic per side: messages without header, paired by log time."""
+"""Wheels as one number of each side: two topics, two fields of messages of any type, or the elements of an array."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.config import Config
+from icrtool.config import Config, TopicsConfig
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Floats
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.stamps import StampedRows
-from icrtool.logs.streams.wheel_sources import COMMAND_NOTE, COMMANDED, Unit, WheelMotion, motion_of
+from icrtool.kernels.arrays import Bools, Ints
+from icrtool.logs.containers.channel import Channel
+from icrtool.logs.messages.definitions import number_fields
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.streams.heading_sources import HEADING_TYPES
+from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.source import of_topic
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.wheel_names import WHEEL_WORDS, right_twin
+from icrtool.logs.streams.wheel_sources import (
+    COMMAND_NOTE,
+    COMMANDED,
+    MOST_WHEELS,
+    WHEEL_TYPES,
+    Unit,
+    WheelMotion,
+    motion_of,
+)
 from icrtool.records.text import LogText
 
-PAIR_TYPES = {f"std_msgs/{name}" for name in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt32")}
+_NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
+PAIR_TYPES = {f"std_msgs/{name}" for name in _NUMBERS}
 """Message types that hold one number of one side."""
+
+ARRAY_TYPES = {f"std_msgs/{name}MultiArray" for name in _NUMBERS}
+"""Message types that may hold the numbers of all wheels."""
 
 _SPEED_WORDS = re.compile(r"vel|speed|rate|rpm|twist", re.IGNORECASE)
 _PLACE_WORDS = re.compile(r"tick|count|enc|pos|angle|travel|dist|odo", re.IGNORECASE)
-_BITS = {"std_msgs/Int16": 16, "std_msgs/Int32": 32, "std_msgs/UInt32": 32, "std_msgs/Int64": 64}
+_OTHER_WORDS = re.compile(
+    r"current|volt|temp|power|torque|effort|force|pwm|duty|status|error|fault|limit|gain|stamp|time|range",
+    re.IGNORECASE,
+)
+"""Fields of a motor driver's messages that are no motion."""
+
+_SIDE_WORDS = re.compile("left|right", re.IGNORECASE)
+_DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE)
+"""Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
+_ELEMENTS = re.compile(r"\[([\d,]+)\]")
+_KNOWN = {*WHEEL_TYPES, *POSITION_TYPES, *HEADING_TYPES}
 _HOLD_NS = 500_000_000
 """A side that ends before the other is held for this long at most [s]."""
 
 
-def pair_motion(left: TopicTable, right: TopicTable, config: Config) -> WheelMotion:
-    """Return the wheel motion of a left and a right topic without headers, at the left one's stamps.
+@dataclass(frozen=True, slots=True)
+class Side:
+    """A number of one side in the messages of a topic.
 
-    Counters of the type's width are unwrapped. Positions are interpolated, speeds are held.
+    Attributes
+    ----------
+    path : its field, ``data``, ``left_ticks``, ``drivers[0].speed``; of elements ``data[0,2]`` the mean is taken
     """
-    kind = LogText(" + ".join(dict.fromkeys(LogText(side.message_type).raw for side in (left, right))))
-    topic = LogText(f"{LogText(left.topic).raw} + {LogText(right.topic).raw}")
-    commanded = bool(COMMANDED.search(left.topic))
-    score, why = 80.0 - (40.0 if commanded else 0.0), "a pair of topics" + (" (commanded)" if commanded else "")
+
+    table: TopicTable
+    path: str = "data"
+
+    @property
+    def name(self) -> LogText:
+        """The name as `topics.wheel_left` has it: the topic, and after a dot the field where it is not ``data``."""
+        return LogText(_name(LogText(self.table.topic).raw, self.path))
+
+    def values(self) -> NDArray[Any]:
+        """Return its numbers (n,) as recorded, counters unwrapped.
+
+        Raises
+        ------
+        DefinitionError
+            The messages have no such field or element.
+        """
+        values, elements = self.table.column(stored_path(self.path)), _ELEMENTS.search(self.path)
+        if elements is None:
+            return _unwrapped(values)
+        places = [int(place) for place in elements[1].split(",") if place]
+        if values.ndim != 2 or max(places) >= values.shape[1]:
+            raise DefinitionError(self.name, "its messages have no such element")
+        wheels: NDArray[Any] = np.array([_unwrapped(values[:, place]) for place in places])
+        return np.asarray(wheels[0] if len(places) == 1 else wheels.mean(axis=0))
+
+
+def stored_path(path: str) -> str:
+    """Return the column that holds a side's field: elements of an array are read together."""
+    return _ELEMENTS.sub("[*]", path, count=1)
+
+
+def topic_of_side(name: str) -> str:
+    """Return the topic in a side's name; names of topics hold no dot."""
+    return name.partition(".")[0]
+
+
+def _name(topic: str, path: str) -> str:
+    return topic if path == "data" else f"{topic}.{path}"
+
+
+def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, set[str]]:
+    """Return, by channel id, the fields that may be one side, or that hold all wheels."""
+    found: dict[int, set[str]] = {}
+    if topics.wheel_left is not None and topics.wheel_right is not None:
+        for topic, _, path in (topics.wheel_left.partition("."), topics.wheel_right.partition(".")):
+            for channel in channels:
+                if channel.topic == topic:
+                    found.setdefault(channel.id, set()).update({*HEADER, stored_path(path or "data")})
+        return found
+    names: dict[str, dict[str, list[tuple[int, str]]]] = {}
+    for channel in channels:
+        if topics.wheels in (None, channel.topic):
+            for path in _fields_of(channel):
+                names.setdefault(channel.message_type, {}).setdefault(_name(channel.topic, path), []).append(
+                    (channel.id, path)
+                )
+    for alike in names.values():
+        for left, places in alike.items():
+            right = right_twin(left, alike)
+            for number, path in [*places, *alike[right]] if right is not None else places if "[" in left else ():
+                found.setdefault(number, set()).update({*HEADER, path})
+    return found
+
+
+def _fields_of(channel: Channel) -> list[str]:
+    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names."""
+    if channel.message_type in PAIR_TYPES:
+        return ["data"]
+    if channel.message_type in ARRAY_TYPES:
+        return ["data[*]"] if _of_wheels(channel.topic) and not _OTHER_WORDS.search(channel.topic) else []
+    words = f"{channel.topic} {channel.message_type} {channel.definition}"
+    if not (_SIDE_WORDS.search(words) and _of_wheels(words)):
+        return []
+    return [path for path in number_fields(channel) if _may_be_side(channel.topic, channel.message_type, path)]
+
+
+def _may_be_side(topic: str, message_type: str, path: str) -> bool:
+    """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
+    if message_type in PAIR_TYPES:
+        return path == "data"
+    if message_type in _KNOWN or not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
+        return False
+    return any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS, _SIDE_WORDS))
+
+
+def _of_wheels(name: str) -> bool:
+    return bool(WHEEL_WORDS.search(name) or _DRIVER_WORDS.search(name))
+
+
+def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
+    """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
+    topics = config.topics
+    if topics.wheel_left is not None and topics.wheel_right is not None:
+        by_topic: dict[str, TopicTable] = {table.topic: table for table in tables}
+        named = (name.partition(".") for name in (topics.wheel_left, topics.wheel_right))
+        sides = [Side(by_topic[topic], path or "data") for topic, _, path in named if topic in by_topic]
+        return [pair_motion(sides[0], sides[1], config)] if len(sides) == 2 else []
+    found: dict[str, dict[str, Side]] = {}
+    for table in tables:
+        for path in table.columns if topics.wheels in (None, table.topic) else ():
+            if _may_be_side(table.topic, table.message_type, path):
+                side = Side(table, path)
+                found.setdefault(table.message_type, {})[side.name] = side
+    twins = (
+        (left, alike.get(right_twin(name, alike) or "")) for alike in found.values() for name, left in alike.items()
+    )
+    pairs = [pair_motion(left, right, config) for left, right in twins if right is not None]
+    return pairs + [
+        _array_motion(table, config) for table in tables if table.message_type in ARRAY_TYPES and len(table)
+    ]
+
+
+def _array_motion(table: TopicTable, config: Config) -> WheelMotion:
+    """Return the motion of wheels in an array; the side of the first one is taken as left.
+
+    What of a wheel's motion the mean of all does not have is the turning, which has opposite signs on the two sides.
+    """
+    values = table.column("data[*]")
+    wheels = np.array([_unwrapped(column) for column in values.T])
+    turning = wheels - wheels.mean(axis=0)
+    turning -= turning.mean(axis=1, keepdims=True)
+    alike = turning @ turning[0] > 0.0
+    if len(wheels) > 2 * MOST_WHEELS or not 0 < 2 * np.count_nonzero(alike) == len(wheels):
+        advice = f"name them in topics.wheel_left and wheel_right, as {_name(table.topic, 'data[0]')}"
+        return WheelMotion(**of_topic(table), problem=f"its numbers do not show two sides of as many wheels; {advice}")
+    left, right = (f"data[{','.join(map(str, np.flatnonzero(side)))}]" for side in (alike, ~alike))
+    return pair_motion(Side(table, left), Side(table, right), config)
+
+
+def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
+    """Return the wheel motion of two sides, at the left one's stamps.
+
+    Positions are interpolated, speeds are held.
+    """
+    kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
+    topic = LogText(f"{left.name.raw} + {right.name.raw}")
+    commanded = bool(COMMANDED.search(left.name))
+    score, why = 80.0 - (40.0 if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
     note = COMMAND_NOTE if commanded else ""
+    stamps, times, held = _common_stamps(left.table, right.table)
 
     def unusable(problem: str) -> WheelMotion:
-        stamps = StampedRows(None, left.log_time_ns, "no header", 0)
         return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=problem)
 
-    if not (len(left) and len(right)):
-        return unusable(f"{(right if len(left) else left).topic} holds no message")
+    if not (len(times) and len(held)):
+        return unusable(f"{(right if len(times) else left).table.topic} holds no message")
     try:
-        values = [_unwrapped(table.column("data"), _BITS.get(table.message_type)) for table in (left, right)]
+        values = left.values(), right.values()
     except DefinitionError as err:
         return unusable(err.why)
-    both = _while_both(left, right)
+    both = _while_both(times, held)
     if not both.any():
         return unusable("the two sides were not recorded at the same time")
-    moments = left.log_time_ns[both]
-    stamps = StampedRows(None, moments, "no header", 0, set_back=max(left.set_back, right.set_back))
-    integer = left.message_type in _BITS
-    if _is_position(left.topic, values[0], config, integer=integer):
+    moments, header = times[both], None if stamps.header_ns is None else stamps.header_ns[both]
+    stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
+    pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=why, note=note)
+    integer = values[0].dtype.kind == "i"
+    if _is_position(left, values[0], config, integer=integer):
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
-        other = np.interp(moments, right.log_time_ns, values[1])
-        why = f"{why}: {'ticks' if unit == 'counts' else 'angles or distances'}"
-        pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit=unit, score=score, why=why, note=note)
-        return motion_of(pair, (values[0][both], other))
-    place = np.clip(np.searchsorted(right.log_time_ns, moments + _half_interval(left), side="right") - 1, 0, None)
-    speed = (values[0][both], values[1][place])
-    pair = WheelMotion(
-        topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=f"{why}: speeds", note=note
-    )
-    return motion_of(pair, speed=speed)
+        what = "ticks" if unit == "counts" else "angles or distances"
+        pair = replace(pair, unit=unit, why=f"{why}: {what}")
+        return motion_of(pair, (values[0][both].astype(np.float64), np.interp(moments, held, values[1])))
+    place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
+    speeds = values[0][both].astype(np.float64), values[1][place].astype(np.float64)
+    return motion_of(replace(pair, why=f"{why}: speeds"), speed=speeds)
 
 
-def _half_interval(table: TopicTable) -> int:
+def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:
+    """Return the stamps of the left side, and the times of both sides: of headers where both have them, else logged."""
+    rows = stamp_rows(left), stamp_rows(right)
+    headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
+    stamps = replace(rows[0], set_back=max(one.set_back for one in rows))
+    if len(headers) == 2:
+        return stamps, headers[0], headers[1]
+    note = rows[0].note or rows[1].note or "the header stamps of a side go back"
+    return StampedRows(None, stamps.log_ns, note, 0, set_back=stamps.set_back), rows[0].log_ns, rows[1].log_ns
+
+
+def _half_interval(times: Ints) -> int:
     """Return half the median interval [ns]: messages of one control cycle are logged closer together than this."""
-    return int(np.median(np.diff(table.log_time_ns))) // 2 if len(table) > 1 else 0
+    return int(np.median(np.diff(times))) // 2 if len(times) > 1 else 0
 
 
-def _while_both(left: TopicTable, right: TopicTable) -> Bools:
+def _while_both(left: Ints, right: Ints) -> Bools:
     """Return the left rows (n,) recorded while the right side was, too: a side held for long would look like a turn."""
     slack = max(_half_interval(left), _half_interval(right))
-    first, last = right.log_time_ns[0] - slack, right.log_time_ns[-1] + max(slack, _HOLD_NS)
-    both: Bools = np.logical_and(left.log_time_ns >= first, left.log_time_ns <= last)
+    both: Bools = np.logical_and(left >= right[0] - slack, left <= right[-1] + max(slack, _HOLD_NS))
     return both
 
 
-def _unwrapped(values: NDArray[Any], bits: int | None) -> Floats:
-    if bits is None or bits == 64 or values.dtype.kind == "f" or not len(values):
-        return values.astype(np.float64)
+def _unwrapped(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a counter (n,) without its wraps: of the least of 16 and 32 bits that holds all its numbers."""
+    if values.dtype.kind == "f" or not len(values):
+        return values
+    bits = next((bits for bits in (16, 32) if _fits(values, bits)), 64)
+    if bits == 64:
+        return values
     span = 1 << bits
-    steps = np.mod(np.diff(values.astype(np.int64)) + span // 2, span) - span // 2
-    return np.concatenate([[0], np.cumsum(steps)]).astype(np.float64) + float(values[0])
+    steps = np.mod(np.diff(values) + span // 2, span) - span // 2
+    return np.cumsum(np.concatenate([values[:1], steps]))
 
 
-def _is_position(topic: str, values: Floats, config: Config, *, integer: bool) -> bool:
+def _fits(values: Ints, bits: int) -> bool:
+    """Return whether numbers fit into a word, with or without sign."""
+    low, high = int(values.min()), int(values.max())
+    return (low >= 0 and high < 1 << bits) or (low >= -(1 << bits - 1) and high < 1 << bits - 1)
+
+
+def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: bool) -> bool:
     """Return whether a pair's numbers are positions (ticks, angles), not speeds."""
     if config.wheels.quantity != "auto":
         return config.wheels.quantity in ("position", "counts")
-    if _SPEED_WORDS.search(topic):
-        return False
-    if _PLACE_WORDS.search(topic):
-        return True
+    for name in (side.path, side.table.topic):
+        if _SPEED_WORDS.search(name):
+            return False
+        if _PLACE_WORDS.search(name):
+            return True
     finite = values[np.isfinite(values)]
     if len(finite) < 3 or np.ptp(finite) == 0:
         return integer

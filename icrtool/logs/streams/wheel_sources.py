@@ -17,7 +17,7 @@ from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.position_sources import REFERENCE_WORDS
-from icrtool.logs.streams.source import Source, of_topic
+from icrtool.logs.streams.source import NEVER_MOVES, Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
 Unit = Literal["rad", "m", "counts", "unknown"]
@@ -35,9 +35,6 @@ ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 
 MOST_WHEELS = 32
 """Of a side. A message that lists more is not of wheels, or was made to take time."""
-
-NEVER_MOVES = 60.0
-"""Subtracted from the score of wheels that never move: another topic that moves is preferred."""
 
 SIDEWAYS_SHARE = 0.2
 """A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""

@@ -258,16 +258,16 @@ def test_scan_of_damaged_records_stays_inside_them(kind):
             chunk = mutated(rng, chunk)
         data = np.frombuffer(chunk, np.uint8)
         tables, plain = np.zeros((2, 4, 20), np.int64), np.zeros((2, 4, 20), np.int64)
-        found = scan(data, 0, *tables)
+        found = scan(data, 0, *tables, 0)
         with np.errstate(over="ignore"):
-            assert python(Guarded(data), 0, *map(Guarded, plain)) == found
+            assert python(Guarded(data), 0, *map(Guarded, plain), 0) == found
         np.testing.assert_array_equal(plain, tables)
         for table, count in zip(tables, found[:2], strict=True):
             start, end = table[2:, :count]
             assert ((start >= 0) & (start <= end) & (end <= len(data))).all()
         if turn % 4 == 0:
             assert (sum(found[:2]), found[2]) == (12, len(data))
-            assert scan(data, 0, tables[0], tables[1][:, :0]) == (found[0], 0, len(data))
+            assert scan(data, 0, tables[0], tables[1][:, :0], 0) == (found[0], 0, len(data))
 
 
 @pytest.mark.parametrize("kind", SCANS)
@@ -278,7 +278,7 @@ def test_scan_refuses_a_length_that_the_chunk_does_not_have(kind, number):
     size, at = (8, 1) if kind == "mcap" else (4, 0)
     chunk = chunk[:at] + (number % (1 << 8 * size)).to_bytes(size, "little") + chunk[at + size :]
     tables = np.zeros((2, 4, 20), np.int64)
-    *counts, stop = scan(np.frombuffer(chunk, np.uint8), 0, *tables)
+    *counts, stop = scan(np.frombuffer(chunk, np.uint8), 0, *tables, 0)
     assert 0 <= sum(counts) <= 12
     assert 0 <= stop <= len(chunk)
     assert (tables[:, 3] <= len(chunk)).all()

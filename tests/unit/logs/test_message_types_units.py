@@ -95,11 +95,54 @@ def test_a_pose_in_a_camera_s_optical_frame_is_no_position() -> None:
     assert problem(ahead, left, up) == problem(ahead, left, 0.3 * ahead + up) == problem(ahead, up, 0.3 * t) == ""
 
 
+def test_positions_counted_from_the_centre_of_the_earth_are_refused_as_such() -> None:
+    """UTM coordinates, which are as large, are read."""
+    t = np.linspace(0.0, 20.0, 200)
+
+    def problem(*places: Any) -> str:
+        columns = {f"pose__pose__position__{axis}": values for axis, values in zip("xyz", places, strict=True)}
+        columns |= {f"pose__pose__orientation__{axis}": values for axis, values in about(0.1 * t).items()}
+        return position("nav_msgs/Odometry", "/ins/odom", **columns).problem
+
+    assert "(ECEF)" in problem(1.25e6 + 5 * np.sin(t), -4.16e6 + t, 4.65e6 + np.cos(t))
+    assert problem(3.3e5 + 5 * np.sin(t), 5.18e6 + t, 98.0 + np.cos(t)) == ""
+
+
+def test_a_position_of_an_autopilot_is_geodetic_and_its_yaw_in_enu() -> None:
+    name, yaw = "geographic_msgs/GeoPoseStamped", np.array([0.1, 0.2, 0.4])
+    columns = {"latitude": [48.0] * 3, "longitude": [11.0] * 3, "altitude": [500.0, np.nan, 500.0]}
+    source = position(name, **{f"pose__position__{field}": values for field, values in columns.items()})
+    assert source.geodetic is not None
+    assert source.geodetic[1].tolist() == [48.0, 11.0, 500.0]
+    found = heading(name, **{f"pose__orientation__{axis}": values for axis, values in about(yaw).items()})
+    np.testing.assert_allclose(found.heading_rad(found.convention), math.pi / 2 - yaw, atol=ROUNDING_RAD)
+
+
+@pytest.mark.parametrize("frame", ["camera_init", "odom_lidar", "map", "odom"])
+def test_the_frame_of_an_odometry_shows_a_reference(frame: str) -> None:
+    """FAST-LIO writes /Odometry in camera_init, KISS-ICP /kiss/odometry in odom_lidar."""
+    t = np.linspace(0.0, 20.0, 200)
+    columns = {f"pose__pose__position__{axis}": values for axis, values in zip("xyz", (t, t**2, 0 * t), strict=True)}
+    columns |= {f"pose__pose__orientation__{axis}": values for axis, values in about(0.1 * t).items()}
+    source = position("nav_msgs/Odometry", "/Odometry", header__frame_id=[frame] * 200, **columns)
+    assert ("topics.gnss" in source.problem) == (frame == "odom")
+
+
 @pytest.mark.parametrize("name", ["sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix"])
 def test_a_negative_status_is_no_fix(name: str) -> None:
     source = position(name, **fix(status__status=[-1, 0, -2]))
     assert source.usable.tolist() == [False, True, False]
     assert source.rejected == {"no fix": 2}
+
+
+@pytest.mark.parametrize("longitude", [11.0, 180.0])
+def test_fixes_of_the_place_where_a_receiver_was_last_are_left_out(longitude: float) -> None:
+    """The local plane would be laid there. At the date line fixes on both sides are of one place."""
+    longitudes = [114.05, *[longitude, -longitude if longitude == 180.0 else longitude] * 5]
+    columns = {"status__status": [0] * 11, "latitude": [22.54, *[48.0] * 10], "longitude": longitudes}
+    source = position("sensor_msgs/NavSatFix", **columns, altitude=[500.0] * 11, position_covariance_type=[0] * 11)
+    assert source.usable.tolist() == [False, *[True] * 10]
+    assert source.rejected == {"far from the others": 1}
 
 
 def test_a_status_that_is_never_told_refuses_nothing() -> None:

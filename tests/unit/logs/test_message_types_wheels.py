@@ -17,7 +17,7 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.wheel_pairs import pair_motion
+from icrtool.logs.streams.wheel_pairs import Side, pair_motion
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
@@ -184,14 +184,22 @@ def test_configured_joints_go_before_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "bits"),
-    [("Int16", 16), ("Int32", 32), ("UInt32", 32), ("Int64", None), ("Float64", None), ("Float32", None)],
+    [
+        ("Int16", 16),
+        ("UInt16", 16),
+        ("Int32", 32),
+        ("UInt32", 32),
+        ("Int64", None),
+        ("Float64", None),
+        ("Float32", None),
+    ],
 )
 def test_counters_are_unwrapped_at_the_width_of_their_type(tmp_path: Path, name: str, bits: int | None) -> None:
     rng = np.random.default_rng(8)
     span = 1 << (bits or 20)
     travelled = np.cumsum(rng.integers(0, span // 5, 60)) - np.cumsum(rng.integers(0, span // 9, 60))
     assert bits is None or np.ptp(travelled) > span
-    lowest = 0 if name == "UInt32" else -(span // 2)
+    lowest = 0 if name.startswith("UInt") else -(span // 2)
     wrapped = (travelled - lowest) % span + lowest if bits else travelled
     types = ROS2.types[f"std_msgs/msg/{name}"]
     kind = float if name.startswith("Float") else int
@@ -215,7 +223,7 @@ def pair_tables(left: Any, right: Any, *, kinds: tuple[str, str] = ("Float64", "
 def test_a_pair_is_read_only_while_both_sides_were_recorded() -> None:
     left, right = pair_tables(np.arange(100.0), np.arange(100.0), topic="angle")
     late = right.rows(np.arange(100) >= 60)
-    motion = pair_motion(left, late, CONFIG)
+    motion = pair_motion(Side(left), Side(late), CONFIG)
     assert motion.position is not None
     assert motion.position is not None
     np.testing.assert_array_equal(motion.position[0], motion.position[1])
@@ -224,7 +232,7 @@ def test_a_pair_is_read_only_while_both_sides_were_recorded() -> None:
 
 def test_a_pair_of_different_integers_is_unwrapped_side_by_side() -> None:
     left, right = pair_tables([32_000, -32_000], [65_500, 66_500], kinds=("Int16", "Int32"), topic="ticks")
-    motion = pair_motion(left, right, CONFIG)
+    motion = pair_motion(Side(left), Side(right), CONFIG)
     assert motion.message_type == "std_msgs/Int16 + std_msgs/Int32"
     assert motion.position is not None
     assert motion.position is not None
@@ -235,17 +243,17 @@ def test_a_pair_of_different_integers_is_unwrapped_side_by_side() -> None:
 def test_a_side_without_messages_is_refused_in_words() -> None:
     left, right = pair_tables([1.0, 2.0], [1.0, 2.0])
     nothing = TopicTable(right.topic, right.message_type, np.empty(0, np.int64), {}, {}, 0)
-    assert pair_motion(left, nothing, CONFIG).problem == "/right/speed holds no message"
-    never = pair_motion(left, right.rows(np.array([True, False])), CONFIG)
+    assert pair_motion(Side(left), Side(nothing), CONFIG).problem == "/right/speed holds no message"
+    never = pair_motion(Side(left), Side(right.rows(np.array([True, False]))), CONFIG)
     assert never.problem == ""
     gone = TopicTable(right.topic, right.message_type, right.log_time_ns + 10**12, right.columns, {}, 0)
-    assert pair_motion(left, gone, CONFIG).problem == "the two sides were not recorded at the same time"
+    assert pair_motion(Side(left), Side(gone), CONFIG).problem == "the two sides were not recorded at the same time"
 
 
 def test_the_second_message_of_a_cycle_belongs_to_the_first() -> None:
     left, right = pair_tables([1.0, 2.0, 3.0], [10.0, 20.0, 30.0])
     shifted = TopicTable(right.topic, right.message_type, right.log_time_ns + 3_000_000, right.columns, {}, 0)
-    motion = pair_motion(left, shifted, CONFIG)
+    motion = pair_motion(Side(left), Side(shifted), CONFIG)
     assert motion.speed is not None
     assert motion.speed[1].tolist() == [10.0, 20.0, 30.0]
 

@@ -277,6 +277,16 @@ def test_the_best_accuracy_is_the_first_choice_as_reference() -> None:
     assert choose([fix(std_m=0.02), pose(), joints(), imu()]).gnss.topic == "/gps/fix"
 
 
+def test_a_base_station_is_not_the_robot() -> None:
+    """Not even where it states a better accuracy, in the namespace of the wheels."""
+    base = fix("/base/fix", std_m=0.005)
+    still = base.columns | {"latitude": np.full(COUNT, 48.0), "longitude": np.full(COUNT, 11.0)}
+    base = TopicTable(base.topic, base.message_type, TIMES, still, {}, 0)
+    found = find([joints("/base/joint_states"), base, fix("/rover/fix"), imu()])
+    assert [source.topic for source in found.gnss] == ["/rover/fix", "/base/fix"]
+    assert "never moves" in found.gnss[1].why
+
+
 def test_a_metric_pose_brings_its_own_heading() -> None:
     choice = choose([joints(), pose(), imu()])
     assert topics_of(choice) == ("/joint_states", "/icp_pose", "/icp_pose")

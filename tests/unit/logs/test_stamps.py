@@ -1,0 +1,41 @@
+"""What is reported of a clock that was set while recording, and of messages that are merely stored out of order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icrtool.errors import DataError
+from icrtool.kernels.arrays import Ints
+from icrtool.logs.messages.topic_table import time_order
+from icrtool.logs.streams.stamps import StampedRows, clock_notes
+
+TIMES = np.arange(0, 100_000_000_000, 20_000_000)
+
+
+def notes_of(times: Ints) -> list[str]:
+    set_back, order = time_order(times)
+    stamps = times if order is None else times[order]
+    return list(clock_notes(StampedRows(None, stamps, "no header", 0, set_back=set_back), "drive", "wheels"))
+
+
+def set_back(seconds: float) -> Ints:
+    return TIMES - np.where(TIMES > 50_000_000_000, int(seconds * 1e9), 0)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.4])
+def test_a_clock_set_back_by_little_is_reported_with_its_step(seconds: float) -> None:
+    (note,) = notes_of(set_back(seconds))
+    assert f"goes back by {seconds - 0.02:.1f} s: the clock was set" in note
+
+
+def test_a_clock_set_back_by_more_is_refused() -> None:
+    with pytest.raises(DataError, match="times come again"):
+        notes_of(set_back(5.0))
+
+
+@pytest.mark.parametrize("late_s", [0.1, 1.0])
+def test_single_messages_out_of_order_are_no_clock_that_was_set(late_s: float) -> None:
+    times = TIMES.copy()
+    times[100::100] -= int(late_s * 1e9)
+    assert notes_of(times) == []
