@@ -51,8 +51,8 @@ def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bo
     if measured is not None and measured.gyro is not None:
         gyro = measured.gyro
         lines.append(f"\ngyro:\n  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter")
-    if measured is not None:
-        spans = [table.stamp_ns for table in (measured.wheels, measured.gnss, measured.heading)]
+    spans = [one.stamp_ns for one in (measured.wheels, measured.gnss, measured.heading)] if measured is not None else []
+    if spans and all(map(len, spans)):
         overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
         lines.append(f"\nall three overlap for {max(overlap, 0):.1f} s")
     return "\n".join(lines)

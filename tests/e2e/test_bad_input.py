@@ -599,3 +599,10 @@ def test_a_recording_of_more_files_than_a_process_may_open_at_first_is_read(tmp_
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "open files" not in done.stdout + done.stderr
+
+
+def test_info_of_a_log_without_heading_and_wheel_radius_states_what_is_missing(icrtool, tmp_path: Path) -> None:
+    status, out, _ = icrtool("info", str(log(tmp_path, first(drive(), heading=1))))
+    assert status == 1
+    assert "cannot be fitted: robot.wheel_radius_m" in out
+    assert "all three overlap" not in out

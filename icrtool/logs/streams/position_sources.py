@@ -145,14 +145,15 @@ def _geodetic(
 
 
 def _far_away(geodetic: Floats, known: Bools) -> Bools:
-    """Return the fixes (n,) of another place: a receiver that was switched on may send where it was last."""
-    if not known.any():
-        return known
-    away_deg = geodetic[:, :2] - geodetic[np.argmax(known), :2]
-    away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
-    away_deg -= np.median(away_deg[known], axis=0)
-    away_deg[:, 1] *= math.cos(math.radians(float(np.median(geodetic[known, 0]))))
-    return np.asarray((np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1))
+    """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
+    far, places_deg = np.zeros(len(known), np.bool_), geodetic[known, :2]
+    if len(places_deg):
+        away_deg = places_deg - places_deg[0]
+        away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
+        away_deg -= np.median(away_deg, axis=0)
+        away_deg[:, 1] *= math.cos(math.radians(float(np.median(places_deg[:, 0]))))
+        far[known] = (np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1)
+    return far
 
 
 def _is_still(geodetic: Floats) -> bool:

@@ -145,6 +145,12 @@ def test_fixes_of_the_place_where_a_receiver_was_last_are_left_out(longitude: fl
     assert source.rejected == {"far from the others": 1}
 
 
+def test_a_longitude_that_is_no_number_is_compared_with_none() -> None:
+    columns = {"status__status": [0] * 4, "latitude": [48.0] * 4, "longitude": [11.0, np.inf, -1.7e308, np.nan]}
+    source = position("sensor_msgs/NavSatFix", **columns, altitude=[500.0] * 4, position_covariance_type=[0] * 4)
+    assert source.rejected == {"not finite": 2, "not a place on earth": 1}
+
+
 def test_a_status_that_is_never_told_refuses_nothing() -> None:
     assert position("sensor_msgs/NavSatFix", **fix(status__status=[-2] * 3)).usable.all()
     never = fix()
