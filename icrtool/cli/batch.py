@@ -17,7 +17,7 @@ import click
 from icrtool.cli import options
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import signal_word
-from icrtool.records.text import LogText, counted, escaped
+from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from icrtool.fleet.one_log import Request
     from icrtool.fleet.roll_up import PooledCalibration
     from icrtool.fleet.row import Row
+
+LONGEST_STAGE, LEAST_NAME = 28, 12
+"""Characters of the live line for the stage of a log with its separators, and for its name at least."""
 
 
 @click.command("batch")
@@ -140,7 +143,7 @@ def print_results(
     elif not quiet:
         click.echo(summary_of(rows, output))
         if calibrations:
-            click.echo(f"\n{calibrations_text(calibrations)}", nl=False)
+            click.echo(f"\n{calibrations_text(calibrations, tables=False)}", nl=False)
 
 
 @contextmanager
@@ -216,8 +219,10 @@ class View:
             rate = worked / elapsed
             left = (self._logs - done) / rate
             parts += [f"{60 * rate:.3g} logs/min", f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"]
-        parts += [f"{LogText(log)}: {stage}" for log, stage in list(self._stages.items())]
         width = shutil.get_terminal_size().columns - 1
+        stages = list(self._stages.items())
+        space = (width - len("  ".join(parts))) // max(len(stages), 1) - LONGEST_STAGE
+        parts += [f"{shortened(escaped(log), max(space, LEAST_NAME))}: {stage}" for log, stage in stages]
         click.echo(f"\r\x1b[2K{'  '.join(parts)[:width]}", err=True, nl=False)
 
     def close(self) -> None:
@@ -250,6 +255,6 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
-    files = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
+    files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
     return f"\n{counted(len(rows), 'log')}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"

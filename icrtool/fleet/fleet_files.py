@@ -78,8 +78,10 @@ def write_fleet(
     write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
 
 
-def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
-    """Return the pooled calibrations with their leave-one-log-out tables, no line end."""
+def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
+    """Return the pooled calibrations, a line each, or with their leave-one-log-out tables."""
+    from icrtool.motion.models import MODELS
+
     parts = []
     for one in calibrations:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
@@ -89,9 +91,11 @@ def calibrations_text(calibrations: Sequence[PooledCalibration]) -> str:
         if one.reason:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue
-        multiplier = f"multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}"
-        parts.append(f"{head}: recommended model {one.recommended}, {multiplier}, in {one.file}\n{one.table}")
-    return "\n\n".join(parts) + "\n"
+        known = MODELS.get(one.recommended)
+        model = f"{known.label} (model {one.recommended})" if known is not None else one.recommended
+        head += f": {model}, multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}, in {one.file}"
+        parts.append(f"{head}\n{one.table}" if tables else head)
+    return ("\n\n" if tables else "\n").join(parts) + "\n"
 
 
 def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:

@@ -96,7 +96,7 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
     inputs = files_of(path_of(request.path)) if repeatable else ()
     return replace(
         request.row, status="failed", reason=reason, details=details, repeatable=repeatable, inputs=inputs,
-        tool_version=__version__,
+        robot=_robot(request), tool_version=__version__,
     )  # fmt: skip
 
 
@@ -134,7 +134,7 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         status="done",
         reason=f"not usable: {summary['unusable_because']}" if not summary["usable"] else "",
         usable=summary["usable"],
-        robot=request.row.robot or request.config.robot.name or "",
+        robot=_robot(request),
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary["drive"]["duration_s"],
         distance_m=summary["drive"]["distance_m"],
@@ -150,6 +150,10 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
     )
+
+
+def _robot(request: Request) -> str:
+    return request.row.robot or request.config.robot.name or ""
 
 
 def _errors(report: DropoutReport) -> dict[str, float | None]:

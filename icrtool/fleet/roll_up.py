@@ -88,7 +88,7 @@ def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     """Return the usable runs of a batch by the name of their group: of the manifest, else of the robot.
 
-    Robots that are in the same group of the manifest are distinguished.
+    Robots that are in the same group of the manifest are distinguished. Of copies in a group, the first one counts.
 
     Raises
     ------
@@ -97,11 +97,12 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     """
     logs = [one for one in logs_of_fleet(directory) if one.usable]
     robots = {one.robot for one in logs}
-    found: dict[str, list[Path]] = {}
+    found: dict[str, dict[tuple[str, ...], Path]] = {}
     for one in logs:
         name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
-        found.setdefault(name, []).append(directory / one.run)
-    return found
+        content = tuple(sorted(file.sha256 for file in one.inputs))
+        found.setdefault(name, {}).setdefault(content, directory / one.run)
+    return {name: list(runs.values()) for name, runs in found.items()}
 
 
 def is_fleet(directory: Path) -> bool:

@@ -67,7 +67,8 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
-    panels[-1].set_xlabel("Date (UTC) [-]")
+    years = sorted({point["start_utc"][:4] for point in fleet.points})
+    panels[-1].set_xlabel(f"Date (UTC), {'-'.join(dict.fromkeys((years[0], years[-1])))} [-]")
     add_legend(figure, ncols=4)
     return figure
 

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from icrtool.cli.batch import line_of, summary_of
-from icrtool.cli.compare import _groups
+from icrtool.cli.compare import _expand, _groups
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, reason_of, write_fleet
 from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_of_fleet
 from icrtool.fleet.row import File, Row
+from icrtool.motion.models import MODELS
 from icrtool.output.files.calibration_file import open_calibration
 from icrtool.records.run import Run
 
@@ -56,6 +57,8 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     assert (ice.file, ice.logs) == ("", ("c",))
     assert "usable" in ice.reason
     assert grass.table in calibrations_text(found)
+    assert len(calibrations_text(found, tables=False).splitlines()) == len(found)
+    assert f"{MODELS[grass.recommended].label} (model" in calibrations_text(found)
     write_fleet(logs, place, found)
     monkeypatch.setattr("icrtool.output.stored_run.open_run", None)
     assert list(pooled_calibrations(logs, place)) == found, "nothing changed: nothing is fitted"
@@ -75,6 +78,9 @@ def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     write_fleet(logs, place)
     groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
+    write_fleet([*logs, *rows("a", multiplier=1.5)], place)
+    assert runs_of_fleet(place) == groups, "a copy in the same group would be tested on itself"
+    assert _expand(place) == [run for runs in groups.values() for run in runs]
     write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice", multiplier=1.5)], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
     with pytest.raises(RunError):
