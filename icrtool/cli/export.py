@@ -61,14 +61,14 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
     if output is not None:
         check_place(output)
     if target == "foxglove" and output is not None:
-        _write_foxglove(_run(source), output)
+        _write_foxglove(_run(source, output), output)
         return
     if target in CONTROLLERS:
         from icrtool.output.exports.controllers import format_export
 
         options.write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
     else:
-        options.write_or_print(_path_text(_run(source), target), output)
+        options.write_or_print(_path_text(_run(source, output), target), output)
 
 
 def _path_text(run: Run, target: str) -> str:
@@ -114,14 +114,16 @@ def _write_foxglove(run: Run, output: Path) -> None:
     click.echo(f"written to {output}; layout for Foxglove: {layout}")
 
 
-def _run(source: Path | None) -> Run:
-    """Read the run whose paths are asked for; one that is not usable has them too."""
-    from icrtool.errors import RunError
+def _run(source: Path | None, output: Path | None = None) -> Run:
+    """Read the run whose paths are asked for; one that is not usable has them too. Its log is never the output."""
+    from icrtool.errors import OutputError, RunError
     from icrtool.output.stored_run import newest_run, open_run
 
     if source is not None and source.is_file():
         raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")
     run = open_run(source or newest_run(RUNS))
+    if output is not None and output.resolve() in (Path(file["path"]).resolve() for file in run.summary["inputs"]):
+        raise OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:
         options.warn([f"{run.name}: its ICRs are not usable: {run.summary['unusable_because']}"], quiet=False)
     return run

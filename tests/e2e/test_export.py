@@ -131,3 +131,17 @@ def test_a_calibration_that_is_not_fit_for_use_is_exported_by_force_only(icrtool
     assert (status, out) == (1, "")
     assert "not fit for use: its error after 10 m" in err
     assert icrtool("export", "--for", "clearpath", "--force", file)[0] == 0
+
+
+def test_an_export_does_not_replace_the_log_of_its_run(icrtool) -> None:
+    content = LOG.read_bytes()
+    status, _, err = icrtool("export", "--for", "foxglove", "-o", LOG)
+    assert status == 1
+    assert "is the log that the run was made from" in err
+    assert LOG.read_bytes() == content
+
+
+def test_an_export_is_no_log_of_wheels(icrtool, tmp_path: Path) -> None:
+    """Its ICRs have a left and a right field in a message with "track" in its name."""
+    assert icrtool("export", "--for", "foxglove", "-o", tmp_path / "paths.mcap")[0] == 0
+    assert "/icrs" not in icrtool("info", tmp_path / "paths.mcap")[1].partition("wheels (key")[2]

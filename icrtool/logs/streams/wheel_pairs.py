@@ -48,6 +48,11 @@ _OTHER_WORDS = re.compile(
 """Fields of a motor driver's messages that are no motion."""
 
 _SIDE_WORDS = re.compile("left|right", re.IGNORECASE)
+_ONLY_SIDE = re.compile(
+    r"(?:(?:left|right|front|rear|wheels?|tracks?|motor|drive|side|value|data)_?|\d)+", re.IGNORECASE
+)
+"""A field that names a side alone: its topic or message states of what."""
+
 _DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE)
 """Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
@@ -147,7 +152,9 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
         return path == "data"
     if message_type in _KNOWN or not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
         return False
-    return any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS, _SIDE_WORDS))
+    field = path.rpartition(".")[2]
+    only_side = bool(_ONLY_SIDE.fullmatch(field) and _SIDE_WORDS.search(field))
+    return only_side or any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS))
 
 
 def _of_wheels(name: str) -> bool:
