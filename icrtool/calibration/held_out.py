@@ -312,8 +312,8 @@ class _Tester:
         by_name = {one.fit.model.name: one for one in tested}
         fold_of = np.concatenate([self._fold_of(i, trials.starts) for i, trials in enumerate(self._trials)])
         first = np.searchsorted(fold_of, np.arange(1, len(self._folds)))
-        parts = (np.split(by_name[name].errors, first)[f] for f, name in enumerate(choice.chosen))
-        chosen = np.concatenate(list(parts))
+        parts = {name: np.split(one.errors, first) for name, one in by_name.items()}
+        chosen = np.concatenate([parts[name][f] for f, name in enumerate(choice.chosen)])
         rows = [(name, one.fit.model.label, one.errors) for name, one in by_name.items()]
         rows.append(("recommended", "recommended", chosen))
         fits = {name: one.fit for name, one in by_name.items()}

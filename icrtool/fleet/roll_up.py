@@ -16,9 +16,9 @@ import numpy as np
 from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
-from icrtool.fleet.row import Row
+from icrtool.fleet.row import File, Row
 from icrtool.output.files.atomic_file import write_file
-from icrtool.output.files.json_file import FLEET_FILE, json_bytes, logs_of_fleet
+from icrtool.output.files.json_file import FLEET_FILE, InputFile, json_bytes, logs_of_fleet
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
@@ -100,8 +100,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     found: dict[str, dict[tuple[str, ...], Path]] = {}
     for one in logs:
         name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
-        content = tuple(sorted(file.sha256 for file in one.inputs))
-        found.setdefault(name, {}).setdefault(content, directory / one.run)
+        found.setdefault(name, {}).setdefault(_content(one.inputs), directory / one.run)
     return {name: list(runs.values()) for name, runs in found.items()}
 
 
@@ -117,7 +116,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     from icrtool.output.text_blocks import Text
 
     # A copy of a log would be tested on itself.
-    distinct = {tuple(sorted(file.sha256 for file in row.inputs)): row for row in reversed(members)}
+    distinct = {_content(row.inputs): row for row in reversed(members)}
     ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
     total_s = sum(row.duration_s or 0.0 for row in ordered)
     count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
@@ -145,6 +144,11 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
     )  # fmt: skip
+
+
+def _content(inputs: Sequence[File | InputFile]) -> tuple[str, ...]:
+    """Return what copies of a log have in common, whatever their names."""
+    return tuple(sorted(file.sha256 for file in inputs))
 
 
 def _stored(directory: Path) -> list[PooledCalibration]:

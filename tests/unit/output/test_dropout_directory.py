@@ -31,6 +31,7 @@ from icrtool.output.files import disk
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.files.trials_file import trials_file
 from icrtool.records.run import Run
+from support.contract import SUMMARY_COLUMNS
 
 HORIZONS_M = [1.0, 5.0, 10.0, 900.0]
 GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001", "icr.max@900m <= 1")
@@ -63,17 +64,7 @@ def written(content: DropoutReport, tmp_path_factory: pytest.TempPathFactory) ->
 def test_summary_csv_is_the_summary_to_the_last_bit(written: Path, content: DropoutReport) -> None:
     read = pd.read_csv(written / "summary.csv")
     pd.testing.assert_frame_equal(read, content.summary, check_exact=True, check_dtype=False)
-    assert list(read.columns)[:9] == [
-        "model",
-        "horizon_m",
-        "trials",
-        "expected_error_m",
-        "p50_m",
-        "p95_m",
-        "max_m",
-        "expected_pct",
-        "p95_pct",
-    ]
+    assert list(read.columns)[:9] == SUMMARY_COLUMNS
     assert len(read) == 3 * len(HORIZONS_M)
     text = (written / "summary.csv").read_text(encoding="utf-8")
     assert "nan" not in text.lower()

@@ -18,6 +18,7 @@ from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
 from icrtool.records.run import Run
+from support.contract import RUN_KEYS
 
 
 @pytest.fixture
@@ -44,17 +45,7 @@ def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) 
 def test_run_json_has_every_key_of_the_contract(written: Path, run: Run) -> None:
     document = json.loads((written / "run.json").read_text(encoding="utf-8"))
     assert document["schema"] == "icrtool/run/1"
-    assert document.keys() >= {
-        "tool_version",
-        "inputs",
-        "config",
-        "streams",
-        "warnings",
-        "drive",
-        "icr",
-        "gnss",
-        "filter",
-    }
+    assert document.keys() >= RUN_KEYS
     assert document["inputs"][0].keys() >= {"path", "bytes", "sha256"}
     assert document["streams"][0].keys() >= {"topic", "message_type", "rate_hz", "count", "why"}
     assert document["drive"].keys() >= {"duration_s", "distance_m", "speed_mean_mps", "speed_std_mps"}
