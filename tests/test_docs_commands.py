@@ -1,4 +1,4 @@
-"""Every command that a page shows runs, in one folder, with a short log in place of the reader's."""
+"""Every command and Python block that a page shows runs, in one folder, with a short log in place of the reader's."""
 
 from __future__ import annotations
 
@@ -56,6 +56,18 @@ for found_on, line in shown_commands():
 """Each command once, and a page that shows it."""
 
 
+def shown_python() -> Iterator[tuple[str, str]]:
+    """Yield each page with Python, and its blocks as one program."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        name = page.relative_to(ROOT).as_posix()
+        blocks = re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        if blocks and name not in ELSEWHERE:
+            yield name, "\n".join(blocks)
+
+
+PYTHON = dict(shown_python())
+
+
 def run(*words: str) -> Result:
     return CliRunner().invoke(command_line, list(words))
 
@@ -88,6 +100,11 @@ def test_a_command_that_a_page_shows_runs(folder: Path, command: str) -> None:
     words = [part for word in words for part in MEANT.get(word, [word])]
     result = run(name, *words, *FEWER.get(name, []))
     assert result.exit_code == 0, (COMMANDS[command], result.output, result.exception)
+
+
+@pytest.mark.parametrize("page", PYTHON)
+def test_the_python_of_a_page_runs_as_it_stands(folder: Path, page: str) -> None:
+    exec(compile(PYTHON[page], page, "exec"), {})
 
 
 def test_what_is_run_elsewhere_or_not_at_all_is_still_shown() -> None:

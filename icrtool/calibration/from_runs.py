@@ -53,6 +53,8 @@ def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
 def robot_of(run: Run) -> dict[str, Any]:
     """Return what a calibration holds of the robot of a run, except its track width."""
     robot: dict[str, Any] = {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
+    if run.config.robot.encoder_counts_per_rev is not None:
+        robot["encoder_counts_per_rev"] = run.config.robot.encoder_counts_per_rev
     if run.config.wheels.twist_width_m is not None and _from_twists(run):
         robot["twist_width_m"] = run.config.wheels.twist_width_m
     return robot

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
+from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import CONTROLLER, FittedModel, TrackGeometry, TypicalDrive, wheel_motion
 from icrtool.records.late_output import call_output
@@ -131,7 +133,8 @@ class Calibration:
 
     Attributes
     ----------
-    robot : name (or None), track_width_m, wheel_radius_m (or None); older files: left_scale, right_scale as configured
+    robot : name (or None), track_width_m, wheel_radius_m (or None), encoder_counts_per_rev where configured; older
+        files: left_scale, right_scale as configured
     fitted : the recommended model; others : every model, by name
     gyro : the recommended model with a gyro, None where a log has none
     typical : curvature and speed at which ICRs and multiplier are stated
@@ -213,13 +216,25 @@ class Calibration:
 
         Parameters
         ----------
-        log : of `icrtool.read_log`; its gyro is not used
+        log : of `icrtool.read_log`, its sides and senses as sent; its gyro is not used
+
+        Raises
+        ------
+        ConfigError
+            Wheels whose unit needs a radius or resolution that the calibration does not hold and the log does not show.
+        DataError
+            Fewer than two usable wheel samples.
 
         Notes
         -----
-        A speed holds until the next sample; Euler steps, as in the dropout analysis.
+        A speed holds until the next sample; Euler steps, as in the dropout analysis. Angles and counts become metres
+        with the numbers that the calibration was fitted with.
         """
-        wheels = log.wheels
+        known = RobotConfig(
+            wheel_radius_m=self.robot.get("wheel_radius_m"),
+            encoder_counts_per_rev=self.robot.get("encoder_counts_per_rev"),
+        )
+        wheels = with_wheel_speeds(log, Config(robot=known)).wheels
         v_x, v_y, omega = self.twist(wheels.v_left_mps, wheels.v_right_mps)
         held = np.diff(wheels.stamp_ns) / 1e9
         heading = np.concatenate([[0.0], np.cumsum(held * omega[:-1])])

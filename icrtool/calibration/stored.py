@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from icrtool.calibration.record import Calibration, CalibrationLog, ControllerErrors, ErrorSources, HeldOutScore
+from icrtool.config import Positive
 from icrtool.motion.models import FittedModel, TypicalDrive, find_model
 from icrtool.records.run import CALIBRATION_SCHEMA
 from icrtool.records.text import escaped
@@ -30,6 +31,7 @@ class RobotDocument(TypedDict):
     name: str | None
     track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
     wheel_radius_m: NotRequired[Scale | None]
+    encoder_counts_per_rev: NotRequired[Positive]
     left_scale: NotRequired[Scale]
     right_scale: NotRequired[Scale]
 

@@ -142,6 +142,15 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
     del v_y
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("rad", 0.165), ("counts", 2.0 * np.pi * 0.165 / 4096.0)])
+def test_odometry_takes_wheels_in_the_unit_of_the_log(result: CalibrationResult, unit: str, metres: float) -> None:
+    robot = {**result.calibration.robot, "wheel_radius_m": 0.165, "encoder_counts_per_rev": 4096.0}
+    calibration, log = replace(result.calibration, robot=robot), make_log(0, 30.0)
+    sent = replace(log.wheels, left=log.wheels.left / metres, right=log.wheels.right / metres, unit=unit)
+    for found, expected in zip(calibration.odometry(replace(log, wheels=sent)), calibration.odometry(log), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
     new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
     trials = trials_from_all(new, (5.0, 10.0))
