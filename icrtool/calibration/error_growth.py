@@ -21,7 +21,7 @@ from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.window_residuals import OMEGA, sums_at_knots
+from icrtool.kernels.window_residuals import OMEGA, displacements, path_at
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, Windows, cut_windows, totals_of
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -100,22 +100,19 @@ def path_errors(
     # the sources act all along the path, not at the ends of windows alone
     of_start, of_end = begin_s + own.wheels_later_s, end_s + own.wheels_later_s
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    knots, k = len(at), len(fitted.parameters)
-    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((k, knots, 3))
-    sums_at_knots(fixed, columns, axes, fitted.parameters, steps.held, steps.into, steps.t, at, rate, sums, by)
-    theta, place = sums[:, 0], sums[:, 1] + 1j * sums[:, 2]
+    path = path_at(
+        steps.t, steps.held, steps.into, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at
+    )
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
-    back = np.exp(-1j * theta[s])
-    went = place[e] - place[s]
-    turned_by = by[:, e, 0] - by[:, s, 0]
-    place_by = by[:, :, 1] + 1j * by[:, :, 2]
-    moved_by = back * (place_by[:, e] - place_by[:, s] - 1j * by[:, s, 0] * went)
+    moved, by = displacements(path, s, e)
+    moved_by, turned_by = by[:-1], path.heading_by[:, e] - path.heading_by[:, s]
     of_parameters = Spread(
         *(np.einsum("kw,kl,lw->w", a, fitted.covariance, b)[:, None]
           for a, b in ((turned_by, turned_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
                        (moved_by.imag, moved_by.imag)))
     )  # fmt: skip
-    return PathErrors(back * went, theta[e] - theta[s], of_parameters, _source_moments(theta, place, s, e))
+    turned = path.heading[e] - path.heading[s]
+    return PathErrors(moved, turned, of_parameters, _source_moments(path.heading, path.place, s, e))
 
 
 def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread:

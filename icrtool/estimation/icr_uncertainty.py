@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
-from icrtool.kernels.window_residuals import sums_at_knots, window_residuals
+from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals
 from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.memory import give_back_freed
 from icrtool.records.tables import States
@@ -81,25 +81,13 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     give_back_freed()
-    rate, sums, by = _sums(drive, dt, table.t_s, rows, parameters)
+    path = _path(drive, dt, table.t_s, rows, parameters)
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
-    missed, jacobian = np.empty(2 * len(start)), np.empty((2 * len(start), terms + 2))
-    window_residuals(
-        rate,
-        sums,
-        by,
-        start,
-        end,
-        np.column_stack([moved.real, moved.imag]),
-        0.0,
-        np.ones(len(start)),
-        missed,
-        jacobian,
-    )
-    turned = np.diff(sums[:, 0])
+    missed, jacobian = window_residuals(path, start, end, moved, 0.0, np.ones(len(start)))
+    turned = np.diff(path.heading)
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
-    by_terms = np.concatenate([jacobian[:, :terms], np.diff(by[:, :, 0]).T]) @ by_icrs
+    by_terms = np.concatenate([jacobian[:, :terms], np.diff(path.heading_by).T]) @ by_icrs
     return StateWindows(
         residuals=np.concatenate([missed, turned - np.diff(heading)]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
@@ -113,18 +101,15 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     )
 
 
-def _sums(drive: Drive, dt: Floats, t_s: Floats, rows: Ints, parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return `rate`, `sums` and `by` of `sums_at_knots` at some rows (m,) of times (n,), by the wheels of a drive."""
-    knots, terms = len(rows), len(parameters)
-    fixed, columns = np.zeros((3, len(dt))), np.empty((terms, len(dt)))
-    axes = np.empty(terms, np.int64)
-    for lo in range(0, len(dt), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
+def _path(drive: Drive, dt: Floats, t_s: Floats, rows: Ints, parameters: Floats) -> PathKnots:
+    """Return the path that the wheels of a drive make at some rows (m,) of times (n,)."""
+
+    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
         motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
-        _, axes, columns[:, some] = model_columns(MODELS["full_linear"], motion)  # each of its terms is free
-    rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-    sums_at_knots(fixed, columns, axes, parameters, dt, fixed[0], t_s, t_s[rows], rate, sums, by)
-    return rate, sums, by
+        return model_columns(MODELS["full_linear"], motion)
+
+    # a broadcast zero takes no memory: each step's heading is that at its start
+    return path_at(t_s, dt, np.broadcast_to(0.0, len(dt)), twists, parameters, t_s[rows])
 
 
 def prior_std(width_m: float) -> Floats:

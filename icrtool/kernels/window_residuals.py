@@ -1,122 +1,134 @@
-"""Residuals of windows of driven distance for a motion model that is linear in its parameters, with derivatives.
+"""Paths of a motion model that is linear in its parameters, and residuals of windows of them, with derivatives.
 
 With z = forward + j right, heading Theta and place S are sums over steps, and a window from knot s to knot e displaces
 the robot, in the body frame of its start, by d = e^{-j Theta_s} (S_e - S_s). omega is linear in the parameters, so
-d Theta / d theta does not depend on them; one pass over the steps gives both and their derivatives.
+d Theta / d theta does not depend on them; cumulative sums over the steps give both and their derivatives.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.compiled import njit
+from icrtool.kernels.arrays import Complexes, Floats, Ints
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 
 VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""
 
-
-@njit
-def _derive_step(
-    columns: Floats, axis: Ints, i: int, held: float, into: float, c: float, s: float, north: float, east: float,
-    state: Floats, step: Floats,
-) -> None:  # fmt: skip
-    """Fill what a step i adds to the derivatives of heading and place (k, 3), from those at its begin, `state`."""
-    for a in range(len(axis)):
-        unit = columns[a, i] * held
-        if axis[a] == VX:
-            step[a, 1], step[a, 2] = unit * c, unit * s
-        elif axis[a] == VY:
-            step[a, 1], step[a, 2] = -unit * s, unit * c
-        else:
-            turned = (state[a, 0] + columns[a, i] * into) * held
-            step[a, 0], step[a, 1], step[a, 2] = unit, -turned * east, turned * north
+Twists = Callable[[slice], tuple[Floats, Ints, Floats]]
+"""Gives of some steps the twist without the free terms (3, n), v_x, v_y [m/s], omega [rad/s], the axis of each free
+term (k,), and the twist per unit parameter of each (k, n)."""
 
 
-@njit
-def sums_at_knots(
-    fixed: Floats, columns: Floats, axis: Ints, parameters: Floats, held: Floats, into: Floats,
-    t: Floats, at: Floats, rate: Floats, sums: Floats, by: Floats,
-) -> None:  # fmt: skip
-    """Fill heading, place and their derivatives at knots.
+class PathKnots(NamedTuple):
+    """A path at knots, and its derivatives by k terms; place and velocity are forward + j right in its own frame.
+
+    Attributes
+    ----------
+    heading, turn_rate : (m,) [rad, rad/s]; place, velocity : complex (m,) [m, m/s]; the rates are 0 over gaps
+    heading_by : (k, m); place_by : complex (k, m)
+    """
+
+    heading: Floats
+    turn_rate: Floats
+    place: Complexes
+    velocity: Complexes
+    heading_by: Floats
+    place_by: Complexes
+
+
+def locate(t: Floats, held: Floats, at: Floats) -> tuple[Ints, Floats]:
+    """Return the step in which each time (m,) lies and how much of it has passed; a gap's speeds end with its step."""
+    row = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
+    lasting = held[row]
+    passed = np.clip(at - t[row], 0.0, lasting)
+    return row, np.divide(passed, lasting, out=np.zeros(len(at)), where=lasting > 0.0)
+
+
+def path_at(t: Floats, held: Floats, into: Floats, twists: Twists, parameters: Floats, at: Floats) -> PathKnots:
+    """Return the path of steps (n,) at knots.
 
     Parameters
     ----------
-    fixed : (3, n) twist without the free terms, v_x, v_y [m/s], omega [rad/s]
-    columns : (k, n) twist per unit parameter of each free term, on its `axis` (k,); parameters : (k,)
-    held : (n,) duration of each step [s], 0 over gaps; into : (n,) how far into the step its heading is taken [s]
-    t, at : (n,), (m,) begin of each step and time of each knot [s], both ascending
-    rate : (m, 3) filled with the velocity [m/s], forward and right in the frame of the path, and omega; 0 over gaps
-    sums : (m, 3) filled with heading [rad] and place [m]
-    by : (k, m, 3) filled with their derivatives
+    t, held : begin of each step [s], ascending, and its duration [s], 0 over gaps
+    into : how far into the step its heading is taken [s]
+    twists : called for some steps at a time: of a long drive, columns of all would take much memory
+    parameters : (k,) of the free terms
+    at : (m,) time of each knot [s], ascending
     """
-    k, m, n = len(parameters), len(at), len(held)
-    theta, x, y, knot = 0.0, 0.0, 0.0, 0
-    state = np.zeros((k, 3))
-    step = np.zeros((k, 3))
-    for i in range(n):
-        if knot >= m:
-            return
-        v_x, v_y, omega = fixed[0, i], fixed[1, i], fixed[2, i]
+    k, m = len(parameters), len(at)
+    row, part = locate(t, held, at)
+    found = PathKnots(
+        np.empty(m), np.empty(m), np.empty(m, np.complex128), np.empty(m, np.complex128),
+        np.zeros((k, m)), np.empty((k, m), np.complex128),
+    )  # fmt: skip
+    heading, place = np.zeros(1), np.zeros(1, np.complex128)
+    heading_by, place_by = np.zeros((k, 1)), np.zeros((k, 1), np.complex128)
+    for lo in range(0, len(t), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        fixed, axis, columns = twists(some)
+        lasting, ahead = held[some], into[some]
+        v_x, v_y, omega = (fixed[one] + parameters[axis == one] @ columns[axis == one] for one in (VX, VY, OMEGA))
+        here = slice(*np.searchsorted(row, [lo, lo + len(lasting)]))
+        step, share = row[here] - lo, part[here]
+        turned = lasting * omega
+        heading = np.cumsum(np.append(heading[-1], turned))
+        angle, forward = heading[:-1] + ahead * omega, np.empty(len(lasting), np.complex128)
+        forward.real, forward.imag = np.cos(angle), np.sin(angle)
+        velocity = (v_x + 1j * v_y) * forward
+        moved = lasting * velocity
+        place = np.cumsum(np.append(place[-1], moved))
+        moving = lasting[step] > 0.0
+        found.heading[here] = heading[step] + share * turned[step]
+        found.turn_rate[here] = np.where(moving, omega[step], 0.0)
+        found.place[here] = place[step] + share * moved[step]
+        found.velocity[here] = np.where(moving, velocity[step], 0.0)
         for a in range(k):
-            value = parameters[a] * columns[a, i]
-            if axis[a] == VX:
-                v_x += value
-            elif axis[a] == VY:
-                v_y += value
+            by = lasting * columns[a]
+            if axis[a] == OMEGA:
+                turned_by = np.cumsum(np.append(heading_by[a], by))
+                found.heading_by[a, here] = turned_by[step] + share * by[step]
+                heading_by[a] = turned_by[-1]
+                moved_by = (turned_by[:-1] + ahead * columns[a]) * moved
             else:
-                omega += value
-        c, s = math.cos(theta + omega * into[i]), math.sin(theta + omega * into[i])
-        north, east = v_x * c - v_y * s, v_x * s + v_y * c
-        _derive_step(columns, axis, i, held[i], into[i], c, s, north, east, state, step)
-        moving = 1.0 if held[i] > 0.0 else 0.0
-        while knot < m and (i == n - 1 or at[knot] < t[i + 1]):
-            part = min(max(at[knot] - t[i], 0.0), held[i]) / held[i] if held[i] > 0.0 else 0.0
-            rate[knot, 0], rate[knot, 1], rate[knot, 2] = moving * north, moving * east, moving * omega
-            sums[knot, 0] = theta + part * omega * held[i]
-            sums[knot, 1] = x + part * north * held[i]
-            sums[knot, 2] = y + part * east * held[i]
-            by[:, knot] = state + part * step
-            knot += 1
-        theta, x, y = theta + omega * held[i], x + north * held[i], y + east * held[i]
-        state += step
+                moved_by = by * forward
+            sums = np.cumsum(np.append(place_by[a], moved_by))
+            # a turn and a velocity to the right move it at right angles to what is summed here
+            found.place_by[a, here] = (sums[step] + share * moved_by[step]) * (1.0 if axis[a] == VX else 1j)
+            place_by[a] = sums[-1]
+    return found
 
 
-@njit
+def displacements(path: PathKnots, start: Ints, end: Ints) -> tuple[Complexes, Complexes]:
+    """Return how far windows (w,) of a path move, forward + j right in the body frame of their start, and derivatives.
+
+    The derivatives (k + 1, w) are by the terms, and by a delay of the knots [s].
+    """
+    back, moved = np.exp(-1j * path.heading[start]), path.place[end] - path.place[start]
+    by = np.empty((len(path.heading_by) + 1, len(start)), np.complex128)
+    # the derivative of e^{-j Theta_s} times the displacement is -j dTheta_s times it
+    by[:-1] = path.place_by[:, end] - path.place_by[:, start] - 1j * path.heading_by[:, start] * moved
+    by[-1] = path.velocity[end] - path.velocity[start] - 1j * path.turn_rate[start] * moved
+    return back * moved, back * by
+
+
 def window_residuals(
-    rate: Floats, sums: Floats, by: Floats, start: Ints, end: Ints, reference: Floats, offset: float, root: Floats,
-    residual: Floats, jacobian: Floats,
-) -> None:  # fmt: skip
-    """Fill residuals, (d - d_ref) / sqrt(length), and their derivatives by terms, heading offset and delay of knots.
+    path: PathKnots, start: Ints, end: Ints, reference: Complexes, offset: float, root: Floats
+) -> tuple[Floats, Floats]:
+    """Return residuals (2 w,), (d - d_ref) / sqrt(length), forward then right, and their derivatives (2 w, k + 2).
+
+    The derivatives are by the terms, by the heading offset [rad] and by a delay of the knots [s].
 
     Parameters
     ----------
-    rate, sums, by : of `sums_at_knots`
-    start, end : (w,) knots of each window; reference : (w, 2) displacement forward and right [m]; root : (w,) [m^0.5]
+    start, end : (w,) knots of each window; reference : complex (w,) displacement [m]; root : (w,) [m^0.5]
     offset : added to the reference's heading [rad]
-    residual : (2 w,), forward then right; jacobian : (2 w, k + 2)
     """
-    k, w = len(by), len(start)
-    cos_offset, sin_offset = math.cos(offset), math.sin(offset)
-    for i in range(w):
-        s, e, scale = start[i], end[i], 1.0 / root[i]
-        c, n = math.cos(sums[s, 0]), math.sin(sums[s, 0])
-        dx, dy = sums[e, 1] - sums[s, 1], sums[e, 2] - sums[s, 2]
-        # e^{-j offset} d_ref
-        forward = reference[i, 0] * cos_offset + reference[i, 1] * sin_offset
-        right = reference[i, 1] * cos_offset - reference[i, 0] * sin_offset
-        residual[i] = (dx * c + dy * n - forward) * scale
-        residual[w + i] = (dy * c - dx * n - right) * scale
-        for a in range(k):
-            turned = by[a, s, 0]
-            # the derivative of e^{-j Theta_s} times the displacement is -j dTheta_s times it
-            gx = by[a, e, 1] - by[a, s, 1] + turned * dy
-            gy = by[a, e, 2] - by[a, s, 2] - turned * dx
-            jacobian[i, a] = (gx * c + gy * n) * scale
-            jacobian[w + i, a] = (gy * c - gx * n) * scale
-        jacobian[i, k], jacobian[w + i, k] = -right * scale, forward * scale
-        gx = rate[e, 0] - rate[s, 0] + rate[s, 2] * dy
-        gy = rate[e, 1] - rate[s, 1] - rate[s, 2] * dx
-        jacobian[i, k + 1], jacobian[w + i, k + 1] = (gx * c + gy * n) * scale, (gy * c - gx * n) * scale
+    moved, by = displacements(path, start, end)
+    turned = np.exp(-1j * offset) * reference
+    residual = (moved - turned) / root
+    by = np.insert(by, len(by) - 1, 1j * turned, axis=0) / root
+    return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T

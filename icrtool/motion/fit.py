@@ -28,7 +28,7 @@ from icrtool.kernels.robust import (
     soft_l1_weights,
     student_covariance,
 )
-from icrtool.kernels.window_residuals import OMEGA, sums_at_knots, window_residuals
+from icrtool.kernels.window_residuals import OMEGA, path_at, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
 
@@ -276,7 +276,6 @@ class WindowResiduals:
             self._gains = gyro_gains(model)
             self._axes = np.append(self._axes, [OMEGA, OMEGA])
             self._columns = np.concatenate([self._columns, np.ones((2, len(steps.t)))])
-        self._reference = np.column_stack([windows.reference.real, windows.reference.imag])
         self._root = np.sqrt(windows.length_m)
 
     def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
@@ -297,13 +296,11 @@ class WindowResiduals:
             columns[:k] += self._gains[:, None] * shift
             columns[-1] = (1.0 + parameters @ self._gains) * self._gyro_change
         at = windows.knot_t + delay
-        terms, knots, count = len(axes), len(at), len(windows.start)
-        rate, sums, by = np.empty((knots, 3)), np.empty((knots, 3)), np.empty((terms, knots, 3))
-        sums_at_knots(fixed, columns, axes, values, steps.held, steps.into, steps.t, at, rate, sums, by)
-        residual, jacobian = np.empty(2 * count), np.empty((2 * count, terms + OF_WHEELS))
-        window_residuals(
-            rate, sums, by, windows.start, windows.end, self._reference, offset, self._root, residual, jacobian
+        terms = len(axes)
+        path = path_at(
+            steps.t, steps.held, steps.into, lambda some: (fixed[:, some], axes, columns[:, some]), values, at
         )
+        residual, jacobian = window_residuals(path, windows.start, windows.end, windows.reference, offset, self._root)
         # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
         return residual, jacobian[:, [*range(k), terms, terms + 1, *range(k, terms)]]
 

@@ -148,13 +148,6 @@ class Steps(NamedTuple):
         near = rows_around(self.t, begin_s, end_s)
         return Steps._make(column[near] for column in self)
 
-    def locate(self, at: Floats) -> tuple[Ints, Floats]:
-        """Return the step in which each time lies and how much of it has passed; a gap's speeds end with its step."""
-        row = np.maximum(np.searchsorted(self.t, at, side="right") - 1, 0)
-        held = self.held[row]
-        passed = np.clip(at - self.t[row], 0.0, held)
-        return row, np.divide(passed, held, out=np.zeros(len(at)), where=held > 0.0)
-
     def gyro_change(self, some: slice = slice(None)) -> Floats:
         """Return the change of the gyro's turn rate by time (n,) [rad/s^2], of some steps; 0 where it has none."""
         rows = np.arange(*some.indices(len(self.t)))

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.direct import ends_from, fill_path_errors
+from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -98,30 +98,17 @@ def predicted_path(
     """
     of = steps if steps is not None else joined_steps(recording, 1)
 
+    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
+        gyro = of.gyro[some]
+        if own.gyro_later_s:
+            gyro = gyro + own.gyro_later_s * of.gyro_change(some)
+        motion = wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro)
+        moving = fitted.twist(motion)
+        moving[OMEGA] += own.gyro_bias_radps
+        return moving, np.empty(0, np.int64), np.empty((0, len(gyro)))
+
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
-        row, share = of.locate(at + own.wheels_later_s)
-        headings, places = np.empty(len(at)), np.empty(len(at), np.complex128)
-        heading, place = np.zeros(1), np.zeros(1, np.complex128)
-        # Some at a time: of a long drive, all of its path would take as much memory as its positions.
-        for lo in range(0, len(of.t), ROWS_AT_ONCE):
-            some = slice(lo, lo + ROWS_AT_ONCE)
-            held, gyro = of.held[some], of.gyro[some]
-            if own.gyro_later_s:
-                gyro = gyro + own.gyro_later_s * of.gyro_change(some)
-            motion = wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro)
-            v_x, v_y, omega = fitted.twist(motion)
-            omega += own.gyro_bias_radps
-            turned = held * omega
-            heading = np.cumsum(np.append(heading[-1], turned))
-            angle = heading[:-1] + of.into[some] * omega
-            cos, sin = np.cos(angle), np.sin(angle)
-            moved = np.empty(len(held), np.complex128)
-            moved.real, moved.imag = held * (v_x * cos - v_y * sin), held * (v_x * sin + v_y * cos)
-            place = np.cumsum(np.append(place[-1], moved))
-            here = np.flatnonzero((row >= lo) & (row < lo + len(held))) if len(of.t) > ROWS_AT_ONCE else slice(None)
-            k, part = row[here] - lo, share[here]
-            headings[here] = heading[k] + part * turned[k] - own.heading_offset_rad
-            places[here] = place[k] + part * moved[k]
-        return headings, places
+        path = path_at(of.t, of.held, of.into, twists, np.empty(0), at + own.wheels_later_s)
+        return path.heading - own.heading_offset_rad, path.place
 
     return at_times
