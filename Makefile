@@ -5,7 +5,7 @@ VENV         ?= .venv
 DEMO_LOG     ?= sample_logs/wheeled_lawnmower.mcap
 DEMO_OPTIONS ?= --robot segway-rmp400
 DEMO_RUN      = icrtool-runs/$(basename $(notdir $(DEMO_LOG)))
-BENCH        ?= benchmarks/run.py
+BENCH        ?=
 FUZZ         ?=
 SAMPLES      ?= sample_logs/generate.py
 JOBS         ?= 2
@@ -22,7 +22,7 @@ AXE           = $(VENV)/axe-core/axe.min.js
 AXE_VERSION   = 4.14.1
 AXE_SHA256    = 29348999450cdf2849a8e70b7912fc2da85a849da39c0d0d5394f51d4a9ed95c
 
-.PHONY: axe help setup demo format format-check lint words types test stress fuzz bench unseen docs schemas samples wheel-check check constraints clean
+.PHONY: axe help setup demo format format-check lint words types test stress fuzz bench bench-quick unseen docs schemas samples wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -79,8 +79,11 @@ $(AXE): | $(READY)
 	@echo "$(AXE_SHA256)  $(@D)/package/axe.min.js" | sha256sum --check --quiet
 	@mv $(@D)/package/axe.min.js $@
 
-bench: $(READY)  ## speed and memory, as ratios to other tools
-	$(BIN)/python $(BENCH)
+bench: $(READY)  ## speed and memory, as ratios to other tools, also in build/bench.json; BENCH=--quick takes a minute
+	$(BIN)/python benchmarks/run.py --json build/bench.json $(BENCH)
+
+bench-quick: $(READY)
+	@$(BIN)/python benchmarks/run.py --quick
 
 unseen: $(READY)  ## right, hedged or wrong on 120 physics drives with random sensors and troubles (an hour the first time)
 	$(BIN)/python benchmarks/unseen.py --drives build/unseen-drives --cases 120
@@ -99,7 +102,7 @@ wheel-check: $(READY)
 	@PYTHON=$(PYTHON) BUILD_PYTHON=$(BIN)/python DEMO_LOG="$(DEMO_LOG)" DEMO_OPTIONS="$(DEMO_OPTIONS)" scripts/check-wheel.sh
 
 check: format-check lint  ## everything CI runs, the built wheel included
-	@$(MAKE) --no-print-directory --jobs=2 types wheel-check
+	@$(MAKE) --no-print-directory --jobs=2 types wheel-check bench-quick
 	@$(MAKE) --no-print-directory test
 
 # uv resolves for every platform and Python from 3.11 on, and keeps the versions already pinned where it can.

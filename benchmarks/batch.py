@@ -29,7 +29,7 @@ DASK_SETTINGS = {  # of docs/fleet.md
 }
 
 
-def make_logs(folder: Path, count: int) -> Path:
+def make_logs(folder: Path, count: int, duration_s: float = 300.0) -> Path:
     """Simulate the logs that are not there yet."""
     logs = folder / f"logs{count}"
     logs.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def make_logs(folder: Path, count: int) -> Path:
         log = logs / f"drive{seed:03d}.mcap"
         if not log.exists():
             path = ("lawnmower", "curved", "figure-eight")[seed % 3]
-            options = ("--seed", str(seed), "--duration", "300", "--path", path, *ROBOT, *RATES)
+            options = ("--seed", str(seed), "--duration", str(duration_s), "--path", path, *ROBOT, *RATES)
             subprocess.run([*ICRTOOL, "simulate", "-q", "-o", log, *options], check=True)
             log.with_suffix(".mcap.truth.csv").unlink(missing_ok=True)
     return logs
