@@ -4,7 +4,6 @@ from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_sum
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.icrs import icr_clusters, icr_estimates
-from icrtool.output.figures.model_comparison import model_comparison
 from icrtool.output.figures.trajectory import trajectory
 
 __all__ = [
@@ -16,6 +15,5 @@ __all__ = [
     "gnss_difference",
     "icr_clusters",
     "icr_estimates",
-    "model_comparison",
     "trajectory",
 ]

@@ -14,12 +14,19 @@ import msgspec
 import numpy as np
 
 from icrtool.calibration.error_differences import ErrorEstimate
-from icrtool.calibration.record import CalibrationLog, ControllerErrors, ControllerNumbers, ErrorSources, HeldOutScore
+from icrtool.calibration.record import (
+    CalibrationLog,
+    ControllerErrors,
+    ControllerNumbers,
+    ErrorSources,
+    HeldOutScore,
+    PooledScore,
+)
 from icrtool.calibration.transfer import Difference
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.kernels.open_loop.block_sums import BlockSums
-from icrtool.motion.models import TrackGeometry, TypicalDrive
+from icrtool.motion.models import TrackGeometry
 from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
 from icrtool.records.run_document import DriveDocument, IcrDocument, InputDocument, RunDocument
 
@@ -49,7 +56,8 @@ def _nullable(hint: object) -> object:
 Parameter = plain("Parameter", {"value": float, "std": float, "verdict": Literal["shown", "not shown"]})
 FITTED = {"terms": list[str], "parameters": dict[str, Parameter], "covariance": list[list[float]]}
 Fitted = plain("Fitted", FITTED)
-GyroModel = plain("GyroModel", {"model": str} | FITTED)
+Sources = record(ErrorSources)
+GyroModel = plain("GyroModel", {"model": str, "error_sources": Sources | None} | FITTED)
 Robot = plain("Robot", {
     "name": str | None, "track_width_m": float, "wheel_radius_m": NotRequired[Number],
     "left_scale": NotRequired[float], "right_scale": NotRequired[float],
@@ -57,11 +65,12 @@ Robot = plain("Robot", {
 Errors = {key: NotRequired[hint] for key, hint in get_type_hints(record(ControllerErrors)).items()}
 CALIBRATION = FITTED | {
     "schema": Literal["icrtool/calibration/1"], "tool_version": str, "robot": Robot, "frame": str,
-    "recommended": str, "why": str, "model": str, "not_shown": list[str], "geometry": record(TrackGeometry),
-    "typical": record(TypicalDrive), "geometry_std": record(TrackGeometry, "GeometryStd"),
+    "recommended": str, "model": str, "not_shown": list[str], "geometry": record(TrackGeometry),
+    "geometry_std": record(TrackGeometry, "GeometryStd"),
     "controller": record(ControllerNumbers, "Controller", **Errors), "gyro": GyroModel | None,
     "models": dict[str, Fitted], "logs": list[record(CalibrationLog)], "held_out": list[record(HeldOutScore)],
-    "error_sources": record(ErrorSources) | None, "warnings": list[str],
+    "held_out_pooled": NotRequired[list[record(PooledScore)]],
+    "error_sources": Sources | None, "warnings": list[str],
 }  # fmt: skip
 CalibrationDocument = plain("CalibrationDocument", CALIBRATION | {"created": str})
 Recommended = plain("Recommended", CALIBRATION)
@@ -71,7 +80,8 @@ SUMMARY = {
 }  # fmt: skip
 Summary = plain("Summary", SUMMARY)
 SummaryRow = plain("SummaryRow", SUMMARY | dict.fromkeys(
-    ("expected_pct", "p95_pct", "expected_low_m", "expected_high_m", "p95_low_m", "p95_high_m"), Number
+    ("expected_pct", "p95_pct", "expected_low_m", "expected_high_m", "p95_low_m", "p95_high_m",
+     "heading_expected_deg", "heading_p95_deg"), Number
 ))  # fmt: skip
 Blocks = record(BlockSums, "Blocks", horizon_m=float, errors_m=list[float], trials=list[int], above_p50=list[int],
                 above_p95=list[int])  # fmt: skip
@@ -100,7 +110,7 @@ Score = plain("Score", {
 Fit = plain("Fit", {"value": dict[str, Number], "std": dict[str, Number]})
 Ladder = plain("Ladder", {
     "left_out": str, "horizons_m": list[float], "blocks": int, "starts": int, "heading": str | None,
-    "notes": list[str], "extended_by_block": list[str], "best": str, "models": list[Score], "fits": dict[str, Fit],
+    "notes": list[str], "models": list[Score], "width_m": float, "fits": dict[str, Fit],
 }, total=False)  # fmt: skip
 GateDocument = record(
     Gate, value_m=Number, value_bound_m=Number, baseline_m=Number, margin_m=Number, margin_low_m=Number,
@@ -114,6 +124,7 @@ Outage = plain("Outage", {
     "max_error_m": Number,
 })  # fmt: skip
 Trial = plain("Trial", {
+    "model": str,
     "stamp_ns": int, "t_s": float, "north_m": float, "east_m": float, "horizon_m": float, "heading_change_deg": float,
     "speed_mean_mps": float, "errors_m": dict[str, Number],
 })  # fmt: skip

@@ -10,7 +10,7 @@ from icrtool.calibration.error_growth import TWIST_OVER_M, nonnegative
 from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.motion.models import CONTROLLER, TERMS, FittedModel
+from icrtool.motion.models import CONTROLLER, NO_SLIP, RECOMMENDED, TERMS, FittedModel
 from icrtool.motion.recording import LogConstants, Recording, Windows
 from icrtool.motion.trials import predicted_path
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -26,8 +26,8 @@ LARGEST_SHARE = 0.5
 def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
     """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
     reasons = [one for one in calibration.warnings if one.startswith("not usable")]
-    p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
-    _, without = calibration.held_out_m("no_slip", POSE_AFTER_M)
+    p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
+    _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
     if p95 > LARGEST_SHARE * POSE_AFTER_M:
         reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out)")
     if expected >= without:
@@ -84,7 +84,7 @@ def controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: Held
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
         p95_m=float(table.score(CONTROLLER).together.p95[h]),
-        full_p95_m=float(table.score("recommended").together.p95[h]),
+        full_p95_m=float(table.score(RECOMMENDED).together.p95[h]),
     )
 
 
@@ -94,7 +94,7 @@ def _window_errors(cut: Sequence[tuple[int, Recording, Windows]], length_m: floa
     for i, recording, windows in cut:
         these = np.flatnonzero(windows.length_m == length_m)
         for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
-            if (found := table.expressed(fold)) is not None:
+            if (found := table.without(CONTROLLER, fold)) is not None:
                 rows.append(_fold_errors(recording, windows, these[some], *found))
     return np.concatenate(rows)
 

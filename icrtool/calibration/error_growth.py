@@ -191,8 +191,10 @@ def cut_error_windows(recordings: Sequence[Recording]) -> list[tuple[int, Record
     return found
 
 
-def measure_error_sources(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ErrorSources | None:
-    """Return the sources of error of a held-out table's recommended model, from windows of what it was not fitted to.
+def measure_error_sources(
+    cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut, name: str
+) -> ErrorSources | None:
+    """Return the sources of error of a row of a held-out table, from windows of what it was not fitted to.
 
     Parameters
     ----------
@@ -215,7 +217,7 @@ def measure_error_sources(cut: Sequence[tuple[int, Recording, Windows]], table: 
         tested = np.zeros(len(begin), np.bool_)
         for fold, of_fold in left_out(table.folds, i, windows.start_m, windows.end_m):
             some = of_fold[windows.length_m[of_fold] >= LENGTHS_M[0]]
-            if not len(some) or (predicted := table.without(fold)) is None:
+            if not len(some) or (predicted := table.without(name, fold)) is None:
                 continue
             fitted, own = predicted
             steps = windows.steps.around(begin[some].min(), end[some].max())

@@ -1,20 +1,31 @@
-"""Fit with a recommendation: what ``icrtool.fit`` and ``icrtool fit`` do."""
+"""Fit with one motion model: what ``icrtool.fit`` and ``icrtool fit`` do."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
+
+import numpy as np
 
 from icrtool.calibration.from_runs import robot_of
-from icrtool.calibration.held_out import recommend
-from icrtool.calibration.record import fitted_document
+from icrtool.calibration.held_out import fit_models
+from icrtool.calibration.record import ControllerNumbers, controller_numbers, fitted_document
 from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit as fit_filter
-from icrtool.records.run import Run, WarmStart
-from icrtool.records.run_document import RecommendedDocument
+from icrtool.estimation.observability import WEAK_SHARE
+from icrtool.kernels.arrays import Floats
+from icrtool.motion.models import FIVE, ICRS, RECOMMENDED, TrackGeometry
+from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, width_or_usual_m
+from icrtool.records.run_document import (
+    ControllerDocument,
+    GeometryDocument,
+    MotionDocument,
+    RecommendedDocument,
+    RunDocument,
+)
 from icrtool.records.tables import RobotLog
 
 
@@ -27,7 +38,7 @@ def fit(
     smooth: bool = False,
     watch: Callable[[str], None] | None = None,
 ) -> Run:
-    """Learn a robot's track ICRs from a log, and which motion model to use.
+    """Learn a robot's track ICRs from a log, and its motion model.
 
     Parameters
     ----------
@@ -41,7 +52,8 @@ def fit(
     Returns
     -------
     Run
-        No file is touched. `summary` holds the recommended model, as `icrtool.calibrate` would recommend it.
+        No file is touched. `summary` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
+        controller is given.
 
     Raises
     ------
@@ -54,23 +66,71 @@ def fit(
     logs = [log]
     del log
     run = fit_filter(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
-    return replace(run, summary=run.summary | {"recommended": recommendation(run)})
+    return replace(run, summary=cast("RunDocument", {**run.summary, **motion_of(run)}))
 
 
-def recommendation(run: Run) -> RecommendedDocument | None:
-    """Return the model, parameters and controller numbers that `calibrate` recommends for a run, without scores.
+def motion_of(run: Run) -> MotionDocument:
+    """Return motion model, ICRs and controller numbers of a run, for its summary.
 
-    Returns
-    -------
-    None where the track width is not known, or the drive is too short to fit on one part and test on another.
+    Notes
+    -----
+    ICRs and controller numbers come from one fit of `FIVE` to the windows of the drive, so that
+    (right - left) / b is the multiplier. With preset ``paper`` they are those of the filter at the end.
     """
-    if run.track_width_m is None:
-        return None
-    recording = recording_of(run)
+    recording = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     try:
-        found = recommend([recording])
+        fits = fit_models([recording], (FIVE, RECOMMENDED)).fits
     except DataError:
-        return None
+        fits = {}
+    if run.config.filter.preset == "paper":
+        geometry, covariance = _of_filter(run, recording.width_m)
+    elif FIVE in fits:
+        geometry, covariance = fits[FIVE].geometry(recording.width_m)
+    else:
+        return {"recommended": None, "geometry": None, "controller": None}
     robot = robot_of(run) | {"track_width_m": recording.width_m}
-    plain = fitted_document(found.fit, found.controller, robot, found.typical)
-    return cast("RecommendedDocument", {"label": found.fit.model.label, "why": found.why} | plain)
+    found = None
+    if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
+        fit = fits[RECOMMENDED]
+        plain: dict[str, Any] = {"label": fit.model.label}
+        found = cast("RecommendedDocument", plain | fitted_document(fit, geometry, covariance, robot))
+    shown = _shown(run, geometry, covariance)
+    numbers = controller_numbers(geometry, covariance, robot)
+    return {
+        "recommended": found,
+        "geometry": _geometry_document(geometry, covariance, shown),
+        "controller": _controller_document(numbers) if found is not None and all(shown[:2]) else None,
+    }
+
+
+def _of_filter(run: Run, width_m: float) -> tuple[TrackGeometry, Floats]:
+    """Return the filter's final ICRs, with radii as configured, and their covariance (6, 6)."""
+    right, left, x = run.table.icrs_at(-1)
+    by_icr = np.zeros((len(TrackGeometry._fields), ICRS))
+    by_icr[:ICRS] = np.eye(ICRS)
+    by_icr[ICRS, :2] = 1.0 / width_m, -1.0 / width_m
+    covariance: Floats = by_icr @ np.array(run.summary["icr"]["final_covariance_m2"]) @ by_icr.T
+    return TrackGeometry(right, left, x, (right - left) / width_m, 1.0, 1.0), covariance
+
+
+def _shown(run: Run, geometry: TrackGeometry, covariance: Floats) -> list[bool]:
+    """Return whether each ICR is shown: by the excitation of the drive, and by its own standard deviation."""
+    verdicts: Any = run.summary["excitation"]["verdict"]
+    largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
+    std = np.sqrt(np.diag(covariance)[:ICRS])
+    paper = run.config.filter.preset == "paper"
+    return [
+        paper or (verdicts[name] != "not shown" and bool(one <= largest))
+        for name, one in zip(ICR_COLUMNS, std, strict=True)
+    ]
+
+
+def _geometry_document(geometry: TrackGeometry, covariance: Floats, shown: list[bool]) -> GeometryDocument:
+    values: dict[str, Any] = {}
+    for name, value, variance, seen in zip(ICR_COLUMNS, geometry, np.diag(covariance), shown, strict=False):
+        values[name], values[f"{name}_std"] = (float(value), float(np.sqrt(variance))) if seen else (None, None)
+    return cast("GeometryDocument", values | {"covariance_m2": covariance[:ICRS, :ICRS].tolist()})
+
+
+def _controller_document(numbers: ControllerNumbers) -> ControllerDocument:
+    return cast("ControllerDocument", numbers._asdict())

@@ -47,7 +47,7 @@ def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     result = calibrate_recordings(recordings, robots[0])
     known = alone if len(recordings) == 1 else tuple(dict.fromkeys(warnings))
-    return replace(result, calibration=replace(result.calibration, warnings=known))
+    return result._replace(calibration=replace(result.calibration, warnings=known))
 
 
 def robot_of(run: Run) -> dict[str, Any]:

@@ -1,97 +1,83 @@
-"""The models of one run, each tested on distance it was not fitted to, all in the same trials.
+"""The models of one run, each tested on distance it was not fitted to.
 
 What is fitted is fitted on windows that keep clear of the trials that it is tested in (`icrtool.calibration.held_out`);
-the filter's own ICRs, momentary and final, stand beside.
+the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn by it and by the wheels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.calibration.from_runs import robot_of, use_warnings
-from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import ErrorsOf, calibration_from, held_out_predictor
+from icrtool.calibration.held_out import GYRO, HeldOut, hold_out
+from icrtool.calibration.pooled import calibration_from
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
-from icrtool.kernels.open_loop.error_statistics import error_summary
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Summary
-from icrtool.motion.models import FittedModel
+from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath
+from icrtool.motion.models import NO_SLIP, FittedModel
 from icrtool.motion.recording import Recording
-from icrtool.motion.trials import Trials
-from icrtool.records.dropout import MeasuredHeading, ModelScore
+from icrtool.motion.trials import ErrorsOf, TrialErrors, Trials
+from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, width_or_usual_m
 
-FAMILY = {"no_slip": "no_slip", "multiplier": "multiplier", "window": "icr", "extended": "recommended"}
-"""Names of the table's rows (public) and of the models of the family that they are."""
+FILTER_LABELS = {"icr": "ICR, momentary", "icr_final": "ICR, final"}
 
-ROWS = {of: row for row, of in FAMILY.items()}
-
-MODELS = ("no_slip", "multiplier", "icr", "icr_final", "window", "extended")
-"""In the order of the table. Each but the multiplier may come again with a measured heading, ``_gyro`` or ``_heading``
-behind its name."""
-
-LABELS = {
-    "no_slip": "no slip", "multiplier": "best multiplier", "icr": "ICR, momentary", "icr_final": "ICR, final",
-    "window": "window fit", "extended": "extended",
-}  # fmt: skip
-FITTED_TO = {
-    "no_slip": "never", "multiplier": "others", "icr": "before", "icr_final": "all", "window": "others",
-    "extended": "others",
-}  # fmt: skip
+FITTED_TO = {"icr": "before", "icr_final": "all", NO_SLIP: "never"}
+"""What a row's numbers were learned from; those of the others from the rest of the drive."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelComparison:
-    """The table.
+    """How the rows of a report were tested that are not the filter's.
 
     Attributes
     ----------
-    blocks : of distance, by which a model is chosen
+    blocks : of distance, which a trial's own is left out with its neighbours
     starts : trials start from so many states
-    chosen : name of the model of the family chosen for each block, without it
-    fits : of all windows, by name in the family: what to use, not what was tested
-    best : the model recommended for the whole log
+    fits : of all windows, by model name: what to use, not what was tested
     width_m : track width b, or what stands for it
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
     notes : what was left out of the table and why, and what was corrected
     calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
     """
 
-    horizons_m: tuple[float, ...]
     blocks: int
     starts: int
-    scores: tuple[ModelScore, ...]
-    chosen: tuple[str, ...]
     fits: dict[str, FittedModel]
-    best: str
     width_m: float
     heading: str
     notes: tuple[str, ...]
     calibration: Calibration | None
 
-    @property
-    def summaries(self) -> dict[str, Summary]:
-        """The errors of each row, by its name."""
-        return {score.name: score.summary for score in self.scores}
 
-    def score(self, name: str) -> ModelScore:
-        """Return a score by name."""
-        return next(score for score in self.scores if score.name == name)
+class ComparedRow(NamedTuple):
+    """A row that is not the filter's.
+
+    Attributes
+    ----------
+    errors_of : its errors in trials; path : its path from one state to another, None where it has none
+    """
+
+    name: str
+    label: str
+    errors_of: ErrorsOf
+    path: Callable[[int, int], OpenLoopPath | None] | None = None
 
 
 class ComparedModels(NamedTuple):
-    """The table, what gives the errors of the recommended model in any trials, and the run's drive."""
+    """How models were compared, the rows, the trials that they are tested in, and the run's drive."""
 
     table: ModelComparison
-    recommended: ErrorsOf
+    rows: tuple[ComparedRow, ...]
+    trials: Trials
     drive: Drive
 
 
@@ -114,35 +100,28 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
     recording, heading, notes = _with_heading(run, headings)
-    wheels, turned = hold_out([recording])
+    found = hold_out([recording])
     give_back_freed()
-    (trials,) = wheels.trials
-    scores = list(_wheels_scores(run, recording, trials, wheels))
-    if turned is not None:
-        scores += _turned_scores(run, recording, trials, turned, heading)
+    (trials,) = found.trials
     table = ModelComparison(
-        horizons_m=HORIZONS_M,
-        blocks=len(wheels.folds),
+        blocks=len(found.folds),
         starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
-        scores=tuple(scores),
-        chosen=wheels.chosen,
-        fits={name: fit.fitted for name, fit in (wheels.fits | (turned.fits if turned else {})).items()},
-        best=wheels.recommended,
+        fits={name: fit.fitted for name, fit in found.fits.items()},
         width_m=recording.width_m,
         heading=heading,
         notes=notes,
-        calibration=_calibration(run, recording, wheels, turned if heading == "gyro" else None),
+        calibration=_calibration(run, found),
     )
     drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-    return ComparedModels(table, held_out_predictor([recording], wheels, 0), drive)
+    rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
+    return ComparedModels(table, tuple(rows), trials, drive)
 
 
-def _calibration(run: Run, recording: Recording, wheels: HeldOut, gyro: HeldOut | None) -> Calibration | None:
-    """Return the calibration of a run from the tables that compare its models."""
+def _calibration(run: Run, found: HeldOut) -> Calibration | None:
+    """Return the calibration of a run from the table that compares its models; an attitude is no gyro."""
     if run.track_width_m is None:
         return None
-    found = calibration_from([recording], wheels, gyro, robot_of(run))
-    return replace(found, warnings=use_warnings(run))
+    return replace(calibration_from(found, robot_of(run)), warnings=use_warnings(run))
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
@@ -161,53 +140,26 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     return plain, "", tuple(notes)
 
 
+def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
+    """Yield the held-out rows, those of the filter's ICRs with a measured heading last."""
+    for name, label in found.rows.items():
+        if name == NO_SLIP:
+            continue
+        public, shown = name.replace(GYRO, f"_{kind}"), label.replace("gyro", kind)
+        yield ComparedRow(public, shown, partial(found.errors, name, 0), partial(found.path, name, 0))
+    if found.has_gyro:
+        (recording,) = found.recordings
+        path = turned_path(run, recording)
+        for name, label in FILTER_LABELS.items():
+            errors_of = partial(_errors_along, path, recording.drive, _icrs_of(run, name))
+            yield ComparedRow(f"{name}_{kind}", f"{label} + {kind}", errors_of)
+
+
 def _icrs_of(run: Run, name: str) -> FrozenIcrs:
     """Return the filter's ICRs, momentary or final."""
     if name == "icr":
         return FrozenIcrs(run.table.y_icr_right_m, run.table.y_icr_left_m, run.table.x_icr_m)
     return FrozenIcrs.constant(*run.table.icrs_at(-1))
-
-
-def _wheels_scores(run: Run, recording: Recording, trials: Trials, table: HeldOut) -> Iterator[ModelScore]:
-    for name in MODELS:
-        if name in FAMILY:
-            if name == "no_slip" and run.track_width_m is None:
-                continue
-            summary = table.score(FAMILY[name]).together
-        else:
-            # the filter's ICRs are those of the speeds that it saw
-            drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-            summary = error_summary(_errors_of_filter(drive, _icrs_of(run, name), trials))
-        yield ModelScore(name, LABELS[name], FITTED_TO[name], False, summary)
-
-
-def _errors_of_filter(drive: Drive, icrs: FrozenIcrs, trials: Trials) -> Floats:
-    """Return the errors (k, h) [m] of the filter's ICRs, some starts at a time."""
-    order = np.argsort(trials.starts, kind="stable")
-    starts, errors = trials.starts[order], np.empty(trials.ends.shape)
-    for lo in range(0, len(drive.distance), ROWS_AT_ONCE):
-        hi = min(lo + ROWS_AT_ONCE, len(drive.distance))
-        some = slice(*np.searchsorted(starts, [lo, hi]))
-        ends = np.full((hi - lo, trials.ends.shape[1]), -1, np.int64)
-        ends[starts[some] - lo] = trials.ends[order[some]]
-        errors[order[some]] = open_loop_errors(drive, icrs, ends, lo)[starts[some] - lo]
-    return errors
-
-
-def _turned_scores(
-    run: Run, recording: Recording, trials: Trials, table: HeldOut, kind: str
-) -> Iterator[ModelScore]:  # fmt: skip
-    """Yield the models that turn by wheels and a measured heading; a multiplier alone gives no path."""
-    path = turned_path(run, recording)
-    for name in MODELS:
-        if name == "multiplier" or (name == "no_slip" and run.track_width_m is None):
-            continue
-        if name in FAMILY:
-            of = FAMILY[name]
-            summary = table.score(of if of == "recommended" else f"{of}_gyro").together
-        else:
-            summary = error_summary(_errors_along(path, recording.drive, trials, _icrs_of(run, name)))
-        yield ModelScore(f"{name}_{kind}", f"{LABELS[name]} + {kind}", FITTED_TO[name], True, summary)
 
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
@@ -222,8 +174,8 @@ def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     return psi, np.cumsum(place, out=place)
 
 
-def _errors_along(path: tuple[Floats, Complexes], drive: Drive, trials: Trials, icrs: FrozenIcrs) -> Floats:
-    """Return the errors (k, h) [m] of ICRs (n,) or (1,) along the path of `turned_path`.
+def _errors_along(path: tuple[Floats, Complexes], drive: Drive, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
+    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`.
 
     Notes
     -----
@@ -231,7 +183,7 @@ def _errors_along(path: tuple[Floats, Complexes], drive: Drive, trials: Trials, 
     ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
     psi, place = path
-    errors: Floats = np.full(trials.ends.shape, np.nan)
+    errors = TrialErrors.none(trials.ends.shape)
     for h in range(trials.ends.shape[1]):
         some = trials.ends[:, h] >= 0
         s, e = trials.starts[some], trials.ends[some, h]
@@ -239,5 +191,6 @@ def _errors_along(path: tuple[Floats, Complexes], drive: Drive, trials: Trials, 
         arm = (right + left) / 2.0 - 1j * x
         moved = place[e] - place[s] - 1j * arm * (np.exp(1j * psi[e]) - np.exp(1j * psi[s]))
         driven = drive.north[e] - drive.north[s] + 1j * (drive.east[e] - drive.east[s])
-        errors[some, h] = np.abs(np.exp(1j * (drive.heading[s] - psi[s])) * moved - driven)
+        errors.position[some, h] = np.abs(np.exp(1j * (drive.heading[s] - psi[s])) * moved - driven)
+        errors.heading[some, h] = np.abs(psi[e] - psi[s] - drive.heading[e] + drive.heading[s])
     return errors

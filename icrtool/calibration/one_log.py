@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from icrtool.calibration.run_recording import known_antenna_m
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records.measurements import RESPONSE_S
@@ -232,7 +233,7 @@ def _derive(run: Run, direct: tuple[Parameter, ...], x_icr_m: float | None) -> t
     """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
     by_key = {one.key: one for one in direct}
     ahead, aside, separation = (by_key[kind.key] for kind in (AHEAD, ASIDE, SEPARATION))
-    forward, right = _known_antenna(run)
+    forward, right = known_antenna_m(run)
     fix = "position determines only antenna forward − x ICR: give frames.antenna_forward_m, or --x-icr"
     found = []
     if forward is not None:
@@ -261,16 +262,6 @@ def _derive(run: Run, direct: tuple[Parameter, ...], x_icr_m: float | None) -> t
         Parameter("y_icr_right_m", "y ICR right", middle + half, stds[0], verdict, note),
         Parameter("y_icr_left_m", "y ICR left", middle - half, stds[1], verdict, note),
         x,
-    )
-
-
-def _known_antenna(run: Run) -> tuple[float | None, float | None]:
-    """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
-    used, given = run.sensors.antenna_m, run.config.frames
-    in_log = run.summary["filter"].get("antenna_is_known", False) and given.antenna_right_m == "auto"
-    return (
-        used[0] if in_log or given.antenna_forward_m != "auto" else None,
-        used[1] if in_log or given.antenna_right_m != "auto" else None,
     )
 
 

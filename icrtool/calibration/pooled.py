@@ -3,37 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import cut_error_windows, measure_error_sources
-from icrtool.calibration.held_out import HeldOut, errors_without, hold_out
-from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore
+from icrtool.calibration.held_out import GYRO, HeldOut, errors_without, hold_out
+from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore, PooledScore
 from icrtool.errors import ConfigError
-from icrtool.kernels.arrays import Floats
 from icrtool.motion.fit import Fold, Prediction, own_constants
+from icrtool.motion.models import MODELS, RECOMMENDED
 from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import Trials
+from icrtool.motion.trials import ErrorsOf
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationResult:
-    """A calibration with the tables it was chosen by; `gyro` is None where a log has no gyro."""
+class CalibrationResult(NamedTuple):
+    """A calibration with the table that it was tested by."""
 
     calibration: Calibration
-    wheels: HeldOut
-    gyro: HeldOut | None
+    table: HeldOut
     notes: tuple[str, ...]
 
 
 def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
-    """Fit every model to all recordings, test each on what it was not fitted to, recommend one.
+    """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
     Parameters
     ----------
@@ -54,41 +51,33 @@ def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, An
     known = [one for one in recordings if one.sha256]
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
-    wheels, gyro = hold_out(recordings)
-    return CalibrationResult(calibration_from(recordings, wheels, gyro, robot), wheels, gyro, _notes(recordings))
+    table = hold_out(recordings)
+    return CalibrationResult(calibration_from(table, robot), table, _notes(recordings))
 
 
-def calibration_from(
-    recordings: Sequence[Recording], wheels: HeldOut, gyro: HeldOut | None, robot: Mapping[str, Any] | None = None
-) -> Calibration:
-    """Return the calibration that the held-out tables of recordings recommend."""
-    best = wheels.fits[wheels.recommended]
+def calibration_from(table: HeldOut, robot: Mapping[str, Any] | None = None) -> Calibration:
+    """Return the calibration of the recordings that a held-out table is of."""
+    recordings, best = table.recordings, table.fits[RECOMMENDED]
+    constants = [best.constants(i) for i in range(len(recordings))]
     logs = tuple(
         CalibrationLog(
-            one.name,
-            one.path,
-            one.sha256,
-            float(one.drive.distance[-1]),
-            math.degrees(best.constants(i).heading_offset_rad),
-            -best.constants(i).wheels_later_s,
-            one.begin_ns,
+            one.name, one.path, one.sha256, float(one.drive.distance[-1]), math.degrees(own.heading_offset_rad),
+            -own.wheels_later_s, one.begin_ns,
         )
-        for i, one in enumerate(recordings)
-    )
+        for one, own in zip(recordings, constants, strict=True)
+    )  # fmt: skip
     cut = cut_error_windows(recordings)
-    scores = [*_scores(wheels), *(_scores(gyro) if gyro is not None else ())]
     return Calibration(
         robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
         fitted=best.fitted,
-        others={name: fit.fitted for name, fit in wheels.fits.items()},
-        gyro=None if gyro is None else gyro.fits[gyro.recommended].fitted,
-        typical=wheels.typical,
-        why=wheels.why,
+        others={name: table.fits[name].fitted for name in MODELS},
+        gyro=table.fits[f"{RECOMMENDED}{GYRO}"].fitted if table.has_gyro else None,
         logs=logs,
-        held_out=tuple(scores),
-        controller=controller_errors(cut, wheels),
-        sources=measure_error_sources(cut, wheels),
-        gyro_sources=None if gyro is None else measure_error_sources(cut, gyro),
+        held_out=tuple(_scores(table)),
+        pooled=tuple(_pooled(table)),
+        controller=controller_errors(cut, table),
+        sources=measure_error_sources(cut, table, RECOMMENDED),
+        gyro_sources=measure_error_sources(cut, table, f"{RECOMMENDED}{GYRO}") if table.has_gyro else None,
         warnings=(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool_version=__version__,
@@ -102,17 +91,19 @@ def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
     """Yield the rows of ``held_out``; a score without trials is left out."""
-    gyro = "_gyro" if any(fit.model.uses_gyro for fit in table.fits.values()) else ""
     for row in table.scores:
-        name = f"{row.name}{gyro}" if row.name == "recommended" else row.name
         for fold, summary in zip(table.folds, row.folds, strict=True):
             for h, horizon in enumerate(table.horizons_m):
                 if summary.trials[h]:
-                    yield HeldOutScore(name, horizon, float(summary.p95[h]), float(summary.expected[h]), fold.name)
+                    yield HeldOutScore(row.name, horizon, float(summary.p95[h]), float(summary.expected[h]), fold.name)
 
 
-ErrorsOf = Callable[[Trials], Floats]
-"""Gives the errors (k, h) [m] of a model in trials, NaN where there is none."""
+def _pooled(table: HeldOut) -> Iterator[PooledScore]:
+    """Yield the scores of all trials together; one without trials is left out."""
+    for row in table.scores:
+        for h, horizon in enumerate(table.horizons_m):
+            if row.together.trials[h]:
+                yield PooledScore(row.name, horizon, float(row.together.p95[h]), float(row.together.expected[h]))
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
@@ -147,15 +138,3 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
-
-
-def held_out_predictor(recordings: Sequence[Recording], table: HeldOut, i: int) -> ErrorsOf:
-    """Return what gives the errors of the recommended model in recording i, predicted without what a trial touches.
-
-    Notes
-    -----
-    See `icrtool.calibration.held_out.left_out`. Trials for which too little is left to fit to have no error.
-    """
-    # Models of the wheels alone: a long log's gyro need not be kept for them.
-    recording = replace(recordings[i], gyro_radps=None)
-    return lambda trials: errors_without(recording, trials, table.folds, i, table.without)

@@ -16,7 +16,7 @@ import numpy as np
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.motion.models import CONTROLLER, FittedModel, TrackGeometry, TypicalDrive, wheel_motion
+from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import CALIBRATION_SCHEMA, WarmStart
@@ -32,6 +32,15 @@ class HeldOutScore(NamedTuple):
     p95_m: float
     expected_m: float
     log: str
+
+
+class PooledScore(NamedTuple):
+    """Errors of one model at one horizon, of the held-out trials of all logs, or blocks of one, together."""
+
+    model: str
+    horizon_m: float
+    p95_m: float
+    expected_m: float
 
 
 class CalibrationLog(NamedTuple):
@@ -135,12 +144,11 @@ class Calibration:
     ----------
     robot : name (or None), track_width_m, wheel_radius_m (or None), encoder_counts_per_rev where configured; older
         files: left_scale, right_scale as configured
-    fitted : the recommended model; others : every model, by name
+    fitted : the recommended model; others : every model that was fitted, by name
     gyro : the recommended model with a gyro, None where a log has none
-    typical : curvature and speed at which ICRs and multiplier are stated
-    why : reason for the recommendation
     logs : what it was fitted to
-    held_out : scores by model, horizon and log; ``recommended`` is what was chosen without that log
+    held_out : scores by model, horizon and log, each predicted without that log, or block of a single one
+    pooled : scores of all these trials together; empty in files of earlier versions
     controller : errors of what a controller can express; None where the drive is too short to measure them
     sources, gyro_sources : variances of what the model leaves out, wheels alone and with a gyro; None where the drive
         is too short to measure them
@@ -153,8 +161,6 @@ class Calibration:
     fitted: FittedModel
     others: Mapping[str, FittedModel]
     gyro: FittedModel | None
-    typical: TypicalDrive
-    why: str
     logs: tuple[CalibrationLog, ...]
     held_out: tuple[HeldOutScore, ...]
     controller: ControllerErrors | None
@@ -164,6 +170,7 @@ class Calibration:
     name: str = field(default="", compare=False)
     sources: ErrorSources | None = None
     gyro_sources: ErrorSources | None = None
+    pooled: tuple[PooledScore, ...] = ()
 
     @property
     def recommended(self) -> str:
@@ -176,13 +183,12 @@ class Calibration:
         return float(self.robot["track_width_m"])
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs [m] of the recommended model, multipliers and radius factors, and their covariance (7, 7)."""
-        # older files have no model of a controller
-        return self.fitted.geometry(self.width_m, self.typical, self.others.get(CONTROLLER))
+        """Return ICRs [m], multiplier and radius factors, from one fit, and their covariance (6, 6)."""
+        return self.others.get(FIVE, self.fitted).geometry(self.width_m)
 
     def controller_numbers(self) -> ControllerNumbers:
-        """Return multiplier and radius factors for a controller, fitted to what it can express."""
-        return _controller_numbers(*self.geometry(), self.robot)
+        """Return multiplier and radius factors for a controller."""
+        return controller_numbers(*self.geometry(), self.robot)
 
     def log_names(self) -> str:
         """Return the names of the logs that it was fitted to, and their number."""
@@ -190,8 +196,12 @@ class Calibration:
         return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
-        """Return p95 and expected error [m] of a row of the held-out table, median over logs or blocks, or NaN."""
-        rows = [one for one in self.held_out if one.model == model and one.horizon_m == horizon_m]
+        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without one.
+
+        A file of an earlier version has them by log or block alone: then the median over these.
+        """
+        scores: tuple[PooledScore | HeldOutScore, ...] = self.pooled or self.held_out
+        rows = [one for one in scores if one.model == model and one.horizon_m == horizon_m]
         if not rows:
             return float("nan"), float("nan")
         return float(np.median([one.p95_m for one in rows])), float(np.median([one.expected_m for one in rows]))
@@ -284,14 +294,14 @@ class Calibration:
             "robot": dict(self.robot),
             "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
             "recommended": self.recommended,
-            "why": self.why,
-            **fitted_document(self.fitted, self.others.get(CONTROLLER), self.robot, self.typical),
+            **fitted_document(self.fitted, *self.geometry(), self.robot),
             "gyro": None
             if self.gyro is None
             else {"model": self.gyro.model.name, **_plain(self.gyro), "error_sources": _sources(self.gyro_sources)},
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
+            "held_out_pooled": [score._asdict() for score in self.pooled],
             "controller": plain(
                 self.controller_numbers()._asdict() | ({} if self.controller is None else self.controller._asdict())
             ),
@@ -301,22 +311,20 @@ class Calibration:
 
 
 def fitted_document(
-    fitted: FittedModel, controller: FittedModel | None, robot: Mapping[str, Any], typical: TypicalDrive
+    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return plain data of a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
-    geometry, covariance = fitted.geometry(float(robot["track_width_m"]), typical, controller)
     return {
         "model": fitted.model.name,
         **_plain(fitted),
         "not_shown": list(fitted.not_shown),
         "geometry": geometry._asdict(),
-        "typical": typical._asdict(),
         "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        "controller": _controller_numbers(geometry, covariance, robot)._asdict(),
+        "controller": controller_numbers(geometry, covariance, robot)._asdict(),
     }
 
 
-def _controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:
+def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:
     """Return multiplier and radius factors with one standard deviation each."""
     std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     left, right = float(robot.get("left_scale", 1.0)), float(robot.get("right_scale", 1.0))

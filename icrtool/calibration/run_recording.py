@@ -11,6 +11,7 @@ from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
+from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
@@ -57,8 +58,19 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         sha256=inputs[0]["sha256"] if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
         slipping=run.slipping if run.sensors.events else None,
+        lever=Lever(*(place is not None for place in known_antenna_m(run))),
     )
     return plain if heading is None else with_turn_rate(plain, heading)
+
+
+def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
+    """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
+    used, given = run.sensors.antenna_m, run.config.frames
+    in_log = run.summary["filter"].get("antenna_is_known", False) and given.antenna_right_m == "auto"
+    return (
+        used[0] if in_log or given.antenna_forward_m != "auto" else None,
+        used[1] if in_log or given.antenna_right_m != "auto" else None,
+    )
 
 
 def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:

@@ -9,9 +9,16 @@ from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
 import msgspec
 import numpy as np
 
-from icrtool.calibration.record import Calibration, CalibrationLog, ControllerErrors, ErrorSources, HeldOutScore
+from icrtool.calibration.record import (
+    Calibration,
+    CalibrationLog,
+    ControllerErrors,
+    ErrorSources,
+    HeldOutScore,
+    PooledScore,
+)
 from icrtool.config import Positive
-from icrtool.motion.models import FittedModel, TypicalDrive, find_model
+from icrtool.motion.models import FittedModel, find_model
 from icrtool.records.run import CALIBRATION_SCHEMA
 from icrtool.records.text import escaped
 
@@ -21,7 +28,7 @@ WIDEST_M = 20.0
 LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
-Record = TypeVar("Record", TypicalDrive, CalibrationLog, HeldOutScore, ControllerErrors, ErrorSources)
+Record = TypeVar("Record", CalibrationLog, HeldOutScore, PooledScore, ControllerErrors, ErrorSources)
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
@@ -54,10 +61,9 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
             fitted=fitted,
             others={name: _fitted(name, one) for name, one in document["models"].items()},
             gyro=None if gyro is None else replace(_fitted(gyro["model"], gyro), wheels=fitted),
-            typical=_record(TypicalDrive, document["typical"]),
-            why=_text(document["why"]),
             logs=tuple(_record(CalibrationLog, log) for log in document["logs"]),
             held_out=tuple(_record(HeldOutScore, score) for score in document["held_out"]),
+            pooled=tuple(_record(PooledScore, score) for score in document.get("held_out_pooled", ())),
             controller=_record(ControllerErrors, controller) if "pose_variance" in controller else None,
             warnings=tuple(map(_text, document["warnings"])),
             created=_text(document["created"]),
@@ -67,8 +73,6 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
         )
     except msgspec.ValidationError as err:
         raise ValueError(str(err)) from err
-    if not np.isfinite(list(found.typical)).all():
-        raise ValueError("typical")
     with np.errstate(all="ignore"):
         geometry, covariance = found.geometry()
         if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):

@@ -17,13 +17,13 @@ import numpy as np
 
 from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, held_out_predictor, predictor
+from icrtool.calibration.pooled import CalibrationResult, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
-from icrtool.motion.models import TrackGeometry
+from icrtool.motion.models import RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import CHOICE_HORIZON_M, DEFAULT_SEED
@@ -171,8 +171,8 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, HORIZONS_M)
-        errors_of = held_out_predictor(recordings, result.wheels, i) if own else predictor(result.calibration, one)
-        errors.append(errors_of(trials))
+        found = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
+        errors.append(found.position)
         path.append(before + one.drive.distance[trials.starts])
         before = path[-1][-1]
     return _Tested(np.concatenate(errors), np.concatenate(path))

@@ -13,9 +13,8 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import BlockSums
-from icrtool.kernels.open_loop.trials import Summary
-from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
+from icrtool.motion.models import FAMILY
+from icrtool.records.dropout import METRICS, BudgetDistance, Gate, ModelResult, Verdict
 from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -27,6 +26,10 @@ _FORM = re.compile(
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
+
+
+FORMER_ROWS = {"multiplier", "window", "extended", *FAMILY} - {"no_slip", "controller", "recommended", "icr"}
+"""Rows that reports of earlier versions had."""
 
 
 def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDistance, ...]:
@@ -88,14 +91,14 @@ def check_gate(
     ConfigError
         A model or horizon that the report, or the baseline, does not have.
     """
-    summary, horizons_m, sums = _numbers(gate, report)
-    places = np.flatnonzero(np.isclose(horizons_m, gate.horizon_m))
+    result = _result(gate, report)
+    places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m))
     if not len(places):
-        known = ", ".join(f"{horizon:g}" for horizon in horizons_m)
-        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m for {gate.model}", f"use {known}")
+        known = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
+        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {known}")
     h = int(places[0])
     field, _ = METRICS[gate.metric]
-    value = float(getattr(summary, field)[h])
+    value = float(getattr(result.summary, field)[h])
     if gate.baseline_factor and baseline is None:
         return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
     half_width, before = math.nan, math.nan
@@ -103,7 +106,7 @@ def check_gate(
         row = baseline.row(gate)
         before = row.values_m[gate.metric]
         half_width = difference_half_width(
-            sums[h] if sums else None, row.sums, gate.metric, gate.baseline_factor,
+            result.block_sums[h], row.sums, gate.metric, gate.baseline_factor,
             same_recording=baseline.is_of(report.run_summary),
         )  # fmt: skip
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
@@ -115,16 +118,14 @@ def check_gate(
     return Verdict(gate, passed, *plain((value, margin, low, high, bound, before, report.name)))
 
 
-def _numbers(gate: Gate, report: DropoutReport) -> tuple[Summary, Floats, tuple[BlockSums | None, ...]]:
-    """Return the numbers of the model that a gate names, its horizons, and its block sums where there are any."""
+def _result(gate: Gate, report: DropoutReport) -> ModelResult:
+    """Return the result of the model that a gate names."""
     result = report.result(gate.model)
     if result is not None:
-        return result.summary, report.horizons_m, result.block_sums
-    table = report.comparison
-    compared = table.summaries if table is not None else {}
-    if table is not None and gate.model in compared:
-        return compared[gate.model], np.array(table.horizons_m), ()
-    known = ", ".join(dict.fromkeys([*(one.name for one in report.results), *compared]))
+        return result
+    if gate.model.removesuffix("_gyro") in FORMER_ROWS:
+        raise ConfigError(f"gate {gate.text!r}", "no such row", "use recommended")
+    known = ", ".join(one.name for one in report.results)
     advice = f"this run has {known}; no_slip needs robot.track_width_m"
     raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
 

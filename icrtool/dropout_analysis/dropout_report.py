@@ -61,7 +61,7 @@ def dropout_report(
     without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds the difference
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
-    comparison : also compare all models on distance they were not fitted to; without it there is no row `recommended`
+    comparison : also test models on distance they were not fitted to; without it the rows are the filter's and no slip
     reference : what trials are compared with: the filter's states or the smoother's
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
     strict : compare such limits by the number alone, without the confidence interval of the difference
@@ -85,13 +85,12 @@ def dropout_report(
     used, further = _calibration_rows(compared, calibrations)
     found, why = _compare(compared, run) if comparison else (None, "")
     give_back_freed()
-    if found is not None:
-        further = [ConstantModel("recommended", "recommended", found.recommended), *further]
-
+    rows = found.rows if found is not None else ()
+    further = [*(ConstantModel(row.name, row.label, row.errors_of) for row in rows), *further]
     horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
     report = dropout(
         compared, horizons, further=further, starts=starts, seed=seed, sink=sink,
-        drive=None if found is None else found.drive,
+        starts_of_further=None if found is None else found.trials.starts, drive=None if found is None else found.drive,
     )  # fmt: skip
     give_back_freed()
     if without_events:
@@ -101,7 +100,7 @@ def dropout_report(
         report,
         smoothed=reference == "smoothed",
         examples=example_trials(compared),
-        worst=worst_trials(compared, starts=starts),
+        worst=worst_trials(compared, found, starts=starts),
         outages=(*forced, *real_outages(compared)),
         budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from icrtool.calibration.model_comparison import ComparedModels, ComparedRow
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.open_loop.trials import Drive, OpenLoopPath
+from icrtool.motion.models import RECOMMENDED
+from icrtool.motion.trials import Trials
 from icrtool.records.dropout import ExampleTrial
 from icrtool.records.run import Run, drive_of
 
@@ -20,23 +25,36 @@ ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
 TYPICAL_OF = 30
 """Trials enough to find the median error."""
-PICTURED = ("icr", "no_slip")
+PICTURED = ("icr", "no_slip", "recommended", "controller")
 
 
 def worst_trials(
-    run: Run, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *, starts: Starts = "moving"
-) -> tuple[ExampleTrial, ...]:
-    """Return the trials with the largest error of the momentary ICRs that do not overlap, worst first."""
+    run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
+    starts: Starts = "moving",
+) -> tuple[ExampleTrial, ...]:  # fmt: skip
+    """Return the trials with the largest error that do not overlap, worst first.
+
+    Parameters
+    ----------
+    compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
+    """
     drive, models = drive_of(run), models_of(run)
-    ends = counted_ends(drive, horizon_m, starts)
-    errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
+    ends, rows = counted_ends(drive, horizon_m, starts), compared.rows if compared is not None else ()
+    held_out = next((row for row in rows if row.name == RECOMMENDED), None)
+    if compared is not None and held_out is not None:
+        some = compared.trials.starts
+        errors = np.full(len(ends), np.nan)
+        errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
+    else:
+        errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
     ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
         chosen.append(worst)
         before_its_end = slice(ends[worst] + 1)
         left[before_its_end][ends[before_its_end] >= worst] = -1.0
-    return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+    name = held_out.name if held_out is not None else models[0].name
+    return tuple(_example(run, drive, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
 
 
 def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:
@@ -63,7 +81,9 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     np.abs(off, out=off)
     groups = (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)])
     chosen = (_typical(drive, models[0], ends, group) for group in groups)
-    return tuple(_example(run, drive, models, start, int(ends[start]), horizon_m) for start in chosen)
+    return tuple(
+        _example(run, drive, models, (), models[0].name, start, int(ends[start]), horizon_m) for start in chosen
+    )
 
 
 def _change(column: Floats, starts: Ints, ends: Ints) -> Floats:
@@ -80,18 +100,25 @@ def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
     return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
 
 
-def _example(run: Run, drive: Drive, models: tuple[Model, ...], start: int, end: int, horizon_m: float) -> ExampleTrial:
-    paths, errors = {}, {}
+def _example(
+    run: Run, drive: Drive, models: tuple[Model, ...], rows: Sequence[ComparedRow], by: str, start: int, end: int,
+    horizon_m: float,
+) -> ExampleTrial:  # fmt: skip
+    paths: dict[str, OpenLoopPath] = {}
+    errors: dict[str, float] = {}
     for model in models:
-        if model.name not in PICTURED:
-            continue
-        right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
-        path = open_loop_path(drive, right, left, x, start, end)
-        paths[model.name] = path
-        errors[model.name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
+        if model.name in PICTURED:
+            right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
+            paths[model.name] = open_loop_path(drive, right, left, x, start, end)
+    for row in rows:
+        if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
+            paths[row.name] = path
+    for name, path in paths.items():
+        errors[name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
     table = run.table
     duration = float(table.t_s[end] - table.t_s[start])
     return ExampleTrial(
+        model=by,
         start=start,
         end=end,
         stamp_ns=int(table.stamp_ns[start]),

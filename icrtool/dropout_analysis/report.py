@@ -114,6 +114,11 @@ class DropoutReport:
         return next((result for result in self.results if result.name == model), None)
 
     @property
+    def best(self) -> str:
+        """Name of the model that the report is about: `recommended`, else the filter's momentary ICRs."""
+        return "recommended" if self.result("recommended") is not None else "icr"
+
+    @property
     def summary(self) -> pd.DataFrame:
         """The rows of summary.csv as a DataFrame."""
         import pandas as pd
@@ -127,6 +132,7 @@ class DropoutReport:
             error_columns(one.summary)
             | {"expected_pct": 100.0 * one.summary.expected / h, "p95_pct": 100.0 * one.summary.p95 / h}
             | {f"{name}_m": values for name, values in one.intervals._asdict().items()}
+            | {f"heading_{name}": values for name, values in one.heading._asdict().items()}
             for one in self.results
         ]
         return {

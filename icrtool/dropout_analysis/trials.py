@@ -14,7 +14,8 @@ from icrtool.dropout_analysis.reference_error import reference_error
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop.block_sums import Blocks, block_sums
 from icrtool.kernels.open_loop.direct import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.error_statistics import (
@@ -28,8 +29,8 @@ from icrtool.kernels.open_loop.error_statistics import (
 )
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.motion.trials import Trials
-from icrtool.records.dropout import DEFAULT_SEED, LearnedSplit, ModelResult, ReferenceErrors
+from icrtool.motion.trials import MOST_STARTS, ErrorsOf, Trials
+from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, drive_of, no_slip_icrs, straight_drive
 
@@ -62,11 +63,11 @@ class Model(NamedTuple):
 
 
 class ConstantModel(NamedTuple):
-    """A model of constant parameters, by the errors (k, h) [m] that it has in trials; NaN where it has none."""
+    """A model of constant parameters, by the errors that it has in trials; NaN where it has none."""
 
     name: str
     label: str
-    errors_of: Callable[[Trials], Floats]
+    errors_of: ErrorsOf
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
@@ -80,6 +81,7 @@ def dropout(
     starts: Starts = "moving",
     models: Sequence[Model] | None = None,
     further: Sequence[ConstantModel] = (),
+    starts_of_further: Ints | None = None,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     drive: Drive | None = None,
@@ -93,6 +95,7 @@ def dropout(
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
     further : models of constant parameters, in addition
+    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
     seed : of the bootstrap
     sink : receives every single error (for ``--trials``)
     drive : `icrtool.records.run.drive_of` the run, where it is at hand: of a long log it is large
@@ -129,7 +132,8 @@ def dropout(
     left_out = standing if starts == "moving" else np.zeros_like(standing)
     if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
-    asked = _Asked(run, drive, predictors, left_out, learned, seed, sink)
+    sparse = starts_of_further if starts_of_further is not None else sparse_starts(drive)
+    asked = _Asked(run, drive, predictors, left_out, learned, seed, sink, sparse)
     with ThreadPoolExecutor(THREADS) as pool:
         parts = [_part(asked, horizons[group], pool) for group in _groups(len(horizons), len(run.table))]
     splits = [part.by_learning for part in parts if part.by_learning is not None]
@@ -152,7 +156,13 @@ def dropout(
 
 
 class _Asked(NamedTuple):
-    """What is the same for all horizons; `left_out` (n,): starts that count as none, `learned`: the first after it."""
+    """What is the same for all horizons.
+
+    Attributes
+    ----------
+    left_out : (n,) starts that count as none; learned : the first at which the ICRs were learned
+    sparse : starts of models of constant parameters
+    """
 
     run: Run
     drive: Drive
@@ -161,6 +171,7 @@ class _Asked(NamedTuple):
     learned: int | None
     seed: int
     sink: ErrorSink | None
+    sparse: Ints
 
 
 class _Part(NamedTuple):
@@ -176,22 +187,43 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     """Return the errors of all models at some horizons."""
     drive, learned, by_learning = asked.drive, asked.learned, None
     ends, counts = _ends(drive, horizons, asked.left_out, pool)
-    blocks = _blocks(drive, horizons, ends, pool)
+    blocks = _blocks(drive.distance, horizons, ends, pool)
+    sparse = Trials(asked.sparse, ends[:, asked.sparse].T.astype(np.int64))
     results = []
     for model in asked.predictors:
         give_back_freed()
-        errors = _errors(drive, model, ends, pool)
-        tested = blocks
-        if isinstance(model, ConstantModel) and not np.array_equal(np.isfinite(errors), ends.T >= 0):
-            tested = _blocks(drive, horizons, np.where(np.isfinite(errors.T), ends, -1), pool)
+        if isinstance(model, ConstantModel):
+            errors, turned = model.errors_of(sparse)
+            tested = _blocks(drive.distance[sparse.starts], horizons, np.isfinite(errors.T) - 1, pool)
+        else:
+            errors, turned = _errors(drive, model, ends, pool), _turn_errors(drive, model.icrs, sparse)
+            tested = blocks
         if asked.sink is not None:
-            asked.sink(model.name, horizons, errors)
-        results.append(_result_of(model, errors, tested, asked.seed, pool))
+            asked.sink(model.name, horizons, errors if len(errors) == len(drive.distance) else _spread(errors, asked))
+        results.append(_result_of(model, errors, turned, tested, asked.seed, pool))
         if model.name == "icr":
             first = len(errors) if learned is None else learned
             by_learning = error_summary(errors[:first]), error_summary(errors[first:])
         del errors  # before those of the next model are made
     return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
+
+
+def _spread(errors: Floats, asked: _Asked) -> Floats:
+    """Return errors (n, h) of all starts from those of some."""
+    all_errors: Floats = np.full((len(asked.drive.distance), errors.shape[1]), np.nan)
+    all_errors[asked.sparse] = errors
+    return all_errors
+
+
+def _turn_errors(drive: Drive, icrs: FrozenIcrs, trials: Trials) -> Floats:
+    """Return the errors (k, h) [rad] of the turns that ICRs make, NaN where there is no trial."""
+    turn = np.concatenate([[0.0], np.cumsum(np.where(drive.gap, 0.0, drive.dt_s) * (drive.v_left - drive.v_right))])
+    at = trials.starts if len(icrs.y_icr_right) > 1 else np.zeros(1, np.int64)
+    width = np.maximum(np.abs(icrs.y_icr_right[at] - icrs.y_icr_left[at]), MIN_ICR_SEPARATION_M)
+    made, driven = (column[trials.ends] - column[trials.starts][:, None] for column in (turn, drive.heading))
+    errors: Floats = np.abs(made / width[:, None] - driven)
+    errors[trials.ends < 0] = np.nan
+    return errors
 
 
 def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
@@ -252,6 +284,12 @@ def models_of(run: Run) -> tuple[Model, ...]:
     return tuple(models)
 
 
+def sparse_starts(drive: Drive) -> Ints:
+    """Return evenly spaced starts of a drive without standstill, at most some `MOST_STARTS`."""
+    moving = np.flatnonzero(~standing_states(drive))
+    return moving[:: max(len(moving) // MOST_STARTS, 1)]
+
+
 def _groups(horizons: int, states: int) -> list[slice]:
     """Cut the horizons into groups whose table of errors is not too large."""
     size = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * max(states, 1)))
@@ -291,36 +329,32 @@ def _learned_split(run: Run, learned: int | None, splits: Sequence[tuple[Summary
     )
 
 
-def _blocks(drive: Drive, horizons: Floats, ends: NDArray[np.int32], pool: Executor) -> list[Blocks | None]:
-    """Return what the bootstrap resamples, for each horizon."""
+def _blocks(path_m: Floats, horizons: Floats, ends: NDArray[np.signedinteger], pool: Executor) -> list[Blocks | None]:
+    """Return what the bootstrap resamples, for each horizon; `ends` (h, n) are negative where there is no trial."""
 
     def cut(h: int) -> Blocks | None:
-        return cut_blocks(ends[h] >= 0, drive.distance, float(horizons[h]))
+        return cut_blocks(ends[h] >= 0, path_m, float(horizons[h]))
 
     return list(pool.map(cut, range(len(horizons))))
 
 
-def _errors(drive: Drive, model: Model | ConstantModel, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(drive: Drive, model: Model, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_AT_ONCE, states)
-        tried = ends[:, lo:hi].T.astype(np.int64)
-        if isinstance(model, ConstantModel):
-            found = model.errors_of(Trials(np.arange(lo, hi), tried))
-        else:
-            found = open_loop_errors(drive, model.icrs, tried, lo)
-        errors[:, lo:hi] = found.T
+        errors[:, lo:hi] = open_loop_errors(drive, model.icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
 
     list(pool.map(fill, range(0, states, STARTS_AT_ONCE)))
     return errors.T
 
 
 def _result_of(
-    model: Model | ConstantModel, errors: Floats, blocks: Sequence[Blocks | None], seed: int, pool: Executor
-) -> ModelResult:
-    """Return the errors of one model in numbers, horizon by horizon."""
+    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], seed: int,
+    pool: Executor,
+) -> ModelResult:  # fmt: skip
+    """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad]."""
 
     def at_horizon(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
@@ -329,7 +363,9 @@ def _result_of(
         intervals = bootstrap_intervals(column, blocks[h : h + 1], seed)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
         sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
-        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,))
+        of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
+        heading = HeadingErrors(of_turns.expected, of_turns.p95)
+        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,), heading)
 
     return _joined(list(pool.map(at_horizon, range(len(blocks)))))
 
@@ -350,4 +386,5 @@ def _joined(parts: Sequence[ModelResult]) -> ModelResult:
         Intervals(*_columns(part.intervals for part in parts)),
         tuple(one for part in parts for one in part.histograms),
         tuple(one for part in parts for one in part.block_sums),
+        HeadingErrors(*_columns(part.heading for part in parts)),
     )

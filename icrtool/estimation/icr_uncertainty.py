@@ -13,7 +13,7 @@ from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals
-from icrtool.motion.models import MODELS, model_columns, parameters_of_icrs, wheel_motion
+from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.memory import give_back_freed
 from icrtool.records.tables import States
 
@@ -106,7 +106,7 @@ def _path(drive: Drive, dt: Floats, t_s: Floats, rows: Ints, parameters: Floats)
 
     def twists(some: slice) -> tuple[Floats, Ints, Floats]:
         motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
-        return model_columns(MODELS["full_linear"], motion)
+        return model_columns(FULL_LINEAR, motion)
 
     # a broadcast zero takes no memory: each step's heading is that at its start
     return path_at(t_s, dt, np.broadcast_to(0.0, len(dt)), twists, parameters, t_s[rows])

@@ -80,7 +80,7 @@ def write_fleet(
 
 def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
     """Return the pooled calibrations, a line each, or with their leave-one-log-out tables."""
-    from icrtool.motion.models import MODELS
+    from icrtool.motion.models import FAMILY
 
     parts = []
     for one in calibrations:
@@ -91,8 +91,8 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
         if one.reason:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue
-        known = MODELS.get(one.recommended)
-        model = f"{known.label} (model {one.recommended})" if known is not None else one.recommended
+        known = FAMILY.get(one.recommended)
+        model = known.label if known is not None else one.recommended
         head += f": {model}, multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}, in {one.file}"
         parts.append(f"{head}\n{one.table}" if tables else head)
     return ("\n\n" if tables else "\n").join(parts) + "\n"

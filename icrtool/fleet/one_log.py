@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -127,8 +127,8 @@ def _results(request: Request, stage: Stage) -> Row:
 
 
 def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:
-    icr = summary["icr"]
-    final, std = icr["final"], icr["final_std"]
+    geometry: Mapping[str, Any] = summary.get("geometry") or {}
+    controller: Mapping[str, Any] = summary.get("controller") or {}
     return replace(
         request.row,
         status="done",
@@ -138,9 +138,10 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary["drive"]["duration_s"],
         distance_m=summary["drive"]["distance_m"],
-        icr={name: final[name] for name in ICR_COLUMNS} | {f"std_{name}": std[name] for name in ICR_COLUMNS},
-        multiplier=icr["separation_multiplier"],
-        multiplier_std=icr["separation_multiplier_std"],
+        icr={name: geometry.get(name) for name in ICR_COLUMNS}
+        | {f"std_{name}": geometry.get(f"{name}_std") for name in ICR_COLUMNS},
+        multiplier=controller.get("multiplier"),
+        multiplier_std=controller.get("multiplier_std"),
         errors=_errors(report),
         events=len(summary["events"]),
         outages=len(report.outages),

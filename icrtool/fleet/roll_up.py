@@ -138,7 +138,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     file = f"{CALIBRATIONS}/{name}.json"
     write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
-    table = str(Text(held_out_blocks(result.wheels)))
+    table = str(Text(held_out_blocks(result.table)))
     return replace(
         one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),

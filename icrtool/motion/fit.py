@@ -180,27 +180,6 @@ class PooledFit(FittedModel):
         grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(whole))[:k])
         return np.asarray(inverse[:k, :k] * np.outer(grown, grown), np.float64)
 
-    def residuals_without(self, fold: Fold, others: Sequence[Fold]) -> Floats:
-        """Return the residuals (f, m) of a fold's recording, as fitted without the fold and without each of others.
-
-        Notes
-        -----
-        To first order of a step of the parameters; the constants of a recording that is left out whole are found in it.
-        """
-        at, rows = self.solution, self.pool.rows(fold.recording)
-        if fold.whole:
-            out = np.array([other.recording for other in others])
-            twice = out == fold.recording
-            gradients, curvatures = (of_each[fold.recording] + of_each[out] for of_each in self._by_recording)
-            gradients[twice] /= 2.0
-            curvatures[twice] /= 2.0
-        else:
-            clear = self.pool.clear_of(fold)
-            removed = [self._derivatives(~(clear & self.pool.clear_of(other))) for other in others]
-            gradients, curvatures = (np.array(one) for one in zip(*removed, strict=True))
-        residuals: Floats = at.residuals[rows] + self._steps(gradients, curvatures) @ at.jacobian[rows].T
-        return residuals
-
     def _steps(self, gradient: Floats, curvature: Floats) -> Floats:
         """Return the steps (..., k) of the parameters without residuals of some gradient and curvature.
 
@@ -351,11 +330,6 @@ class Pool:
         """Return the residuals (m,) that share no distance with a fold."""
         apart = (self.end_m <= fold.begin_m) | (self.start_m >= fold.end_m)
         return np.asarray(apart | (self.recording != fold.recording), np.bool_)
-
-    def within(self, fold: Fold) -> Bools:
-        """Return the residuals (m,) that lie in a fold."""
-        inside = (self.start_m >= fold.begin_m) & (self.end_m <= fold.end_m)
-        return np.asarray(inside & (self.recording == fold.recording), np.bool_)
 
     def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> PooledFit:
         """Fit a model.

@@ -11,7 +11,7 @@ without free terms.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -83,8 +83,8 @@ TERMS: dict[str, Term] = {
         Term("omega_v", OMEGA, lambda m: m.v / m.b, "v / b", 0.02, "left/right asymmetry: turns while driving ahead"),
         Term("vy_w", VY, lambda m: m.w * m.b / 2, "w * b / 2", 0.3, "-2 x_icr / W (Martinez 2005)"),
         Term("vy_vw", VY, lambda m: m.v * m.w, "v * w", 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"),
-        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, "spin * w", 0.3, "turn gain that depends on curvature"),
-        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.2, "turn gain that depends on speed"),
+        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, "spin * w", 0.03, "change of the turn gain with curvature"),
+        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.02, "change of the turn gain with speed"),
         Term("vy_v", VY, lambda m: m.v, "v", 0.02, "sideways while driving ahead (Anousaki 2004)"),
         Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, "abs(w) * b / 2", 0.1, "drag in turns (Seegmiller 2014)"),
         Term("gyro_scale", OMEGA, lambda m: m.gyro, "gyro", 0.02, "scale error of the gyro"),
@@ -133,8 +133,11 @@ class MotionModel:
         return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*moves, *GYRO_TERMS), self.source)
 
 
+NO_SLIP, FIVE, RECOMMENDED = "no_slip", "five", "recommended"
+"""Names of the models that are fitted: without free terms; for ICRs and controller; to predict with."""
+
 CONTROLLER = "controller"
-"""Fitted to what a differential-drive controller can express: multiplier and radius factors follow from it."""
+"""Row of what a differential-drive controller makes of multiplier and radius factors; these come from `FIVE`."""
 
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
 _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
@@ -142,26 +145,27 @@ _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
 MODELS: dict[str, MotionModel] = {
     model.name: model
     for model in (
-        MotionModel("no_slip", "no slip", (), "Pentzer 2014, Eqs. 38-39"),
-        MotionModel(
-            "multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier of diff_drive_controller"
-        ),
+        MotionModel(NO_SLIP, "no slip", (), "Pentzer 2014, Eqs. 38-39"),
+        MotionModel(FIVE, "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
+        MotionModel(RECOMMENDED, "whole model", _EIGHT, "with Seegmiller 2014, and gains of curvature and speed"),
+    )
+}
+"""The models that are fitted, by name."""
+
+FAMILY: dict[str, MotionModel] = MODELS | {
+    model.name: model
+    for model in (
+        MotionModel("multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier"),
         MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
         MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
-        MotionModel(
-            CONTROLLER,
-            "separation and radii",
-            ("vx_v", "omega_w", "omega_v"),
-            "diff_drive_controller of ros2_controllers",
-        ),
-        MotionModel("five", "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
+        MotionModel(CONTROLLER, "separation and radii", ("vx_v", "omega_w", "omega_v"), "diff_drive_controller"),
         MotionModel("six", "ICRs, scales, side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
-        MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains that depend on curvature and speed"),
+        MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains of curvature and speed"),
         MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004"),
         MotionModel("slip", "slip regression", (*_FIVE, "vx_absw", "vy_vw"), "Seegmiller 2014, Baril 2024"),
     )
 }
-"""Every model by name, simplest first."""
+"""Every model that a calibration of an earlier version may hold, and that `benchmarks/models.py` compares."""
 
 
 def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints, Floats]:
@@ -201,7 +205,6 @@ class TrackGeometry(NamedTuple):
     ----------
     y_icr_right_m, y_icr_left_m, x_icr_m : track ICRs
     multiplier : (y_r - y_l) / b, beside the radius factors
-    multiplier_nominal : W / (a b), for a controller that keeps the configured radii
     radius_left, radius_right : wheel radius over the configured one
     """
 
@@ -209,7 +212,6 @@ class TrackGeometry(NamedTuple):
     y_icr_left_m: float
     x_icr_m: float
     multiplier: float
-    multiplier_nominal: float
     radius_left: float
     radius_right: float
 
@@ -218,37 +220,8 @@ ICRS = 3
 """So many values of a `TrackGeometry`, the first, are ICRs."""
 
 
-class TypicalDrive(NamedTuple):
-    """At what curvature and speed the robot turned, weighted with the square of w.
-
-    Attributes
-    ----------
-    spin : of `WheelMotion`; speed_mps, speed_abs_mps : mean of v and of its size
-    """
-
-    spin: float = 0.0
-    speed_mps: float = 0.0
-    speed_abs_mps: float = 0.0
-
-
-def typical_drive(motions: Iterable[tuple[WheelMotion, Floats]]) -> TypicalDrive:
-    """Return where robots turned; `motions` are wheel motions with how long each sample holds [s]."""
-    total, sums = 0.0, np.zeros(3)
-    for motion, held in motions:
-        weight = held * motion.w**2
-        total += float(weight.sum())
-        sums += [weight @ column for column in (motion.spin, motion.v, np.abs(motion.v))]
-    return TypicalDrive(*(sums / total).tolist()) if total > 0.0 else TypicalDrive()
-
-
-def track_geometry(
-    model: MotionModel, parameters: Floats, width_m: float, typical: TypicalDrive | None = None
-) -> TrackGeometry:
-    """Return ICRs, multiplier and radius factors of a model.
-
-    Parameters
-    ----------
-    typical : terms that are not linear in the speeds enter with the curvature and speed here; default zero
+def track_geometry(model: MotionModel, parameters: Floats, width_m: float) -> TrackGeometry:
+    """Return ICRs, multiplier and radius factors of a model; terms that are not linear in the speeds do not enter.
 
     Notes
     -----
@@ -256,28 +229,21 @@ def track_geometry(
     turn. A radius factor of a side is that by which its speed must be multiplied for one W to give the turn:
     a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
     """
-    at = typical if typical is not None else TypicalDrive()
-    ahead = twist(model, parameters, _one_motion(np.array([1.0, -1.0]), np.zeros(2), 0.0, width_m))
-    speeds = at.speed_abs_mps * np.array([1.0, 1.0, -1.0, -1.0])
-    turning = twist(model, parameters, _one_motion(speeds, np.array([1.0, -1.0, 1.0, -1.0]), at.spin, width_m))
-    forward = 0.5 if at.speed_abs_mps == 0.0 else (1.0 + at.speed_mps / at.speed_abs_mps) / 2.0
-    by_v = (ahead[:, 0] - ahead[:, 1]) / 2.0
-    by_w = ((turning[:, [0, 2]] - turning[:, [1, 3]]) / 2.0) @ [forward, 1.0 - forward]
+    of = dict(zip(model.terms, parameters.tolist(), strict=True))
+    term = {name: of.get(name, TERMS[name].nominal) for name in _FIVE}
     # V_l adds half of itself to v and its share of b to w, V_r takes away the latter
-    by_left, by_right = by_v / 2.0 + by_w / width_m, by_v / 2.0 - by_w / width_m
-    y_right, y_left = by_left[VX] / by_left[OMEGA], by_right[VX] / by_right[OMEGA]
+    x_left, x_right = (term["vx_v"] + term["vx_w"]) / 2.0, (term["vx_v"] - term["vx_w"]) / 2.0
+    turn_left = (term["omega_v"] / 2.0 + term["omega_w"]) / width_m
+    turn_right = (term["omega_v"] / 2.0 - term["omega_w"]) / width_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        y_right, y_left, x = np.divide(
+            [x_left, x_right, -term["vy_w"] * width_m / 2.0], [turn_left, turn_right, term["omega_w"]]
+        ).tolist()
     separation = y_right - y_left
-    numbers = (
-        y_right, y_left, -by_w[VY] / by_w[OMEGA], separation / width_m, 1.0 / by_w[OMEGA],
-        separation * by_left[OMEGA], -separation * by_right[OMEGA],
-    )  # fmt: skip
-    return TrackGeometry(*map(float, numbers))
+    return TrackGeometry(y_right, y_left, x, separation / width_m, separation * turn_left, -separation * turn_right)
 
 
-def _one_motion(v: Floats, w: Floats, spin: float, width_m: float) -> WheelMotion:
-    """Return a motion of given speeds and curvature, no gyro."""
-    none = np.zeros(len(v))
-    return WheelMotion(v, w, np.full(len(v), spin), width_m, none, none)
+FULL_LINEAR = FAMILY["full_linear"]
 
 
 def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
@@ -311,7 +277,7 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
         "vy_v": (0.0, 0.0, 0.0, 0.0, aside / 2),
     }
     value = {"vx_v": 1.0, "vx_w": middle, "omega_w": gain, "omega_v": 0.0, "vy_w": aside, "vy_v": 0.0}
-    terms = MODELS["full_linear"].terms
+    terms = FULL_LINEAR.terms
     return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
 
 
@@ -356,41 +322,53 @@ class FittedModel:
         """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
         return twist(self.model, self.parameters, self.complete(motion))
 
-    def geometry(
-        self, width_m: float, typical: TypicalDrive, controller: FittedModel | None = None
-    ) -> tuple[TrackGeometry, Floats]:
-        """Return ICRs, multipliers and radius factors, and their covariance (7, 7).
-
-        Parameters
-        ----------
-        controller : of the same windows, whose multipliers and radius factors are given; default this one's
-        """
-        if controller is not None:
-            icrs, of_icrs = self.geometry(width_m, typical)
-            numbers, whole = controller.geometry(width_m, typical)
-            whole[:ICRS, :ICRS] = of_icrs[:ICRS, :ICRS]
-            whole[:ICRS, ICRS:] = whole[ICRS:, :ICRS] = 0.0
-            return TrackGeometry(*icrs[:ICRS], *numbers[ICRS:]), whole
-        at = np.array(track_geometry(self.model, self.parameters, width_m, typical))
+    def geometry(self, width_m: float) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs, multiplier and radius factors, and their covariance (6, 6)."""
+        at = np.array(track_geometry(self.model, self.parameters, width_m))
         by_parameter = np.zeros((len(at), len(self.parameters)))
         for k in range(len(self.parameters)):
             moved = self.parameters.copy()
             moved[k] += STEP
-            by_parameter[:, k] = (np.array(track_geometry(self.model, moved, width_m, typical)) - at) / STEP
+            by_parameter[:, k] = (np.array(track_geometry(self.model, moved, width_m)) - at) / STEP
         covariance: Floats = by_parameter @ self.covariance @ by_parameter.T
         return TrackGeometry(*at.tolist()), covariance
 
 
-def controller_model(geometry: TrackGeometry) -> FittedModel:
-    """Return what a differential-drive controller with the multiplier and radius factors of a geometry drives.
+class Lever(NamedTuple):
+    """Whether it is known where on the robot the position is measured, ahead and to the right of the body's origin.
+
+    What is not known looks like an ICR that is off centre: it is a constant of the log, not an error of a controller.
+    """
+
+    ahead: bool = False
+    aside: bool = False
+
+
+NO_LEVER = Lever()
+
+
+def controller_model(five: FittedModel, lever: Lever, width_m: float) -> FittedModel:
+    """Return what a differential-drive controller drives with the multiplier and radius factors of a fit of `FIVE`.
+
+    Parameters
+    ----------
+    five : with the turn rate of the wheels, or of wheels and gyro
+    lever : of the position; where a part of it is not known, the motion that it makes of a turn is kept
 
     Notes
     -----
-    v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b) with V_l = v + w b / 2, V_r = v - w b / 2.
+    v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b). With V_l = v + w b / 2 and V_r = v - w b / 2 the
+    turn rate is that of the fit, and v_x differs from it by (y_r + y_l) / 2 omega, v_y by -x omega: what a lever makes.
     """
-    left, right, m = geometry.radius_left, geometry.radius_right, geometry.multiplier
-    values = [(left + right) / 2.0, (left - right) / 2.0, (left + right) / (2.0 * m), (left - right) / m]
-    return FittedModel(MotionModel("", "", _FIVE[:4], ""), np.array(values), np.zeros((4, 4)))
+    values = dict(zip(five.model.terms, five.parameters.tolist(), strict=True))
+    if lever.aside:
+        wheels = five if five.wheels is None else five.wheels
+        _, _, _, _, left, right = track_geometry(wheels.model, wheels.parameters, width_m)
+        values |= {"vx_v": (left + right) / 2.0, "vx_w": (left - right) / 2.0}
+    if lever.ahead:
+        values["vy_w"] = 0.0
+    parameters = np.array([values[name] for name in five.model.terms])
+    return FittedModel(five.model, parameters, five.covariance, five.wheels)
 
 
 def find_model(name: str) -> MotionModel:
@@ -402,4 +380,4 @@ def find_model(name: str) -> MotionModel:
         There is none.
     """
     base = name.removesuffix("_gyro")
-    return MODELS[base].with_gyro() if base != name else MODELS[base]
+    return FAMILY[base].with_gyro() if base != name else FAMILY[base]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
+from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.open_loop.direct import ends_from
 from icrtool.kernels.open_loop.trials import Drive
-from icrtool.motion.models import WheelMotion, wheel_motion
+from icrtool.motion.models import NO_LEVER, Lever
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
@@ -57,6 +57,7 @@ class Recording:
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
     slipping : (n,) whether the interval after a state lies in a slip event, which no window crosses; None without one
+    lever : what is known of the place of the position on the robot
     """
 
     name: str
@@ -69,6 +70,7 @@ class Recording:
     gyro_reversed: bool = False
     begin_ns: int = 0
     slipping: Bools | None = None
+    lever: Lever = NO_LEVER
 
     @property
     def held_s(self) -> Floats:
@@ -83,13 +85,6 @@ class Recording:
         by_step *= rate
         np.cumsum(by_step[:-1], out=sums[1:])
         return sums
-
-    def motions(self) -> Iterator[tuple[WheelMotion, Floats]]:
-        """Yield the motion of the wheels and how long each sample holds [s], some samples at a time."""
-        drive, held = self.drive, self.held_s
-        for lo in range(0, len(held), ROWS_AT_ONCE):
-            some = slice(lo, lo + ROWS_AT_ONCE)
-            yield wheel_motion(drive.v_left[some], drive.v_right[some], self.width_m), held[some]
 
     def around(self, begin_s: float, end_s: float) -> Steps:
         """Return single wheel samples as `Steps.around` does; of a long log, columns of all would take much memory."""
@@ -175,7 +170,6 @@ class Windows(NamedTuple):
     start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
     reference : complex (w,), displacement forward + j right in the body frame of the start [m]
     turned : (w,) turn of the reference [rad]
-    moving : (w,) states in which the robot moved from this start to the next
     """
 
     steps: Steps
@@ -187,7 +181,6 @@ class Windows(NamedTuple):
     length_m: Floats
     reference: Complexes
     turned: Floats
-    moving: Ints
 
 
 class Totals(NamedTuple):
@@ -243,7 +236,6 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
         length_m=np.asarray(lengths_m, np.float64)[column],
         reference=np.exp(-1j * drive.heading[start]) * (end_place - begin_place),
         turned=drive.heading[end] - drive.heading[start],
-        moving=np.add.reduceat(moving_states(drive), begins, dtype=np.int64)[row],
     )
 
 

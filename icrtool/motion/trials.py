@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ends_from, fill_path_errors
+from icrtool.kernels.open_loop.direct import ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
@@ -54,13 +54,34 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals
     return Trials(starts, ends_from(recording.drive, np.array(horizons_m, np.float64), starts))
 
 
+class TrialErrors(NamedTuple):
+    """Errors of a model at the ends of trials (k, h), NaN where there is no trial.
+
+    Attributes
+    ----------
+    position : distance between open-loop position and reference [m]
+    heading : size of the difference between open-loop turn and that of the reference [rad]
+    """
+
+    position: Floats
+    heading: Floats
+
+    @classmethod
+    def none(cls, shape: tuple[int, ...]) -> TrialErrors:
+        """Return errors of trials that have none yet, a horizon contiguous."""
+        return cls(*(np.full(shape[::-1], np.nan).T for _ in cls._fields))
+
+
+ErrorsOf = Callable[[Trials], TrialErrors]
+"""Gives the errors (k, h) of a model in trials."""
+
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
 """Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]: each
 call drives all of it."""
 
 
-def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> Floats:
-    """Return the distance (m,) [m] between open-loop position and reference at the ends of trials.
+def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> TrialErrors:
+    """Return the errors (m,) at the ends of trials.
 
     Parameters
     ----------
@@ -76,10 +97,10 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     used[s] = used[e] = True
     rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
     turned, place = path(recording.t_s[rows])
-    turn, reference = np.exp(1j * (drive.heading[rows] - turned)), drive.north[rows] + 1j * drive.east[rows]
-    errors = np.empty(len(s))
-    fill_path_errors(turn, place, reference, number[s], number[e], errors)
-    return errors
+    s, e, off = number[s], number[e], turned - drive.heading[rows]
+    turn, reference = np.exp(-1j * off), drive.north[rows] + 1j * drive.east[rows]
+    missed = turn[s] * (place[e] - place[s]) - (reference[e] - reference[s])
+    return TrialErrors(np.abs(missed), np.abs(off[e] - off[s]))
 
 
 def predicted_path(

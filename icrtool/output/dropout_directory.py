@@ -38,11 +38,10 @@ KNOWS = {
     "icr": "the distance up to each start",
     "no_slip": "the track width",
     "icr_final": "all of the drive (in sample)",
-    "recommended": "the rest of the drive",
 }
-"""What the ICRs of a model were learned from."""
+"""What the numbers of a model were learned from; those of the others from the rest of the drive."""
 
-ERROR_COLUMNS = ("icr", "no_slip")
+ERROR_COLUMNS = ("icr", "no_slip", "recommended", "controller")
 
 
 def write_report(
@@ -94,7 +93,9 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     (directory / "histogram.csv").write_bytes(csv_bytes(HISTOGRAM_COLUMNS, _histogram_rows(report)))
     (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, _worst_rows(report.worst)))
     if report.comparison is not None:
-        (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(report.comparison)))
+        (directory / "ladder.csv").write_bytes(
+            csv_bytes(COMPARISON_COLUMNS, comparison_rows(report, report.comparison))
+        )
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
@@ -131,9 +132,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         and {key: value for key, value in report.calibration.summary().items() if key != "created"},
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
-        "ladder": comparison_document(report.comparison)
-        if report.comparison is not None
-        else {"left_out": report.no_comparison},
+        "ladder": comparison_document(report),
         "gates": [
             {**asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, "value_bound_m": one.bound_m,
              "not_checked": one.not_checked or None, "verdict": one.line()}
@@ -154,7 +153,7 @@ VERDICT_KEYS = ("value_m", "baseline_m", "margin_m", "margin_low_m", "margin_hig
 OUTAGE_KEYS = ("kind", "begin_s", "end_s", "distance_m", "end_error_m", "max_error_m")
 
 WORST_COLUMNS = (
-    "rank", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
+    "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
     *(f"{model}_error_m" for model in ERROR_COLUMNS),
 )  # fmt: skip
 
@@ -163,7 +162,7 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
     """Return one model's rows of summary.csv, under its name."""
     rows = [row for row in rows_of(report.summary_columns()) if row.pop("model") == result.name]
     used = next((one for one in report.calibrations if one.name == result.name), None)
-    knows = used.fitted_text if used is not None else KNOWS.get(result.name)
+    knows = used.fitted_text if used is not None else KNOWS.get(result.name, "the rest of the drive")
     blocks = [
         {"horizon_m": horizon, **sums._asdict(), "errors_m": [float(f"{error:.6g}") for error in sums.errors_m]}
         for horizon, sums in zip(report.horizons_m, result.block_sums, strict=False)
@@ -228,7 +227,8 @@ def _summary_rows(report: DropoutReport, summary: Summary) -> list[dict[str, Any
 
 def _trial_document(trial: ExampleTrial) -> dict[str, Any]:
     return {
-        "stamp_ns": trial.stamp_ns, "t_s": trial.t_s, "north_m": trial.north_m, "east_m": trial.east_m,
+        "model": trial.model, "stamp_ns": trial.stamp_ns, "t_s": trial.t_s, "north_m": trial.north_m,
+        "east_m": trial.east_m,
         "horizon_m": trial.horizon_m, "heading_change_deg": float(np.degrees(trial.heading_change_rad)),
         "speed_mean_mps": trial.speed_mean_mps, "errors_m": trial.errors_m,
     }  # fmt: skip

@@ -110,11 +110,6 @@ FIGURES = {
         "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
         "dropout_errors.dropout_summary", _where(lambda report: report.counts.trials.any()),
     ),
-    "ladder": Entry(
-        "report", "Model comparison",
-        "Each model on distance it was not fitted to: the further left, the better.",
-        "model_comparison.model_comparison", _where(lambda report: report.comparison),
-    ),
     "icrs": Entry(
         "fleet", "Final ICRs of every log",
         "One robot on one ground should lie on one level; a step is other ground or wear.",

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 from icrtool.output.text_blocks import Line
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.run import ICR_WORDS
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import counted
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import ControllerErrors
     from icrtool.motion.models import FittedModel
-    from icrtool.records.run_document import DriveDocument, RunDocument
+    from icrtool.records.run_document import DriveDocument, IcrColumn, RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-MODEL_WORDS = {"icr": "ICR", "no_slip": "no slip"}
+MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers", "icr": "ICR", "no_slip": "no slip"}
 
-FITTED = {"never": "", "before": "up to the start", "all": "in sample", "others": "held out"}
-"""What the numbers of a compared model were fitted to, by the ``fitted`` of `icrtool.records.dropout`'s scores."""
+FITTED = {"never": "not fitted", "before": "up to the start", "all": "in sample", "others": "held out"}
+"""What the numbers of a row were fitted to, by the values of `icrtool.calibration.model_comparison.FITTED_TO`."""
 
 
 def run_title(summary: RunDocument) -> str:
@@ -95,6 +95,33 @@ def driven_text(drive: DriveDocument) -> str:
     return f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
 
 
+AGREES_SIGMAS = 3.0
+"""Two estimates of an ICR agree where they differ by less than so many standard deviations."""
+
+
+def icr_value_text(geometry: Mapping[str, Any], column: IcrColumn) -> str:
+    """Return an ICR with its standard deviation, of the section ``geometry`` of a run's summary."""
+    value, std = geometry.get(column), geometry.get(f"{column}_std")
+    return f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
+
+
+def filter_agreement(summary: RunDocument) -> str:
+    """Return where the filter's ICRs ended, and whether they agree with those of the drive; empty without both."""
+    geometry: Mapping[str, Any] = summary.get("geometry") or {}
+    final, final_std = summary["icr"]["final"], summary["icr"]["final_std"]
+    ends, apart = [], []
+    for column in ICR_COLUMNS:
+        word = ICR_WORDS[column]
+        value, std, at, at_std = geometry.get(column), geometry.get(f"{column}_std"), final[column], final_std[column]
+        if value is None or at is None or std is None or at_std is None:
+            continue
+        ends.append(f"{word.removeprefix('y ')} {at:+.3f}")
+        sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
+        if sigmas > AGREES_SIGMAS:
+            apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
+    return f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}" if ends else ""
+
+
 def model_text(label: str, name: str, parameters: int) -> str:
     """Return a recommended model as ``three ICRs (3 parameters, model icr)``."""
     return f"{label} ({counted(parameters, 'parameter')}, model {name})"
@@ -107,8 +134,6 @@ def fitted_model_text(fitted: FittedModel) -> str:
 
 def controller_text(numbers: Mapping[str, Any]) -> str:
     """Return what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
-    if not any(value for name, value in numbers.items() if name.endswith("_std")):
-        return "keeps its constants: the recommended model estimates none of them"
     return (
         f"wheel_separation_multiplier {numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}, left/right wheel "
         f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"

@@ -20,7 +20,7 @@ DEFAULT_SEED = 20140311
 """Seed of the bootstrap: any number, but the same for every run and every model."""
 
 CHOICE_HORIZON_M = 10.0
-"""Where extended models are chosen, and which horizon the picture of the model comparison shows."""
+"""The distance that headlines, tables of calibrations and the worst trials are about."""
 
 
 METRICS = {
@@ -35,6 +35,13 @@ def error_columns(summary: Summary) -> dict[str, Floats | Ints]:
     return {"trials": summary.trials} | {column: getattr(summary, field) for field, column in METRICS.values()}
 
 
+class HeadingErrors(NamedTuple):
+    """Mean and 95th percentile of the errors of the turn over trials, by horizon; (h,) [deg], NaN without trials."""
+
+    expected_deg: Floats
+    p95_deg: Floats
+
+
 class ModelResult(NamedTuple):
     """The errors of one model's trials, by horizon; `block_sums` has None where there is too little path."""
 
@@ -43,7 +50,8 @@ class ModelResult(NamedTuple):
     summary: Summary
     intervals: Intervals
     histograms: tuple[Histogram, ...]
-    block_sums: tuple[BlockSums | None, ...] = ()
+    block_sums: tuple[BlockSums | None, ...]
+    heading: HeadingErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +60,13 @@ class ExampleTrial:
 
     Attributes
     ----------
+    model : by whose error it was chosen
     reference_north_m, reference_east_m : (m,)
     paths : by model name
     errors_m : by model name, at the end
     """
 
+    model: str
     start: int
     end: int
     stamp_ns: int
@@ -93,23 +103,6 @@ class Outage:
     max_error_m: float
     north_m: Floats
     east_m: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class ModelScore:
-    """One model's errors.
-
-    Attributes
-    ----------
-    name : of `icrtool.calibration.model_comparison.MODELS`, with ``_gyro`` or ``_heading`` where it is measured
-    fitted : ``never``, ``before`` (from the states up to the start), ``all`` (in sample), ``others`` (held out)
-    """
-
-    name: str
-    label: str
-    fitted: str
-    measured_heading: bool
-    summary: Summary
 
 
 class ReferenceErrors(NamedTuple):

@@ -259,10 +259,24 @@ class ControllerDocument(TypedDict):
     multiplier_std: float
     left_radius: float
     right_radius: float
+    left_radius_std: NotRequired[float]
+    right_radius_std: NotRequired[float]
+
+
+class GeometryDocument(TypedDict):
+    """The ICRs that `controller` belongs to, with one standard deviation each; null where not shown."""
+
+    y_icr_right_m: float | None
+    y_icr_right_m_std: float | None
+    y_icr_left_m: float | None
+    y_icr_left_m_std: float | None
+    x_icr_m: float | None
+    x_icr_m_std: float | None
+    covariance_m2: Matrix
 
 
 class RecommendedDocument(TypedDict):
-    """The recommended motion model."""
+    """The motion model."""
 
     label: str
     model: str
@@ -270,8 +284,16 @@ class RecommendedDocument(TypedDict):
     controller: ControllerDocument
 
 
+class MotionDocument(TypedDict):
+    """What a run holds of the robot's motion, beside its filter."""
+
+    recommended: RecommendedDocument | None
+    geometry: GeometryDocument | None
+    controller: ControllerDocument | None
+
+
 class RunDocument(TypedDict):
-    """run.json; `recommended`: the motion model, of a run that `icrtool.fit` made."""
+    """run.json; `recommended`, `geometry`, `controller`: of a run that `icrtool.fit` made."""
 
     schema: Literal["icrtool/run/1"]
     log: str
@@ -298,3 +320,5 @@ class RunDocument(TypedDict):
     filter: FilterDocument
     excitation: ExcitationDocument
     recommended: NotRequired[RecommendedDocument | None]
+    geometry: NotRequired[GeometryDocument | None]
+    controller: NotRequired[ControllerDocument | None]

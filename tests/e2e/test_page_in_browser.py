@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.model_comparison import _errors_along, _icrs_of, turned_path
 from icrtool.calibration.pooled import predictor
 from icrtool.calibration.run_recording import recording_of, turning_recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
@@ -22,6 +21,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
 from icrtool.motion.fit import own_constants
+from icrtool.motion.models import controller_model
 from icrtool.motion.recording import cut_windows
 from icrtool.motion.trials import Trials, predicted_path
 from icrtool.output.dropout_directory import report_document
@@ -168,23 +168,19 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
     starts = starts[:: len(starts) // 8]
     assert report.calibration is not None
     trials = Trials(starts, ends[starts])
-    along = {"recommended": predictor(report.calibration, recording_of(run))(trials)}
+    along = {"recommended": predictor(report.calibration, recording_of(run))(trials).position}
     compared = report.comparison
     assert compared is not None
     assert compared.heading == "heading"
     turned = turning_recording_of(run, "heading")
     for row, of in (
-        ("multiplier", ""),
-        ("window", "icr"),
-        ("window_heading", "icr_gyro"),
-        ("no_slip_heading", "no_slip_gyro"),
-    ):
-        fitted = compared.fits[of or row]
+        ("controller", "five"), ("controller_heading", "five_gyro"), ("recommended_heading", "recommended_gyro"),
+    ):  # fmt: skip
+        fitted = compared.fits[of]
         own = own_constants(cut_windows(turned), fitted, turned.width_m)
+        if of.startswith("five"):
+            fitted = controller_model(fitted, turned.lever, turned.width_m)
         along[row] = table_errors(turned, trials, predicted_path(turned, fitted, own))
-    turned_path_of_run = turned_path(run, turned)
-    for name in ("icr", "icr_final"):
-        along[f"{name}_heading"] = _errors_along(turned_path_of_run, drive, trials, _icrs_of(run, name))
     final = (table.y_icr_right_m[-1], table.y_icr_left_m[-1], table.x_icr_m[-1])
     # Every state of so short a drive is a row of the series.
     assert page.evaluate("icrtoolPage.data.series.step.length") == len(table)
@@ -248,17 +244,16 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
-    assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {3}
+    assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {2}
     table, recording = report.comparison, turning_recording_of(run)
     assert table is not None
     drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))
-    # What the comparison chose by block is, of the whole drive, the recommended model.
-    assert {score.name.replace("extended", "recommended") for score in table.scores} <= drawn
+    assert {"recommended", "recommended_gyro", "controller", "controller_gyro", "no_slip", "icr"} <= drawn
     ends = trial_ends(drive_of(run), np.array(LENGTHS_M))
     starts = np.flatnonzero((ends >= 0).all(axis=1))[::300]
     trials = Trials(starts, ends[starts])
     for name, with_gyro in names.items():
-        expected = predictor(calibration, recording, with_gyro=with_gyro)(trials)
+        expected = predictor(calibration, recording, with_gyro=with_gyro)(trials).position
         for start, errors in zip(starts.tolist(), expected.tolist(), strict=True):
             found = page.evaluate(f"icrtoolPage.openLoop({start}).models.find((one) => one.name === '{name}').errors")
             # Between its points a path is straight, and its heading at a start is known to some 0.0002 rad.
@@ -314,9 +309,9 @@ def test_without_scripts_pictures_and_tables_are_there(chrome: Browser, file: Pa
     page = chrome.page(scripts=False)
     page.open(file)
     visible = "[...document.querySelectorAll({})].map((one) => one.getClientRects().length > 0)"
-    assert page.evaluate(visible.format("'.picture img'")) == [True, True]
+    assert page.evaluate(visible.format("'.picture img'")) == [True]
     assert set(page.evaluate(visible.format("'.needs-js'"))) == {False}
-    assert all(page.evaluate(visible.format("'#errors table, #worst table, #models table'")))
+    assert all(page.evaluate(visible.format("'#errors table, #worst table'")))
 
 
 def test_print_shows_pictures_in_place_of_what_is_interactive(chrome: Browser, file: Path) -> None:

@@ -67,7 +67,7 @@ def table_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
     """Return the errors (k, h) [m] of trials along one path, NaN where there is none."""
     errors: Floats = np.full(trials.ends.shape, np.nan)
     row, column = np.nonzero(trials.ends >= 0)
-    errors[row, column] = trial_errors(recording, trials.starts[row], trials.ends[row, column], path)
+    errors[row, column] = trial_errors(recording, trials.starts[row], trials.ends[row, column], path).position
     return errors
 
 

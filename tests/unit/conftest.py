@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from icrtool.estimation.fit import fit
+from icrtool.calibration.fit import fit
 from icrtool.records.run import Run
 from support.barn import TRACK_WIDTH_M, configured, simulate
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from icrtool.kernels.arrays import Complexes, Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.kinematics import euler_step
@@ -119,22 +119,6 @@ def integrate_path(drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: f
             y_icr_left,
             x_icr,
         )
-
-
-@njit
-def fill_path_errors(
-    turn: Complexes, place: Complexes, reference: Complexes, start: Ints, end: Ints, errors: Floats
-) -> None:
-    """Fill `errors` (m,) [m] of trials that follow one path from row `start` to row `end`, turned at its start.
-
-    Parameters
-    ----------
-    turn : (n,) e^{j heading of the reference less that of the path}; place, reference : (n,) forward + j right [m]
-    """
-    for i in range(len(start)):
-        s, e = start[i], end[i]
-        miss = turn[s] * (place[e] - place[s]) - (reference[e] - reference[s])
-        errors[i] = math.sqrt(miss.real * miss.real + miss.imag * miss.imag)
 
 
 def compiled_drive(drive: Drive) -> Drive:

@@ -119,7 +119,8 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
 
 def _constant_models(report: DropoutReport) -> tuple[str, ...]:
     """Return the recommended model and the calibrations that the report has rows of."""
-    return tuple(result.name for result in report.results if result.name not in {*LOOKS, "icr_final"})
+    given = {one.name for one in report.calibrations}
+    return tuple(result.name for result in report.results if result.name in {"recommended", "controller"} | given)
 
 
 def _look(report: DropoutReport, name: str) -> tuple[str, str, str]:

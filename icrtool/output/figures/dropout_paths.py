@@ -22,6 +22,7 @@ from icrtool.output.figures.style import (
     LABEL_BOX,
     NO_SLIP,
     REAL,
+    WHOLE,
     WIDTH_IN,
     Pen,
     add_legend,
@@ -40,7 +41,7 @@ WORST_COLUMNS = 4
 WORST_CELL_IN = 1.95
 CELL_TITLE: dict[str, Any] = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
-PENS = {"icr": ICR, "no_slip": NO_SLIP}
+PENS = {"icr": ICR, "no_slip": NO_SLIP, "recommended": WHOLE}
 OUTAGES = {"forced": FORCED, "real": REAL}
 PATH = Pen(FIX_COLOR, width=1.4)
 
@@ -78,7 +79,9 @@ def dropout_examples(report: DropoutReport) -> Figure:
     for axes, drive in zip(panels, examples, strict=True):
         _draw_drive(axes, drive, shape=3.0 / 2.75)
         facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in drive.errors_m.items())
+        errors = ",  ".join(
+            f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in drive.errors_m.items() if name in PENS
+        )
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -109,9 +112,8 @@ def dropout_worst(report: DropoutReport) -> Figure:
     _draw_overview(panels[0], worst, report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
         _draw_drive(axes, drive, shape=1.0)
-        text = (
-            f"{rank}.  ICR error {error_text(drive.errors_m['icr'])}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
-        )
+        what = f"{rank}.  {MODEL_WORDS[drive.model]}: {error_text(drive.errors_m[drive.model])}"
+        text = f"{what}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
         axes.set_title(f"{text}\nat {drive.speed_mean_mps:.2f} m/s", **CELL_TITLE)
         axes.tick_params(labelsize=7.5)
     for axes in panels[len(worst) + 1 :]:
@@ -179,7 +181,9 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
 def _draw_drive(axes: Axes, drive: ExampleTrial, shape: float) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
     lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, "filter")]
-    lines += [(path.north, path.east, PENS[name], MODEL_WORDS[name]) for name, path in drive.paths.items()]
+    lines += [
+        (path.north, path.east, PENS[name], MODEL_WORDS[name]) for name, path in drive.paths.items() if name in PENS
+    ]
     lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape)

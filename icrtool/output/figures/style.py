@@ -98,6 +98,7 @@ BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
 FILTER = Pen("black", width=1.1)
 ICR = Pen("#2166ac", (0, (6, 2)), 1.5)
+WHOLE = Pen("#1b7837", "solid", 1.6)
 NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
 CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)

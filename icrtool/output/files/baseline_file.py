@@ -125,12 +125,7 @@ def read_report(path: Path, log: str = "") -> BaselineReport:
 
 
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:
-    """Yield the rows of a report; those of the model comparison first, which others of the same name replace."""
-    ladder = document.get("ladder") or {}
-    for model in ladder.get("models", ()):
-        for h, horizon_m in enumerate(ladder["horizons_m"]):
-            values = {metric: _number(model[column][h]) for metric, (_, column) in METRICS.items()}
-            yield (model["name"], float(horizon_m)), BaselineRow(values, None)
+    """Yield the rows of a report."""
     for model in document["models"]:
         sums = {float(one["horizon_m"]): _sums(one) for one in model.get("blocks", ())}
         for row in model["by_horizon"]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from icrtool.motion.models import MODELS
+from icrtool.motion.models import FAMILY
 from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
 from icrtool.output.page.pictures import drawn_pictures
@@ -33,7 +33,7 @@ def comparison_page(document: Mapping[str, Any], title: str) -> str:
     return render(
         "comparison.html", SCRIPTS, {"by_group": [_errors(cells, names, name) for name in names]}, title=title,
         groups=document["groups"], pairs=document["pairs"], names=names, cells=at_choice, horizon_m=CHOICE_HORIZON_M,
-        drawn=drawn, labels={name: model.label for name, model in MODELS.items()},
+        drawn=drawn, labels={name: model.label for name, model in FAMILY.items()},
     )  # fmt: skip
 
 

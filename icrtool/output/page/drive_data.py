@@ -6,7 +6,7 @@ open-loop path that the page integrates ends where the library's does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import FAMILY, ROWS, turned_path
 from icrtool.calibration.pooled import calibrated
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.calibration.stored import calibration_of
@@ -22,7 +21,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
-from icrtool.motion.models import MODELS, FittedModel, MotionModel
+from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
@@ -195,15 +194,13 @@ class ModelPath(NamedTuple):
 
     Attributes
     ----------
-    heading, place : [rad], forward + j right [m], of the robot at the steps; with `icrs` of the mean of its tracks
-    icrs : y right, y left, x [m]; None: those of the start; empty where the path is the robot's
+    heading, place : [rad], forward + j right [m], of the robot at the steps
     """
 
     name: str
     label: str
     heading: Floats
     place: Complexes
-    icrs: Sequence[float] | None = ()
 
 
 def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[str, Any]]:
@@ -215,8 +212,7 @@ def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[
         {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
     ]
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(b)))
-    paths = list(_calibrated(recording, report, labels, steps.rows))
-    paths += _compared(run, recording, report["ladder"], {*labels, *(one.name for one in paths)}, steps.rows)
+    paths = [*_held_out(recording, report, labels, steps.rows), *_calibrated(recording, report, steps.rows)]
     count = len(steps.rows)
     every = max(-(-len(paths) * count // MOST_STEPS), 1)
     rows = np.unique(np.append(np.arange(0, count, every), count - 1))
@@ -224,71 +220,48 @@ def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[
         columns = {"forward": one.place.real, "right": one.place.imag, "turn": one.heading}
         path: dict[str, Any] = {"every": every, "first_turn": float(one.heading[0])}
         path |= {name: packed_sums(column[rows]) for name, column in columns.items()}
-        found = {"name": one.name, "label": one.label, "path": path}
-        models.insert(
-            0 if one.name == "recommended" else len(models), found | ({} if one.icrs == () else {"icrs": one.icrs})
-        )
-    return models
+        models.append({"name": one.name, "label": one.label, "path": path})
+    return sorted(models, key=lambda one: one["name"] != RECOMMENDED)
 
 
-def _calibrated(
+def _held_out(
     recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str], rows: Ints
 ) -> Iterator[ModelPath]:
-    """Yield the path of each calibration of the report, its own first; with the gyro too where there is one."""
-    wanted = [(one["name"], one["label"], one["calibration"], one["with_gyro"]) for one in report["calibrations"]]
-    if (own := report["recommended"]) is not None and (label := labels.get("recommended")):
-        gyro = [("recommended_gyro", f"{label} + gyro", own, True)] if own["gyro"] is not None else []
-        wanted = [("recommended", label, own, False), *gyro, *wanted]
-    recording = recording_of("gyro") if wanted else None
-    for name, label, document, with_gyro in wanted:
-        if recording is not None and document and not (with_gyro and recording.gyro_radps is None):
-            # Too short a drive to find the delay of its wheels has no path.
-            with suppress(DataError):
-                model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=with_gyro)
-                yield ModelPath(name, label, *predicted_path(recording, *model)(recording.t_s[rows]))
-
-
-def _compared(
-    run: Run, recording_of: Callable[[str], Recording], ladder: Mapping[str, Any], known: set[str], rows: Ints
-) -> Iterator[ModelPath]:
-    """Yield the path of each model of the comparison that is not `known`, as fitted to the whole drive."""
-    if "left_out" in ladder:
+    """Yield the path of each held-out model of the report, here as fitted to the whole drive."""
+    if "left_out" in (ladder := report["ladder"]):
         return
     kind = ladder["heading"] or ""
     recording = recording_of(kind)
     windows = cache(partial(cut_windows, recording))
-
-    @cache
-    def path_turned() -> tuple[Floats, Complexes]:
-        heading, place = turned_path(run, recording)
-        return heading[rows], place[rows]
-
-    for row in ladder["models"]:
-        name, turned = row["name"], row["heading"] != "wheels"
-        base = name.removesuffix(f"_{kind}") if turned else name
-        # What is chosen by block is, of the whole drive, the recommended model.
-        if {name, name.replace("extended", "recommended")} & known or (turned and recording.gyro_radps is None):
-            continue
-        with suppress(DataError):
-            if base in FAMILY:
-                fitted = _fitted(ladder, base, turned=turned)
-                own = own_constants(windows(), fitted, recording.width_m)
-                yield ModelPath(name, row["label"], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
-            else:
-                icrs = None if base == "icr" else run.table.icrs_at(-1)
-                yield ModelPath(name, row["label"], *path_turned(), icrs)
+    wheels = {name: _fitted(name, ladder) for name in (FIVE, RECOMMENDED)}
+    for model, base in ((RECOMMENDED, RECOMMENDED), (CONTROLLER, FIVE)):
+        fits = {model: wheels[base]}
+        if recording.gyro_radps is not None:
+            fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder), wheels=wheels[base])
+        for name, fit in fits.items():
+            # Too short a drive to find the delay of its wheels has no path.
+            with suppress(DataError):
+                own = own_constants(windows(), fit, recording.width_m)
+                fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
+                yield ModelPath(name, labels[name], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
 
 
-def _fitted(ladder: Mapping[str, Any], row: str, *, turned: bool) -> FittedModel:
-    """Return the model of a row as it was fitted to the whole drive; with wheels and a measured turn rate."""
-    family = ladder["best"] if row == "extended" else FAMILY[row]
+def _fitted(name: str, ladder: Mapping[str, Any]) -> FittedModel:
+    """Return a model as it was fitted to the whole drive."""
+    model, value = find_model(name), ladder["fits"][name]["value"]
+    k = len(model.terms)
+    return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((k, k)))
 
-    def fit(model: MotionModel, suffix: str) -> FittedModel:
-        value = ladder["fits"][f"{ROWS.get(family, family)}{suffix}"]["value"]
-        return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((0, 0)))
 
-    wheels = fit(MODELS[family], "")
-    return replace(fit(wheels.model.with_gyro(), f"_{ladder['heading']}"), wheels=wheels) if turned else wheels
+def _calibrated(recording_of: Callable[[str], Recording], report: Mapping[str, Any], rows: Ints) -> Iterator[ModelPath]:
+    """Yield the path of each calibration that was given; with the gyro too where there is one."""
+    recording = recording_of("gyro") if report["calibrations"] else None
+    for one in report["calibrations"]:
+        turned, document = one["with_gyro"], one["calibration"]
+        if recording is not None and document and not (turned and recording.gyro_radps is None):
+            with suppress(DataError):
+                model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=turned)
+                yield ModelPath(one["name"], one["label"], *predicted_path(recording, *model)(recording.t_s[rows]))
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ FLEET_FAMILY = "icrtool/fleet/"
 HORIZON_M = 10.0
 """At this distance the table shows the errors of each model."""
 
-MODELS = {"recommended": "recommended", **MODEL_WORDS}
+MODELS = MODEL_WORDS
 
 
 class Cell(NamedTuple):

@@ -85,9 +85,9 @@ def run_page(
         pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
         warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]],
         streams=[{**one, "role": role_word(summary, one["role"])} for one in summary["streams"]],
-        begun=_utc(int(run.table.stamp_ns[0])), ladder=_ladder_rows(document["ladder"]),
+        begun=_utc(int(run.table.stamp_ns[0])),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
-        coordinates=coordinates, samples=len(run.table),
+        coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
     )  # fmt: skip
 
 
@@ -165,16 +165,10 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
     return found
 
 
-def _ladder_rows(ladder: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the model comparison, with the least error at each horizon."""
-    if "left_out" in ladder:
-        return {"left_out": ladder["left_out"], "models": []}
-    held_out = [one for one in ladder["models"] if one["fitted"] != "in sample"]
-    best = [
-        min((one["p95_m"][h] for one in held_out if one["p95_m"][h] is not None), default=None)
-        for h in range(len(ladder["horizons_m"]))
-    ]
-    return {**ladder, "heads": _heads(ladder["horizons_m"]), "best": best, "left_out": ""}
+def _worst_label(report: Mapping[str, Any]) -> str:
+    """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
+    name = next((one.get("model", "icr") for one in report["worst"]), "icr")
+    return next((f"the {one['label']}" for one in report["models"] if one["name"] == name), name)
 
 
 def _heads(horizons_m: Sequence[float]) -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.output.tables.model_comparison import comparison_blocks
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
     MODEL_WORDS,
@@ -20,7 +19,6 @@ from icrtool.output.text_format import (
     driven_text,
     duration_text,
     error_text,
-    fitted_model_text,
     run_title,
     unusable_lines,
 )
@@ -61,9 +59,9 @@ def format_dropout(report: DropoutReport) -> Text:
     blocks += [*_learned_blocks(report), *_count_lines(report), *map(_turning_line, report.by_turning)]
     blocks += ["", *budget_lines(report.budgets)]
     if report.comparison is not None:
-        blocks += ["", *comparison_blocks(report.comparison)]
+        blocks += ["", *report.comparison.notes]
     elif report.no_comparison:
-        blocks += ["", f"models on distance they were not fitted to: left out: {report.no_comparison}"]
+        blocks += ["", f"whole model and controller numbers: left out: {report.no_comparison}"]
     if report.outages:
         blocks += ["", _outage_table(report.outages, report)]
     if report.verdicts:
@@ -91,20 +89,20 @@ def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> flo
 
 
 def headline(report: DropoutReport) -> list[str]:
-    """Return what is recommended: the model, how far it goes without GNSS, what a controller is given."""
-    calibration, reached = report.calibration, {one.model: one for one in reversed(report.budgets)}
-    if calibration is None or (best := reached.get("recommended")) is None:
+    """Return how far the robot goes without GNSS, and what a controller is given."""
+    reached = {one.model: one for one in reversed(report.budgets)}
+    if (best := reached.get("recommended")) is None:
         return []
-    fitted, numbers = calibration.fitted, calibration.controller_numbers()
     interval = f" ({best.interval_text})" if best.interval_text else ""
-    without = f"; without slip model: {reached['no_slip'].reach_text}" if "no_slip" in reached else ""
-    model = fitted_model_text(fitted)
-    alone = controller_error_text(calibration.controller) if len(fitted.parameters) else ""
-    return [
-        f"Recommended: {model}, tested on distance it was not fitted to.",
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {best.reach_text}{interval}{without}.",
-        f"Controller: {controller_text(numbers._asdict())}{f'; {alone}' if alone else ''}.",
+    without = f"; no slip: {reached['no_slip'].reach_text}" if "no_slip" in reached else ""
+    found = [
+        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {best.reach_text}{interval}{without}."
     ]
+    if (calibration := report.calibration) is not None:
+        alone = controller_error_text(calibration.controller)
+        numbers = controller_text(calibration.controller_numbers()._asdict())
+        found.append(f"Controller: {numbers}{f'; {alone}' if alone else ''}.")
+    return found
 
 
 def _calibration_lines(report: DropoutReport) -> list[str]:

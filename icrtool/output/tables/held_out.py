@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from icrtool.calibration.controller_numbers import not_shown_sentences
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
-from icrtool.motion.models import TERMS, FittedModel, find_model
+from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import fitted_model_text
 
@@ -18,26 +16,23 @@ GEOMETRY = (
     ("y_icr_right_m", "y ICR right", "m"),
     ("y_icr_left_m", "y ICR left", "m"),
     ("x_icr_m", "x ICR", "m"),
-    ("multiplier", "multiplier, with the radius factors below", ""),
+    ("multiplier", "multiplier (y right - y left) / b", ""),
     ("radius_left", "left radius over configured", ""),
     ("radius_right", "right radius over configured", ""),
-    ("multiplier_nominal", "multiplier, radii as configured", ""),
 )
 
 
 def format_result(result: CalibrationResult) -> Text:
     """Return the tables of a pooled calibration, no line end."""
     calibration, fitted = result.calibration, result.calibration.fitted
-    blocks: list[Block] = [
-        f"Recommended: {fitted_model_text(fitted)}: {calibration.why}",
+    return Text([
+        f"Motion model: {fitted_model_text(fitted)}",
         "",
         *_parameter_blocks(calibration),
         "",
-        *held_out_blocks(result.wheels),
-    ]
-    if result.gyro is not None:
-        blocks += ["", "wheels and gyro", *held_out_blocks(result.gyro)]
-    return Text([*blocks, *result.notes])
+        *held_out_blocks(result.table),
+        *result.notes,
+    ])  # fmt: skip
 
 
 def _parameter_blocks(calibration: Calibration) -> list[Block]:
@@ -65,28 +60,24 @@ def _parameter_rows(fitted: FittedModel) -> list[tuple[str, str, str]]:
 
 
 def held_out_blocks(table: HeldOut) -> list[Block]:
-    """Return the leave-one-out table: p95 / expected error by horizon, median over folds and worst fold."""
+    """Return the leave-one-out table: p95 / expected error by horizon, of all trials together and of the worst fold."""
     what = "log" if table.folds[0].whole else "block"
-    rows = [
-        (row.label.removesuffix(" + gyro"), *(_cell(row, h) for h in range(len(table.horizons_m))))
-        for row in table.scores
-    ]
-    used = "; ".join(dict.fromkeys(find_model(name).label for name in table.chosen))
-    recommended = find_model(table.recommended).label
+    rows = [(row.label, *(_cell(row, h) for h in range(len(table.horizons_m)))) for row in table.scores]
     tested = (
         f"each {what} left out in turn"
         if table.folds[0].whole
         else "each trial predicted by a fit to the rest of the drive"
     )
     return [
-        f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m], median {what} (worst {what})",
+        f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m] of all trials (of the worst {what})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),
-        f"recommended: chosen without the {what} that it is tested on: {used}; for all: {recommended}",
     ]
 
 
 def _cell(row: HeldOutRow, h: int) -> str:
-    if not math.isfinite(row.median("p95", h)):
+    if not row.together.trials[h]:
         return "–"
-    median, worst = ((over("p95", h), over("expected", h)) for over in (row.median, row.worst))
-    return f"{median[0]:.2f}/{median[1]:.2f} ({worst[0]:.2f}/{worst[1]:.2f})"
+    all_trials = row.together.p95[h], row.together.expected[h]
+    worst = (row.worst(column, h) for column in ("p95", "expected"))
+    (p95, expected), (worst_p95, worst_expected) = all_trials, worst
+    return f"{p95:.2f}/{expected:.2f} ({worst_p95:.2f}/{worst_expected:.2f})"

@@ -1,18 +1,17 @@
-"""The model comparison as text, as rows of ladder.csv and as plain data."""
+"""The rows of ladder.csv, and what report.json holds of how models were tested."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import ROWS, ModelComparison
-from icrtool.motion.models import FittedModel, TypicalDrive
-from icrtool.output.text_blocks import Block, Table
+from icrtool.calibration.model_comparison import FITTED_TO, ModelComparison
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.motion.models import FittedModel
 from icrtool.output.text_format import FITTED
-from icrtool.records.dropout import ModelScore, error_columns
+from icrtool.records.dropout import ModelResult, error_columns
 from icrtool.records.plain_data import rows_of
 
 COMPARISON_COLUMNS = (
@@ -21,82 +20,60 @@ COMPARISON_COLUMNS = (
 )  # fmt: skip
 
 
-def comparison_blocks(comparison: ModelComparison) -> list[Block]:
-    """Return the table as text: p95 / expected error [m] by horizon, all models in the same trials."""
-    rows = [
-        (score.label, FITTED[score.fitted], *map(_pair, score.summary.p95.tolist(), score.summary.expected.tolist()))
-        for score in comparison.scores
-    ]
-    return [
-        "models on distance they were not fitted to: 95 % / expected error [m]",
-        Table("llr", rows, ("model", "fitted", *(f"{horizon:g} m" for horizon in comparison.horizons_m))),
-        extended_line(comparison),
-        *comparison.notes,
-    ]
+def compared_results(report: DropoutReport) -> list[ModelResult]:
+    """Return the rows of the comparison: all of the report but those of calibrations."""
+    given = {one.name for one in report.calibrations}
+    return [one for one in report.results if one.name not in given]
 
 
-def extended_line(comparison: ModelComparison) -> str:
-    """Return which models were chosen for the blocks, and which one for the whole drive."""
-    names = {name: fit.model.label for name, fit in comparison.fits.items()}
-    whole = f"for all: {names[comparison.best]}"
-    used = dict.fromkeys(names[name] for name in comparison.chosen)
-    return f"extended: chosen without the block that it is tested on: {'; '.join(used)}; {whole}"
+def fitted_text(name: str, heading: str) -> str:
+    """Return what the numbers of a row were fitted to; `heading` is what rows with a measured one go by."""
+    return FITTED[FITTED_TO.get(name.removesuffix(f"_{heading}") if heading else name, "others")]
 
 
-def comparison_rows(comparison: ModelComparison) -> Iterator[tuple[Any, ...]]:
+def comparison_rows(report: DropoutReport, comparison: ModelComparison) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of ladder.csv, a model and horizon each; see `COMPARISON_COLUMNS`."""
-    for score in comparison.scores:
-        fitted, heading = FITTED[score.fitted] or "not fitted", _heading(score, comparison)
-        for row in rows_of({"horizon_m": comparison.horizons_m, **error_columns(score.summary)}):
+    for one in compared_results(report):
+        fitted, heading = fitted_text(one.name, comparison.heading), _heading(one.name, comparison)
+        for row in rows_of({"horizon_m": report.horizons_m, **error_columns(one.summary)}):
             shares = (100.0 * row[name] / row["horizon_m"] for name in ("expected_error_m", "p95_m"))
-            yield score.name, fitted, heading, *row.values(), *shares
+            yield one.name, fitted, heading, *row.values(), *shares
 
 
-def comparison_document(comparison: ModelComparison) -> dict[str, Any]:
-    """Return what report.json holds, with numbers of numpy."""
+def comparison_document(report: DropoutReport) -> dict[str, Any]:
+    """Return what report.json holds, with numbers of numpy; why there is none where it was left out."""
+    comparison = report.comparison
+    if comparison is None:
+        return {"left_out": report.no_comparison}
     return {
-        "horizons_m": list(comparison.horizons_m),
+        "horizons_m": list(report.horizons_m),
         "blocks": comparison.blocks,
         "starts": comparison.starts,
         "heading": comparison.heading or None,
         "notes": list(comparison.notes),
-        "extended_by_block": list(comparison.chosen),
-        "best": comparison.best,
         "models": [
             {
-                "name": score.name,
-                "label": score.label,
-                "fitted": FITTED[score.fitted] or "not fitted",
-                "heading": _heading(score, comparison),
-                **error_columns(score.summary),
+                "name": one.name,
+                "label": one.label,
+                "fitted": fitted_text(one.name, comparison.heading),
+                "heading": _heading(one.name, comparison),
+                **error_columns(one.summary),
             }
-            for score in comparison.scores
+            for one in compared_results(report)
         ],
-        "fits": {_fit_name(name, comparison): _fit(fit, comparison.width_m) for name, fit in comparison.fits.items()},
+        "width_m": comparison.width_m,
+        "fits": {name: _fit(fit) for name, fit in comparison.fits.items()},
     }
 
 
-def _fit_name(name: str, comparison: ModelComparison) -> str:
-    """Return the name of a fit: that of its row; ``icr`` is the filter's row."""
-    base = name.removesuffix("_gyro")
-    row = ROWS.get(base, base)
-    return row if base == name else f"{row}_{comparison.heading}"
+def _fit(fit: FittedModel) -> dict[str, Any]:
+    """Return the parameters of a fit with one standard deviation."""
+    return {
+        "value": dict(zip(fit.model.terms, fit.parameters, strict=True)),
+        "std": dict(zip(fit.model.terms, np.sqrt(np.diag(fit.covariance)), strict=True)),
+    }
 
 
-def _fit(fit: FittedModel, width_m: float) -> dict[str, Any]:
-    """Return parameters of a fit, and the track ICRs of one by wheels alone, with one standard deviation."""
-    value = dict(zip(fit.model.terms, fit.parameters, strict=True))
-    std = dict(zip(fit.model.terms, fit.std, strict=True))
-    if not fit.model.uses_gyro:
-        geometry, covariance = fit.geometry(width_m, TypicalDrive())
-        value |= geometry._asdict()
-        std |= dict(zip(geometry._fields, np.sqrt(np.diag(covariance)), strict=True))
-    return {"value": value, "std": std}
-
-
-def _heading(score: ModelScore, comparison: ModelComparison) -> str:
-    return comparison.heading if score.measured_heading else "wheels"
-
-
-def _pair(p95: float, expected: float) -> str:
-    return f"{p95:.2f} / {expected:.2f}" if math.isfinite(p95) else "–"
+def _heading(name: str, comparison: ModelComparison) -> str:
+    turned = comparison.heading and name.endswith(f"_{comparison.heading}")
+    return comparison.heading if turned else "wheels"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
@@ -12,13 +15,14 @@ from icrtool.output.text_format import (
     error_text,
     event_kinds,
     excitation_text,
-    model_text,
+    filter_agreement,
+    icr_value_text,
     position_word,
     role_word,
     run_title,
     unusable_lines,
 )
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import ClassDocument
 from icrtool.records.text import counted
 
@@ -43,7 +47,7 @@ def format_run(run: Run) -> Text:
     """
     drive = run.summary["drive"]
     speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s (mean ± std)"
-    learned = [*_multiplier_rows(run), *_recommended_rows(run), excitation_row(run)]
+    learned = [*_controller_rows(run), *_filter_rows(run), excitation_row(run)]
     measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
     return Text(
         [
@@ -85,45 +89,40 @@ def _stream_table(run: Run) -> Table:
 
 
 def _icr_table(run: Run) -> Table:
+    """Return the ICRs of the drive, and how those of the filter converged."""
     icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
+    geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
     rows = []
     for column in ICR_COLUMNS:
+        found = icr_value_text(geometry, column)
         mean, std, time_s = icr["mean"][column], icr["std"][column], icr["convergence_s"][column]
-        if icr["final"][column] is None:
-            rows.append((ICR_WORDS[column], icr_text(icr, column), "", "", ""))
+        if mean is None:
+            rows.append((ICR_WORDS[column], found, "", "", ""))
             continue
-        convergence = f"{time_s:.1f} s" if time_s is not None else "hardly moved"
+        convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         verdict = SHOWN_WORDS.get(verdicts[column], "")
-        rows.append((ICR_WORDS[column], icr_text(icr, column), convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
-    return Table("l", rows, ("ICR [m]".ljust(LABEL), "final ± std", "convergence time", "mean ± std after that", ""))
+        rows.append((ICR_WORDS[column], found, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
+    head = ("ICR [m]".ljust(LABEL), "value ± σ", "EKF: converged in", "mean ± std after that", "")
+    return Table("l", rows, head)
 
 
-def _multiplier_rows(run: Run) -> list[Row]:
-    width, icr = run.track_width_m, run.summary["icr"]
+def _controller_rows(run: Run) -> list[Row]:
+    """Return what a controller is given; it belongs to the ICRs in the table above."""
+    numbers, width = run.summary.get("controller"), run.track_width_m
     if width is None:
-        return [("multiplier", "left out, and no-slip odometry too: robot.track_width_m is not known")]
-    multiplier, std = icr["separation_multiplier"], icr["separation_multiplier_std"]
-    if multiplier is None:
-        return [("multiplier", "not shown: it is made of y right and y left")]
+        return [("controller", "left out, and no-slip odometry too: robot.track_width_m is not known")]
+    if numbers is None:
+        return [("controller", "no multiplier: y right and y left are not shown")] if run.usable else []
     verdicts = run.summary["excitation"]["verdict"]
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
-    note = "" if shown else ": not shown well enough to be used"
-    value = f"{multiplier:.3f} ± {std:.3f}" if std is not None else f"{multiplier:.3f}"
-    return [("multiplier", f"{value} = (y right - y left) / b of these, with b = {width:g} m{note}")]
+    note = "" if shown else "; y right and y left are not shown well enough to use it"
+    return [("controller", f"{controller_text(numbers)}; (y right - y left) / b, b = {width:g} m{note}")]
 
 
-def _recommended_rows(run: Run) -> list[Row]:
-    """Return the motion model to use, as `icrtool calibrate` recommends it, and what a controller is given."""
-    found = run.summary.get("recommended")
-    if found is None or not run.usable:
-        return []
-    rows = found["parameters"].items()
-    values = "".join(f", {name} {one['value']:.3f} ± {one['std']:.3f}" for name, one in rows)
-    model = model_text(found["label"], found["model"], len(rows))
-    return [
-        ("model", f"recommended: {model}{values}; what error it makes: icrtool dropout-report"),
-        ("controller", controller_text(found["controller"])),
-    ]
+def _filter_rows(run: Run) -> list[Row]:
+    """Return where the filter's ICRs ended, as a check of those in the table."""
+    agreement = filter_agreement(run.summary)
+    return [("EKF", agreement)] if agreement else []
 
 
 def _terrain_table(run: Run) -> list[Block]:

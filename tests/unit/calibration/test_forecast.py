@@ -17,13 +17,13 @@ from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError, IcrToolError
-from icrtool.motion.models import MODELS, FittedModel, wheel_motion
+from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
 from icrtool.output.files.csv_file import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
 from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 
-SIX = MODELS["six"]
+SIX = FAMILY["six"]
 SEEDS = range(5)
 HORIZONS_M = (5.0, 10.0, 20.0)
 ROUNDING = 1e-6
@@ -53,7 +53,7 @@ def test_the_95_percent_error_holds_on_drives_that_were_not_calibrated_with() ->
         parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
         new = make_recording(SIX, parameters, 10 * seed + 9, 300.0, name="new")
         found, trials = calibrated(seed), cut_trials(new, HORIZONS_M)
-        errors, (expected, p95) = predictor(found, new)(trials), forecast_trials(found, new, trials)
+        errors, (expected, p95) = predictor(found, new)(trials).position, forecast_trials(found, new, trials)
         inside.append(np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0))
         ratio.append(np.nanmean(errors, axis=0) / np.nanmean(expected, axis=0))
     print("within the 95 % forecast after 5, 10 and 20 m:", np.mean(inside, axis=0).round(2))
@@ -105,7 +105,7 @@ def test_a_plan_and_its_turned_and_shifted_copy_have_equal_errors(calibration: C
 
 @pytest.mark.parametrize("name", ["icr", "six", "eight"])
 def test_wheel_speeds_make_the_motion_asked_for(name: str) -> None:
-    model = MODELS[name]
+    model = FAMILY[name]
     parameters = draw_parameters(model, np.random.default_rng(4))
     speed, turn = np.array([0.5, 1.0, 0.8]), np.array([0.3, -0.4, 0.0])
     fitted = FittedModel(model, parameters, np.eye(len(parameters)))
@@ -205,7 +205,7 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     assert calibration_of(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
     trials = cut_trials(new, HORIZONS_M)
-    errors = predictor(found, new, with_gyro=True)(trials)
+    errors = predictor(found, new, with_gyro=True)(trials).position
     expected, p95 = forecast_trials(found, new, trials, with_gyro=True)
     wheels, _ = forecast_trials(found, new, trials)
     inside = np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0)

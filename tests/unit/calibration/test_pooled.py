@@ -11,15 +11,14 @@ import pytest
 
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
-from icrtool.calibration.model_choice import choose
-from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, held_out_predictor, predictor
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, predictor
 from icrtool.calibration.run_recording import recording_of, with_turn_rate
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
 from icrtool.motion.fit import Pool, own_constants
-from icrtool.motion.models import MODELS
+from icrtool.motion.models import FAMILY, MODELS
 from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path
 from icrtool.output.files.calibration_file import open_calibration, write_calibration
@@ -28,9 +27,8 @@ from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
 
-SIX = MODELS["six"]
+SIX, WHOLE = FAMILY["six"], MODELS["recommended"]
 TRUTH = np.array([0.96, -0.1, 0.6, -0.02, 0.1, -0.12])
-SOME = [MODELS[name] for name in ("no_slip", "multiplier", "icr", "six")]
 
 
 def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
@@ -42,15 +40,16 @@ def result() -> CalibrationResult:
     return calibrate_recordings(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
 
 
-def test_the_model_that_made_the_logs_is_recommended(result: CalibrationResult) -> None:
+def test_the_parameters_that_made_the_logs_come_back(result: CalibrationResult) -> None:
     chosen = result.calibration.fitted
     assert set(SIX.terms) <= set(chosen.model.terms)
     for term, value in zip(SIX.terms, TRUTH, strict=True):
         k = chosen.model.terms.index(term)
         assert abs(chosen.parameters[k] - value) < 4.0 * chosen.std[k]
-    table = result.wheels
-    # one multiplier and a heading offset of each log do well over a few metres
-    assert table.score("recommended").together.p95[2] < 0.5 * table.score("multiplier").together.p95[2]
+    table = result.table
+    expected = {row.name: row.together.expected for row in table.scores}
+    assert np.all(expected["recommended"] < expected["controller"])
+    assert np.all(expected["controller"] < 0.2 * expected["no_slip"])
 
 
 def test_a_gyro_on_a_circle_turns_with_the_robot() -> None:
@@ -65,41 +64,35 @@ def test_a_gyro_on_a_circle_turns_with_the_robot() -> None:
 
 
 def test_wheels_and_gyro_together_are_not_worse_than_either(result: CalibrationResult) -> None:
-    assert result.gyro is not None
-    both = result.gyro.score("recommended").together.expected
-    assert np.all(both < 1.05 * result.wheels.score("recommended").together.expected)
-    assert np.all(both < 1.05 * result.gyro.score("no_slip_gyro").together.expected)
+    both = result.table.score("recommended_gyro").together.expected
+    assert np.all(both < 1.05 * result.table.score("recommended").together.expected)
+    assert np.all(both < 1.05 * result.table.score("no_slip_gyro").together.expected)
 
 
 def test_a_log_is_tested_with_parameters_of_the_others() -> None:
     """Against a fit that never saw the log, with the log's own constants."""
     recordings = logs(3)
-    table, _ = hold_out(recordings, [SIX], (5.0, 10.0))
-    alone = Pool([cut_windows(one) for one in recordings[:2]], [WIDTH_M] * 2).fit(SIX)
+    table = hold_out(recordings, (5.0, 10.0))
+    alone = Pool([cut_windows(one) for one in recordings[:2]], [WIDTH_M] * 2).fit(WHOLE)
     own = own_constants(cut_windows(recordings[2]), alone, WIDTH_M)
     path = predicted_path(recordings[2], alone, own)
     errors = table_errors(recordings[2], cut_trials(recordings[2], (5.0, 10.0)), path)
     # the two fits stop within a small share of their standard deviation of one another
-    assert table.score("six").folds[2].expected == pytest.approx(np.nanmean(errors, axis=0), rel=0.02)
+    assert table.score("recommended").folds[2].expected == pytest.approx(np.nanmean(errors, axis=0), rel=0.02)
 
 
-def test_a_block_that_is_spoilt_changes_neither_its_fit_nor_its_choice() -> None:
+def test_a_block_that_is_spoilt_does_not_change_what_it_is_predicted_by() -> None:
     clean = logs(1)[0]
     folds, drive = plan_folds([clean]), clean.drive
     inside = (drive.distance > folds[-1].begin_m) & (drive.distance <= folds[-1].end_m)
     spoilt = replace(clean, drive=drive._replace(north=drive.north * np.where(inside, 1.5, 1.0)))
-    before, after = (hold_out([one], SOME, (5.0,))[0] for one in (clean, spoilt))
-    assert before.chosen[-1] == after.chosen[-1]
-    assert after.score("six").folds[-1].expected[0] > 1.0
-    assert after.fits["six"].parameters != pytest.approx(before.fits["six"].parameters, abs=1e-3)
-
-
-def test_the_least_held_out_error_is_chosen_and_so_never_worse_than_one_multiplier() -> None:
-    errors = {"multiplier": np.full(4, 1.0), "icr": np.array([0.1, 0.31, 0.31, 0.31]), "eight": np.full(4, 0.25)}
-    assert choose(errors, "multiplier")[0] == "icr"  # of a mean of ratios: one hard fold does not decide
-    assert choose(errors | {"icr": np.full(4, 0.26)}, "multiplier")[0] == "eight"
-    assert choose(errors | {"icr": np.full(4, 1.2), "eight": np.full(4, 1.1)}, "multiplier")[0] == "multiplier"
-    assert choose({name: np.full(2, np.nan) for name in errors}, "multiplier")[0] == "multiplier"
+    before, after = (hold_out([one], (5.0,)) for one in (clean, spoilt))
+    of_last = [one.without("recommended", folds[-1]) for one in (before, after)]
+    assert of_last[0] is not None
+    assert of_last[1] is not None
+    assert of_last[1][0].parameters == pytest.approx(of_last[0][0].parameters, abs=5e-3)
+    assert after.score("recommended").folds[-1].expected[0] > 1.0
+    assert after.fits["recommended"].parameters != pytest.approx(before.fits["recommended"].parameters, abs=5e-3)
 
 
 def test_a_file_comes_back_as_it_was(result: CalibrationResult, tmp_path: Path) -> None:
@@ -154,10 +147,10 @@ def test_odometry_takes_wheels_in_the_unit_of_the_log(result: CalibrationResult,
 def test_a_calibration_is_tested_in_the_trials_of_other_models(result: CalibrationResult) -> None:
     new = make_recording(SIX, TRUTH, 9, 200.0, gyro=True, name="new")
     trials = trials_from_all(new, (5.0, 10.0))
-    errors = predictor(result.calibration, new)(trials)
+    errors = predictor(result.calibration, new)(trials).position
     np.testing.assert_array_equal(np.isfinite(errors), trials.ends >= 0)
     assert np.nanmean(errors[:, 1]) < 0.5
-    assert np.nanmean(predictor(result.calibration, new, with_gyro=True)(trials)[:, 1]) < 0.5
+    assert np.nanmean(predictor(result.calibration, new, with_gyro=True)(trials).position[:, 1]) < 0.5
     assert not result.calibration.fitted_to(new.sha256)
     assert result.calibration.fitted_to("log 1")
     with pytest.raises(ConfigError, match="width"):
@@ -173,10 +166,10 @@ def kept_of(windows: Windows, kept: Bools) -> Windows:
 def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
     """Against fits made here to the windows that keep clear of the trial."""
     recording = logs(1)[0]
-    table, _ = hold_out([recording], SOME, (horizon_m,))
+    table = hold_out([recording], (horizon_m,))
     distance, windows = recording.drive.distance, cut_windows(recording)
     trials = cut_trials(recording, (horizon_m,))
-    errors = held_out_predictor([recording], table, 0)(trials)
+    errors = table.errors("recommended", 0, trials).position
     differs = []
     for row in np.flatnonzero(trials.ends[:, 0] >= 0)[::400]:
         one = Trials(trials.starts[[row]], trials.ends[[row]])
@@ -185,8 +178,7 @@ def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
         assert fold.begin_m <= begin
         assert end <= fold.end_m
         clear = (windows.end_m <= fold.begin_m) | (windows.start_m >= fold.end_m)
-        model = MODELS[table.chosen[fold.number]]
-        apart, whole = (Pool([kept_of(windows, kept)], [WIDTH_M]).fit(model) for kept in (clear, clear | True))
+        apart, whole = (Pool([kept_of(windows, kept)], [WIDTH_M]).fit(WHOLE) for kept in (clear, clear | True))
         expected, in_sample = (
             table_errors(recording, one, predicted_path(recording, fitted, fitted.constants(0)))[0, 0]
             for fitted in (apart, whole)
@@ -198,13 +190,12 @@ def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
 
 def test_a_trial_that_leaves_too_little_has_no_error_in_any_row() -> None:
     recording = make_recording(SIX, TRUTH, 1, 60.0)
-    table, _ = hold_out([recording], SOME, (5.0, 40.0))
-    errors = held_out_predictor([recording], table, 0)(cut_trials(recording, (5.0, 40.0)))
+    table = hold_out([recording], (5.0, 40.0))
+    errors = table.errors("recommended", 0, cut_trials(recording, (5.0, 40.0))).position
     assert np.isfinite(errors[:, 0]).any()
     assert not np.isfinite(errors[:, 1]).any()
-    assert np.array_equal(np.isfinite(errors), table.trials[0].ends >= 0)
-    for row in table.scores:
-        assert np.array_equal(row.together.trials, np.isfinite(errors).sum(axis=0))
+    for name in ("recommended", "controller"):
+        assert np.array_equal(table.score(name).together.trials, np.isfinite(errors).sum(axis=0))
 
 
 def test_a_log_given_twice_and_robots_of_two_widths_are_refused() -> None:
@@ -232,6 +223,6 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
 
 def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:
     text = format_result(result)
-    assert text.splitlines()[0].startswith(f"Recommended: {result.calibration.fitted.model.label}")
+    assert text.splitlines()[0].startswith(f"Motion model: {result.calibration.fitted.model.label}")
     assert "each log left out in turn (3 logs)" in text
     assert max(map(len, text.splitlines())) <= 110

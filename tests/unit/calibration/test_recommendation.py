@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import icrtool
@@ -22,7 +23,7 @@ def run() -> Run:
 
 def test_a_fit_recommends_what_a_calibration_of_its_run_does(run: Run) -> None:
     found, calibration = run.summary["recommended"], icrtool.calibrate(run).summary()
-    for key in ("model", "why", "terms", "parameters", "covariance", "geometry", "geometry_std", "not_shown"):
+    for key in ("model", "terms", "parameters", "covariance", "geometry", "geometry_std", "not_shown"):
         assert found[key] == calibration[key], key
     assert found["controller"].items() <= calibration["controller"].items()
     assert not SCORES & set(found)
@@ -40,7 +41,32 @@ def test_it_is_the_reports_first_line_too(run: Run) -> None:
     assert report.calibration.controller_numbers()._asdict() == run.summary["recommended"]["controller"]
 
 
-@pytest.mark.parametrize(("seconds", "width"), [(10.0, 0.6), (60.0, None)])
-def test_without_enough_to_choose_by_nothing_is_recommended(seconds: float, width: float | None) -> None:
+@pytest.mark.parametrize(("seconds", "width"), [(4.0, 0.6), (60.0, None)])
+def test_too_short_a_drive_and_an_unknown_width_have_no_model_for_a_controller(
+    seconds: float, width: float | None
+) -> None:
     config = parse_config({"robot": {} if width is None else {"track_width_m": width}})
-    assert icrtool.fit(make_log(0, seconds, rate=20.0), config).summary["recommended"] is None
+    summary = icrtool.fit(make_log(0, seconds, rate=20.0), config).summary
+    assert summary["recommended"] is None
+    assert summary["controller"] is None
+    assert (summary["geometry"] is None) == (width is not None)
+
+
+def test_the_multiplier_belongs_to_the_icrs_beside_it(run: Run) -> None:
+    """(right - left) / b, with a standard deviation that holds their covariance."""
+    geometry, controller = run.summary["geometry"], run.summary["controller"]
+    right, left = geometry["y_icr_right_m"], geometry["y_icr_left_m"]
+    assert controller["multiplier"] == pytest.approx((right - left) / 0.6, rel=1e-12)
+    by = np.array([1.0, -1.0, 0.0]) / 0.6
+    variance = by @ np.array(geometry["covariance_m2"]) @ by
+    assert controller["multiplier_std"] == pytest.approx(np.sqrt(variance), rel=1e-4)
+    assert geometry["y_icr_right_m_std"] == pytest.approx(np.sqrt(geometry["covariance_m2"][0][0]))
+
+
+def test_with_preset_paper_the_icrs_are_the_filters() -> None:
+    config = parse_config({"robot": {"track_width_m": 0.6}, "filter": {"preset": "paper"}})
+    summary = icrtool.fit(make_log(0, 180.0, rate=20.0), config).summary
+    for name, value in summary["icr"]["final"].items():
+        assert summary["geometry"][name] == pytest.approx(value)
+    assert summary["controller"]["multiplier"] == pytest.approx(summary["icr"]["separation_multiplier"])
+    assert (summary["controller"]["left_radius"], summary["controller"]["right_radius"]) == (1.0, 1.0)

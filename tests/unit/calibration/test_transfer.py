@@ -53,7 +53,7 @@ def test_the_wrong_calibration_costs_and_an_equal_one_does_not(transfer: Transfe
 
 def test_the_diagonal_is_the_held_out_score(transfer: Transfer) -> None:
     groups = group(OLD, range(3))
-    table = calibrate_recordings(groups).wheels
+    table = calibrate_recordings(groups).table
     together = table.score("recommended").together
     for h, horizon in enumerate(table.horizons_m):
         assert transfer.cell("old", "old", horizon).errors.p95_m == pytest.approx(together.p95[h], rel=1e-6)

@@ -20,10 +20,10 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.motion.trials import cut_trials
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.run import Run
-from support.recordings import trials_from_all
 
 HORIZONS = (5.0, 10.0, 20.0)
 
@@ -46,7 +46,7 @@ def report(drive: Run, own: Calibration, tmp_path_factory: pytest.TempPathFactor
     other = replace(own, logs=(own.logs[0]._replace(sha256="b"),), others=own.others)
     files = [own.write(folder / "own.json"), other.write(folder / "last.season.json")]
     calibrations = [icrtool.open_calibration(file) for file in files]
-    gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "extended.p95@10m <= 9"]
+    gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "controller.p95@10m <= 9"]
     return dropout_report(drive, horizons_m=HORIZONS, calibrations=calibrations, gates=gates, starts="all")
 
 
@@ -54,12 +54,13 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
     drive: Run, own: Calibration, report: DropoutReport
 ) -> None:
     recording = recording_of(drive)
-    expected = error_summary(predictor(own, recording)(trials_from_all(recording, HORIZONS)))
+    trials = cut_trials(recording, HORIZONS)
+    expected = error_summary(predictor(own, recording)(trials).position)
     for name in ("calibration:own", "calibration:last.season"):
         result = report.result(name)
         assert result is not None
-        np.testing.assert_array_equal(result.summary.trials, report.counts.trials)
-        np.testing.assert_allclose(result.summary.p95, expected.p95)
+        np.testing.assert_array_equal(result.summary.trials, (trials.ends >= 0).sum(axis=0))
+        np.testing.assert_allclose(result.summary.p95, expected.p95, rtol=1e-6)
         assert np.all(result.intervals.p95_low[:1] < result.summary.p95[:1])
 
 
@@ -90,7 +91,7 @@ def test_what_is_recommended_is_not_better_than_what_knew_the_drive(report: Drop
     assert in_sample is not None
     assert np.all(held_out.summary.expected != in_sample.summary.expected)
     assert held_out.summary.expected[0] < 2.0 * in_sample.summary.expected[0]
-    np.testing.assert_array_equal(held_out.summary.trials, report.counts.trials)
+    np.testing.assert_array_equal(held_out.summary.trials, in_sample.summary.trials)
 
 
 def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, report: DropoutReport) -> None:
@@ -104,21 +105,27 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
     )
     assert exported["left_radius_multiplier"] == numbers.left_radius
     # the controller's model is tested in the same trials as the whole one
-    assert exported["full_p95_m"] == report.comparison.score("extended").summary.p95[1]  # type: ignore[union-attr]
+    for key, row in (("full_p95_m", "recommended"), ("p95_m", "controller")):
+        assert (result := report.result(row)) is not None
+        assert exported[key] == pytest.approx(result.summary.p95[1], rel=1e-9)
     assert exported["p95_m"] != exported["full_p95_m"]
+    pooled = {(one.model, one.horizon_m): one.p95_m for one in own.pooled}
+    assert pooled["recommended", 10.0] == exported["full_p95_m"]
+    assert own.held_out_m("recommended", 10.0)[0] == exported["full_p95_m"]
+    assert f"within {exported['full_p95_m']:.2f} m" in repr(own)
 
 
 def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:
     assert [verdict.passed for verdict in report.verdicts] == [True, False, True]
-    rows = {"icr", "no_slip", "icr_final", "recommended", "calibration:own", "calibration:last.season"}
-    assert {one.model for one in report.budgets} <= rows
+    assert {one.model for one in report.budgets} <= {one.name for one in report.results}
     known = [one for one in report.budgets if np.isfinite(one.low_m)]
     assert all(one.low_m <= one.distance_m <= np.nan_to_num(one.high_m, nan=np.inf) for one in known)
 
 
 def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path) -> None:
     report.write(tmp_path / "dropout")
-    names = {"icr", "no_slip", "icr_final", "recommended", "calibration:own", "calibration:last.season"}
+    rows = {"icr", "no_slip", "icr_final", "controller", "recommended"}
+    names = rows | {f"{row}_heading" for row in rows} | {"calibration:own", "calibration:last.season"}
     assert set(pd.read_csv(tmp_path / "dropout" / "summary.csv")["model"]) == names
     assert set(pd.read_csv(tmp_path / "dropout" / "histogram.csv")["model"]) == names
     document = json.loads((tmp_path / "dropout" / "report.json").read_bytes())

@@ -8,9 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from icrtool.calibration.model_comparison import compare_models
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.motion.trials import Trials
 from icrtool.records.run import Run, drive_of
 
 EQUAL_M = 1e-9
@@ -29,21 +31,34 @@ def test_the_worst_trials_are_the_largest_that_do_not_overlap(run: Run) -> None:
         span = (int(start), int(ends[start]))
         if not np.isnan(errors[start]) and all(span[1] < begin or end < span[0] for begin, end in expected):
             expected.append(span)
-    worst = worst_trials(run, 3.0, count=6)
+    worst = worst_trials(run, horizon_m=3.0, count=6)
     assert [(drive.start, drive.end) for drive in worst] == expected[:6]
     assert len(worst) == 6
     assert [drive.errors_m["icr"] for drive in worst] == sorted((d.errors_m["icr"] for d in worst), reverse=True)
 
 
+def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[..., Run]) -> None:
+    run = make_run(duration_s=150.0, troubles=False)
+    compared = compare_models(run)
+    row = next(row for row in compared.rows if row.name == "recommended")
+    ends = trial_ends(drive_of(run), np.array([5.0]))[compared.trials.starts]
+    errors = row.errors_of(Trials(compared.trials.starts, ends)).position[:, 0]
+    worst = worst_trials(run, compared, 5.0, count=3)
+    assert {one.model for one in worst} == {"recommended"}
+    assert worst[0].start == compared.trials.starts[np.nanargmax(errors)]
+    assert worst[0].errors_m["recommended"] == pytest.approx(np.nanmax(errors), abs=1e-4)
+    assert set(worst[0].paths) == {"icr", "no_slip", "recommended", "controller"}
+
+
 def test_fewer_drives_fit_than_are_asked_for(run: Run) -> None:
-    worst = worst_trials(run, 10.0)
+    worst = worst_trials(run, horizon_m=10.0)
     assert 1 <= len(worst) < 10
     spans = sorted((drive.start, drive.end) for drive in worst)
     assert all(earlier[1] < later[0] for earlier, later in pairwise(spans))
 
 
 def test_a_drive_tells_time_place_turn_speed_and_paths(run: Run) -> None:
-    drive, table = worst_trials(run, 3.0)[0], run.table
+    drive, table = worst_trials(run, horizon_m=3.0)[0], run.table
     k, j = drive.start, drive.end
     assert (drive.stamp_ns, drive.t_s) == (table.stamp_ns[k], table.t_s[k])
     assert (drive.north_m, drive.east_m) == (table.north_m[k], table.east_m[k])

@@ -58,7 +58,7 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     assert "usable" in ice.reason
     assert grass.table in calibrations_text(found)
     assert len(calibrations_text(found, tables=False).splitlines()) == len(found)
-    assert f"{MODELS[grass.recommended].label} (model" in calibrations_text(found)
+    assert f"{MODELS[grass.recommended].label}, multiplier {grass.multiplier:.4f}" in calibrations_text(found)
     write_fleet(logs, place, found)
     monkeypatch.setattr("icrtool.output.stored_run.open_run", None)
     assert list(pooled_calibrations(logs, place)) == found, "nothing changed: nothing is fitted"

@@ -13,7 +13,7 @@ from icrtool.calibration.controller_numbers import factor_to_old, unfit_reasons
 from icrtool.calibration.from_runs import calibrate
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError, DataError
-from icrtool.motion.models import MODELS, FittedModel, controller_model, wheel_motion
+from icrtool.motion.models import FAMILY, FittedModel, Lever, controller_model, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
 
 CONTROLLER_KEYS = {
@@ -109,7 +109,7 @@ def test_without_measured_errors_only_the_twist_model_is_given(calibration: Cali
 def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration) -> None:
     """Evaluated as a robot's node would, for every term of the family: v_y and turn rate change sign, v_x does not."""
     rng, b = np.random.default_rng(1), calibration.width_m
-    for model in MODELS.values():
+    for model in FAMILY.values():
         k = len(model.terms)
         fitted = FittedModel(model, rng.normal(size=k), np.eye(k))
         one = replace(calibration, fitted=fitted)
@@ -133,15 +133,16 @@ def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -
     left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
-    assert controller_model(calibration.geometry()[0]).twist(motion)[:, 0] == pytest.approx(expected)
+    tested = controller_model(calibration.others["five"], Lever(ahead=True, aside=True), b)
+    assert tested.twist(motion)[:, 0] == pytest.approx(expected)
 
 
 def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:
     assert unfit_reasons(calibration) == ()
-    far = tuple(one._replace(p95_m=14.8) if one.model == "recommended" else one for one in calibration.held_out)
-    worse = tuple(one._replace(expected_m=99.0) if one.model == "recommended" else one for one in calibration.held_out)
-    for held_out, word in ((far, "14.8 m"), (worse, "no slip")):
-        spoilt = replace(calibration, held_out=held_out)
+    far = tuple(one._replace(p95_m=14.8) if one.model == "recommended" else one for one in calibration.pooled)
+    worse = tuple(one._replace(expected_m=99.0) if one.model == "recommended" else one for one in calibration.pooled)
+    for pooled, word in ((far, "14.8 m"), (worse, "no slip")):
+        spoilt = replace(calibration, pooled=pooled)
         (reason,) = unfit_reasons(spoilt)
         assert word in reason
         assert f"WARNING: {reason.split(':')[0]}" in " ".join(format_export(spoilt, "clearpath").split("\n# "))

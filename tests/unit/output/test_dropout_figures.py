@@ -38,7 +38,7 @@ def outages(run: Run) -> tuple[Outage, ...]:
 
 
 def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dict[str, Callable[[], Figure]]:
-    whole = replace(report, outages=outages, examples=example_trials(run, 5.0), worst=worst_trials(run, 2.0))
+    whole = replace(report, outages=outages, examples=example_trials(run, 5.0), worst=worst_trials(run, horizon_m=2.0))
     return {
         "summary": lambda: dropout_summary(whole),
         "histogram": lambda: dropout_histogram(whole, 5.0),

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from icrtool.calibration.record import ControllerNumbers
-from icrtool.estimation.summary import separation_multiplier
 from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import controller_text, distance_text, duration_text, error_text, signed
+from icrtool.output.text_format import distance_text, duration_text, error_text, signed
 from icrtool.records.run import Run
 
 
@@ -19,7 +17,7 @@ def line_of(text: str, begin: str) -> str:
 
 def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
     text = format_run(run)
-    icr, drive = run.summary["icr"], run.summary["drive"]
+    icr, drive, geometry = run.summary["icr"], run.summary["drive"], run.summary["geometry"]
     assert text.splitlines()[0] == "barn  (segway-rmp400)"
     assert line_of(text, "wheels").split() == [
         "wheels",
@@ -35,15 +33,13 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
     assert f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s" in line_of(text, "drive")
     for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x ", "x_icr_m")):
         line = line_of(text, label)
-        assert f"{icr['final'][column]:+.3f} ± {icr['final_std'][column]:.3f}" in line
+        assert f"{geometry[column]:+.3f} ± {geometry[f'{column}_std']:.3f}" in line
         assert f"{icr['mean'][column]:+.3f} ± {icr['std'][column]:.3f}" in line
         rise = icr["convergence_s"][column]
-        assert (f"{rise:.1f} s" if rise is not None else "hardly moved") in line
-    multiplier = line_of(text, "multiplier")
-    assert (
-        f"{separation_multiplier(run.table, 0.6):.3f} ± {icr['separation_multiplier_std']:.3f} = (y right" in multiplier
-    )
-    assert multiplier.endswith("with b = 0.6 m")
+        assert (f"{rise:.1f} s" if rise is not None else "none") in line
+    multiplier = (geometry["y_icr_right_m"] - geometry["y_icr_left_m"]) / 0.6
+    assert f"wheel_separation_multiplier {multiplier:.3f} ± " in line_of(text, "controller")
+    assert f"right {icr['final']['y_icr_right_m']:+.3f}" in line_of(text, "EKF")
     assert line_of(text, "fixes").endswith("7 rejected (gate 4, no fix 3)")
     assert "1 outage, " in text
     assert "filter to GNSS fixes: mean " in line_of(text, "position")
@@ -76,22 +72,15 @@ def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: Run) -> None:
 
 def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(track_width_m=None, datum=False, troubles=False, duration_s=20.0))
-    assert "robot.track_width_m is not known" in line_of(text, "multiplier")
+    assert "robot.track_width_m is not known" in line_of(text, "controller")
     assert "filter to position reference" in text
     assert "outage" not in text
     assert " 0 rejected" in text
 
 
-def test_constants_that_no_model_estimated_are_no_numbers() -> None:
-    numbers = ControllerNumbers(1.0, 0.0, 1.0, 0.0, 1.0, 0.0)
-    assert not any(one.isdigit() for one in controller_text(numbers._asdict()))
-    assert "1.482 ± 0.004" in controller_text(numbers._replace(multiplier=1.482, multiplier_std=0.004)._asdict())
-
-
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(speed_mps=0.01, duration_s=20.0))
     assert line_of(text, "y right").split() == ["y", "right", "not", "shown"]
-    assert line_of(text, "multiplier").split()[1:3] == ["not", "shown:"]
     assert text.startswith("NOT USABLE: y right, y left, x not shown")
     assert "too little straight driving" in text
 

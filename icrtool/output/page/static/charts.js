@@ -278,8 +278,7 @@ const icrtoolCharts = (() => {
   const LOOKS = {
     recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
     no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
-    multiplier: { color: "other", dash: "dashdot", width: 2 }, window: { color: "other", dash: "dashed", width: 2 },
-    extended: { color: "recommended", width: 2.6 },
+    controller: { color: "other", dash: "dashed", width: 2 },
   };
   const OTHERS = [["other", "solid"], ["icr", "dotted"], ["no-slip", "solid"], ["final", "dashdot"], ["other", "dashed"],
     ["icr", "dashdot"], ["no-slip", "dotted"], ["recommended", "dotted"]].map(([color, dash]) => ({ color, dash, width: 2 }));

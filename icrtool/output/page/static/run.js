@@ -65,7 +65,7 @@ const icrtoolPage = (() => {
     const notes = [];
     if (result.why) notes.push(`The paths end before ${LENGTHS_M[LENGTHS_M.length - 1]} m: ${result.why}.`);
     else if (result.models.some((model) => model.errors.includes(null))) notes.push("–: no GNSS at the end of that path.");
-    if (result.models.some((model) => model.name === "recommended")) notes.push("Here the recommended model is fitted to the whole drive; in the tables it is tested on distance it was not fitted to.");
+    if (result.models.some((model) => model.name === "recommended")) notes.push("Here the whole model is fitted to the whole drive; in the tables it is tested on distance it was not fitted to.");
     if (notes.length) text("p", notes.join(" "), box);
     return result;
   }

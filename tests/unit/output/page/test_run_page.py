@@ -79,7 +79,7 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
     assert report.calibration is not None
     assert f"{report.calibration.controller_numbers().multiplier:.3f}" in text
     assert "No: an acceptance limit" in text
-    assert f"{report.worst[0].errors_m['icr']:.3f} m" in text
+    assert f"{report.worst[0].errors_m['recommended']:.3f} m" in text
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
@@ -187,6 +187,9 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
     table = replace(run.table, north_m=run.table.north_m + 4_440_123.0, east_m=run.table.east_m + 612_345.0)
     there = replace(run, summary=summary, table=table)
     document = report_document(report)
+    for one in document["worst"]:
+        one["north_m"] += 4_440_123.0
+        one["east_m"] += 612_345.0
     shown, hidden = (run_page(there, document, {}, coordinates=one) for one in (True, False))
     for trace in ("40.12345", "77.65432", "-87.65", "4440123", "612345"):
         assert trace in shown, trace
@@ -197,7 +200,7 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
 
 def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
     metric = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "datum": None}})
-    pictures = pictures_of([("worst", b"place"), ("ladder", b"models")])
+    pictures = pictures_of([("worst", b"place"), ("summary", b"models")])
     page = run_page(metric, report_document(report), pictures, coordinates=False)
     assert base64.b64encode(b"models").decode() in page
     assert base64.b64encode(b"place").decode() not in page
