@@ -121,9 +121,9 @@ class FilterConfig:
     process_heading_degps: Noise | None = None
     process_icr_mps: Noise = 0.01
     terrain_icr_std_m: Std | None = None
-    gnss_std_m: Std = 0.01
+    gnss_std_m: Literal["auto"] | Std = "auto"
     gnss_std_floor_m: Std = 0.01
-    heading_std_deg: Std = 1.0
+    heading_std_deg: Literal["auto"] | Std = "auto"
     heading_std_floor_deg: Std = 0.5
     heading_correlation_s: Noise = 0.5
     gate_probability: Probability = 0.9999

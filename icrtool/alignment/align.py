@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.findings import alignment_findings, run_sections, start_icrs
 from icrtool.alignment.position.gnss_quality import grade_fixes
 from icrtool.alignment.position.gnss_steps import without_frozen
-from icrtool.alignment.position.sensor_noise import heading_variance, position_variance
+from icrtool.alignment.position.sensor_noise import heading_variance, position_variance, reference_noise
 from icrtool.alignment.slip.slip_events import find_slip_events
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheels.wheel_alignment import bridged
@@ -59,7 +60,8 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
     heading = found.heading
     quality = grade_fixes(found.log, config, found.fix_steps)
-    sensors = sensors_as_sent(quality.log, config)
+    noise = reference_noise(found.log, config.filter, found.fix_steps, found.heading_steps)
+    sensors = sensors_as_sent(quality.log, config, noise)
     findings = alignment_findings(found, sensors.antenna_m)
     return Measurements(
         sensors=replace(
@@ -75,10 +77,11 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
                 heading_rad=sensors.headings.heading_rad - heading.remaining_offset_rad,
                 var_rad2=quality.log.heading.var_rad2
                 if heading.is_estimated
-                else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad),
+                else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad, noise[1]),
             ),
             heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
             heading_is_estimated=heading.is_estimated,
+            heading_is_measured=math.isfinite(noise[1]),
             attitude=None if found.derived is None else found.derived.attitude,
             losses_ns=quality.losses_ns,
             icr_start=start_icrs(found.geometry, sensors.antenna_m, config),
@@ -108,8 +111,12 @@ def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurem
     return replace(found, sensors=replace(found.sensors, events=events))
 
 
-def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
+def sensors_as_sent(log: RobotLog, config: Config, measured: tuple[float, float] = (math.nan, math.nan)) -> SensorData:
     """Return the streams of a log without any correction, each sample with its noise: for logs known to be right.
+
+    Parameters
+    ----------
+    measured : noise of positions [m] and headings [rad], of `reference_noise`; NaN: as stated or configured
 
     Raises
     ------
@@ -120,8 +127,8 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
     return SensorData(
         name=log.name,
         wheels=log.wheels,
-        fixes=_fixes(log.gnss, config),
-        headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
+        fixes=_fixes(log.gnss, config, measured[0]),
+        headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter, measured_rad=measured[1])),
         gyro=log.gyro,
         heading_from_position=log.heading_is_of_position,
         heading_correlation_s=config.filter.heading_correlation_s,
@@ -130,8 +137,8 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
     )
 
 
-def _fixes(gnss: PositionFixes, config: Config) -> Fixes:
-    variance = position_variance(gnss, config.filter)
+def _fixes(gnss: PositionFixes, config: Config, measured_m: float) -> Fixes:
+    variance = position_variance(gnss, config.filter, measured_m)
     none = np.zeros(len(gnss.stamp_ns), np.bool_)
     return Fixes(
         stamp_ns=gnss.stamp_ns,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from icrtool.alignment.conventions import (
     AS_NAMED,
     Convention,
@@ -18,7 +20,7 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, alignment_window_m, cut_windows, drive_arrays
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
 from icrtool.alignment.heading.heading_alignment import (
     FEWEST_WINDOWS,
@@ -93,6 +95,16 @@ class AlignedStreams(NamedTuple):
         expected = self.drive.laid_until_fixes() if self.fit is None else self.fit.expected_motion()[0]
         return measure_steps(self.drive.fix_t, self.drive.fix, expected)
 
+    @property
+    def heading_steps(self) -> FixSteps:
+        """Steps of the heading between the fixes [rad] beyond the turn of the wheels; none without an estimate."""
+        drive = self.drive
+        if self.fit is None or not len(drive.heading_t):
+            return measure_steps(np.empty(0), np.empty(0, np.complex128), np.empty(0, np.complex128))
+        turned = np.interp(drive.fix_t, drive.heading_t, drive.heading)
+        by_wheels = self.fit.expected_motion()[1]
+        return measure_steps(drive.fix_t, turned.astype(np.complex128), by_wheels.astype(np.complex128))
+
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     """Estimate what relates wheels, heading and positions, and correct what is significant.
@@ -129,7 +141,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if derived is not None:
             log = derived.apply(log)
             drive = drive_arrays(log, derived.smoothed)
-            fit = estimate_alignment(drive, cut_windows(drive), width)
+            fit = estimate_alignment(drive, cut_windows(drive, alignment_window_m(drive, width)), width)
             heading = align_estimated_heading(log, derived, heading)
     configured = configured_scales(config)
     if convention.swapped and corrects:
@@ -159,7 +171,7 @@ def _name_streams(
     check_streams(log)
     faults = dead_or_copied(log)
     drive = drive_arrays(log, None if derived is None else derived.smoothed)
-    windows = cut_windows(drive)
+    windows = cut_windows(drive, alignment_window_m(drive, width_m))
     free = config.frames.heading == "auto" and derived is None
     decision = decide_conventions(
         drive, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, drive), mirror_allowed=free
@@ -171,7 +183,7 @@ def _name_streams(
             derived = _derived_heading(named, width_m)
             named = derived.apply(named)
         drive = drive_arrays(named, None if derived is None else derived.smoothed)
-        windows = cut_windows(drive)
+        windows = cut_windows(drive, alignment_window_m(drive, width_m))
     notes = [
         *faults,
         *convention_notes(Decision(senses, None), corrects=True),

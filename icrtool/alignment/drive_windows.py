@@ -14,6 +14,9 @@ from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 
 WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
+WINDOW_IN_WIDTHS = 4.0
+"""Windows of small robots are so many track widths long: slip is a share of the distance, and hides them over 2 m."""
+
 WINDOW_IN_POSITION_STD = 12.0
 """A window is so long that noise of the fixes turns its displacement by no more than 7 deg."""
 
@@ -201,10 +204,15 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
-def window_length(drive: DriveArrays, least_m: float = WINDOW_M) -> float:
+def window_length(drive: DriveArrays, least_m: float) -> float:
     """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
     noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
     return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
+
+
+def alignment_window_m(drive: DriveArrays, width_m: float) -> float:
+    """Return how long the windows of the alignment are [m], for a robot of track width b [m]."""
+    return window_length(drive, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
 def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindows:
@@ -214,9 +222,9 @@ def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindo
 
     Parameters
     ----------
-    length_m : of a window; default `window_length`
+    length_m : of a window; default that of the alignment of a robot of usual size
     """
-    length = window_length(drive) if length_m is None else length_m
+    length = window_length(drive, WINDOW_M) if length_m is None else length_m
     at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
     cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
     begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)

@@ -154,7 +154,7 @@ def set_up_filter(
         slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
     )
     icrs, icr_std = _initial_icrs(config, sensors.icr_start)
-    if sensors.heading_is_estimated:
+    if sensors.headings_are_precise:
         data = data._replace(turn_variance=_response_variance(data, float(icrs[0] - icrs[1])) + TURN_WANDER_RAD**2)
     t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
@@ -300,11 +300,11 @@ def _heading_correlation_s(sensors: SensorData, noise: ProcessNoise) -> float:
 
     Notes
     -----
-    Estimated headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
+    Precise headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
     with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is then
     sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
     """
-    if not sensors.heading_is_estimated:
+    if not sensors.headings_are_precise:
         return sensors.heading_correlation_s
     density, usual = (
         math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)

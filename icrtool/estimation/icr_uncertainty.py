@@ -17,10 +17,11 @@ from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs
 from icrtool.records.memory import give_back_freed
 from icrtool.records.tables import States
 
-WINDOW_M = 2.0
-"""Distance of the wheels, spins included, over which displacement and turn are compared."""
+WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
+"""Distance of the wheels, spins included, over which displacement and turn are compared: this, or so many times
+y right - y left where that is less. Slip is a share of the distance: over 2 m it hides the ICRs of a robot of 0.2 m."""
 
-STRETCH_M = 20.0
+STRETCH_IN_WINDOWS = 10.0
 """Windows of one stretch err alike: slip, ground and heading errors last for some metres."""
 
 WIDTH_M = 1.0
@@ -35,6 +36,10 @@ Y_OF_STRETCH, X_OF_STRETCH = 0.04, 0.1
 """How far the ICRs of one stretch are expected to lie from those of the drive, in parts of y right - y left, before a
 drive: ground and slip. x_icr moves with the speed of a turn as well: the prior of side slip, 0.1 s over a turn gain of
 0.6 (`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
+
+SLIPS, LEAST_SLIP = 0.4, 0.25
+"""A robot whose ICRs lie so much further apart than its tracks, in parts of b, slips as others do. One whose wheels
+roll has less slip to vary; at least this part of it."""
 
 
 class StateWindows(NamedTuple):
@@ -76,7 +81,8 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     driven /= 2.0
     np.cumsum(driven[:-1], out=distance[1:])
     del driven
-    rows = rows_at_steps(distance, WINDOW_M)
+    window_m = min(WINDOW_M, WINDOW_IN_SEPARATIONS * float(icrs_m[0] - icrs_m[1]))
+    rows = rows_at_steps(distance, window_m)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
@@ -94,7 +100,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
         length_m=np.diff(distance),
         turned_rad=turned,
         end_s=table.t_s[rows[1:]],
-        stretch=(distance[:-1] // STRETCH_M).astype(np.int64),
+        stretch=(distance[:-1] // (STRETCH_IN_WINDOWS * window_m)).astype(np.int64),
         distance_m=whole_m,
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
         heading_std_rad=float(np.median(table.std_heading_rad)),
@@ -118,7 +124,12 @@ def prior_std(width_m: float) -> Floats:
 
 
 def final_covariance(
-    windows: StateWindows, filter_covariance: Floats, *, width_m: float, process_icr_mps: float
+    windows: StateWindows,
+    filter_covariance: Floats,
+    *,
+    width_m: float,
+    process_icr_mps: float,
+    track_width_m: float | None = None,
 ) -> Floats:
     """Return the covariance (3, 3) of the final ICRs [m^2]: from how much the stretches of their drive differ.
 
@@ -128,12 +139,13 @@ def final_covariance(
     filter_covariance : (3, 3) of the ICRs at the end, and
     process_icr_mps : process noise of the filter: both give how fast it forgets
     width_m : y right - y left, the prior's standard deviation
+    track_width_m : b; None: not known
 
     Notes
     -----
     The filter's own variance is that of constant ICRs in noise as large as its process noise: four times too wide on
     even ground, and it holds no slip that varies along the drive. Here it is the sandwich covariance (Liang and Zeger
-    1986) of a fit over the windows, clustered by stretches of `STRETCH_M`, heading offset and wheel scales
+    1986) of a fit over the windows, clustered by stretches of `STRETCH_IN_WINDOWS`, heading offset and wheel scales
     marginalised, with one stretch's worth of what stretches are expected to differ by (`Y_OF_STRETCH`). Its residuals
     are those of the final ICRs, so that a fit that would end elsewhere counts too; their scale is no less than the
     noise of the states, which follow poor fixes only slowly. A window weighs exp(-age / T): T = P / q is the memory of
@@ -156,7 +168,8 @@ def final_covariance(
     scale = np.hypot(scale_by_kind(windows.residuals, kind), windows.noise[kind]) / np.sqrt(weight)
     prior = np.diag(prior_std(width_m) ** -2.0)
     at_final_icrs = Linearised(residuals=windows.residuals, jacobian=windows.jacobian, scale=scale, prior=prior)
-    of_stretch = width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
+    slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
+    of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
     return sandwich_covariance(at_final_icrs, np.tile(windows.stretch, 3), of_stretch)[:3, :3]
 
 

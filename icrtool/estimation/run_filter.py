@@ -34,7 +34,7 @@ OUTAGE_IN_INTERVALS = 5.0
 
 
 LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
-"""An estimated heading is carried on by the wheels for less than this, and where it is so many times as certain as the
+"""A precise heading is carried on by the wheels for less than this, and where it is so many times as certain as the
 filter's own: among noisy fixes it is not."""
 
 LEAST_WHEEL_TRAVEL_M = 0.1
@@ -178,11 +178,11 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 
 
 def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
-    """Carry the headings (h,), where they are estimated and `used` (h,), on by the wheels' turn; changes the states.
+    """Carry the headings (h,), where they are precise and `used` (h,), on by the wheels' turn; changes the states.
 
     The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
     """
-    if not (sensors.heading_is_estimated and used.any()):
+    if not (sensors.headings_are_precise and used.any()):
         return
     headings = sensors.headings
     stamps, psi = headings.stamp_ns[used], table.heading_rad

@@ -20,6 +20,10 @@ from icrtool.records.tables import States
 SMALLEST_MULTIPLIER = 0.9
 """ICRs nearer to each other than this share of the track width are no robot's that slips."""
 
+ROLLS, ROLLS_STD = 0.02, 0.05
+"""A robot whose ICRs are as far apart as its tracks, within this or two standard deviations of at most the second, does
+not slip in turns: track widths are measured no better."""
+
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 """ICRs whose middle is off by more than this are not treated as even ones."""
 
@@ -99,16 +103,18 @@ def run_warnings(
     table: States,
     gnss: MeasurementOutcome,
     heading: MeasurementOutcome,
-    multiplier: float | None,
+    multiplier: tuple[float, float] | None,
     excitation: Excitation,
 ) -> list[str]:
-    """Return what a user should know before trusting the numbers; `multiplier` is (y_r - y_l) / b where b is known."""
+    """Return what a user should know before trusting the numbers.
+
+    Parameters
+    ----------
+    multiplier : (y_r - y_l) / b and its standard deviation, None where b is not known
+    """
     found = []
-    if multiplier is not None and multiplier < SMALLEST_MULTIPLIER and excitation.shows_sides:
-        found.append(
-            f"the ICRs are {multiplier:.2f} of the track width apart; slip makes it "
-            "more than 1: check robot.track_width_m, wheel radius and sides"
-        )
+    if multiplier is not None and excitation.shows_sides:
+        found += _multiplier_warnings(*multiplier)
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
@@ -120,6 +126,16 @@ def run_warnings(
         if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
             found.append(f"{100 * share:.0f} % of the {word} were rejected: check {causes}")
     return [f"{name}: {warning}" for warning in found]
+
+
+def _multiplier_warnings(multiplier: float, std: float) -> list[str]:
+    if abs(multiplier - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
+        value = f"multiplier {multiplier:.3f} ± {std:.3f}"
+        return [f"this robot turns as a differential drive ({value}): ICRs improve nothing"]
+    if multiplier < SMALLEST_MULTIPLIER:
+        cause = "slip makes it more than 1: check robot.track_width_m, wheel radius and sides"
+        return [f"the ICRs are {multiplier:.2f} of the track width apart; {cause}"]
+    return []
 
 
 def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:

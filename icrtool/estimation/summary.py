@@ -117,11 +117,12 @@ def _warnings(
     changes_s: Sequence[float], covariance: Floats,
 ) -> list[str]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
-    name, table = filtered.sensors.name, filtered.table
+    name, table, width = filtered.sensors.name, filtered.table, config.robot.track_width_m
+    apart = None if multiplier is None or width is None else (multiplier, multiplier_std(covariance, width))
     end_s = float(table.t_s[-1])
     return [
         *measurements.warnings,
-        *run_warnings(name, table, filtered.gnss, filtered.heading, multiplier, excitation),
+        *run_warnings(name, table, filtered.gnss, filtered.heading, apart, excitation),
         *(
             []
             if measurements.antenna_is_known or not excitation.shows_sides
@@ -148,6 +149,7 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
         "heading_correlation_s": sensors.heading_correlation_s,
         "heading_from_position": sensors.heading_from_position,
         "heading_is_estimated": sensors.heading_is_estimated,
+        "heading_is_measured": sensors.heading_is_measured,
         "antenna_m": sensors.antenna_m,
         "antenna_is_known": measurements.antenna_is_known,
         "states": len(filtered.table),
@@ -174,7 +176,11 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     if config.filter.preset == "paper":
         return own, excitation
     covariance = final_covariance(
-        windows, own, width_m=float(p[0] - p[1]), process_icr_mps=config.filter.process_icr_mps
+        windows,
+        own,
+        width_m=float(p[0] - p[1]),
+        process_icr_mps=config.filter.process_icr_mps,
+        track_width_m=width,
     )
     excitation = withhold_unlearned(
         excitation,

@@ -78,6 +78,7 @@ class SensorData:
     heading_from_position : heading and position are fields of the same messages: they have the same delay
     heading_correlation_s : the errors of headings closer together than this are correlated
     heading_is_estimated : `headings` are estimated, with the positions; they do not exist without them
+    heading_is_measured : the variance of `headings` is that of a reference's poses, as measured
     attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
@@ -97,7 +98,13 @@ class SensorData:
     events: tuple[SlipEvent, ...] = ()
     icr_start: IcrStart | None = None
     heading_is_estimated: bool = False
+    heading_is_measured: bool = False
     attitude: HeadingSamples | None = None
+
+    @property
+    def headings_are_precise(self) -> bool:
+        """Whether the variance of a heading is its own, and not that of an error which lasts."""
+        return self.heading_is_estimated or self.heading_is_measured
 
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""

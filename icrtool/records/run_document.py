@@ -209,6 +209,7 @@ class FilterDocument(TypedDict):
     heading_correlation_s: float
     heading_from_position: bool
     heading_is_estimated: bool
+    heading_is_measured: NotRequired[bool]
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
     icr_start: IcrStartDocument | None

@@ -13,14 +13,12 @@ import numpy as np
 
 from icrtool.alignment.position.gnss_steps import FixSteps
 from icrtool.alignment.position.misreported_fixes import find_misreported
+from icrtool.alignment.position.sensor_noise import LARGEST_SANE_GNSS_STD_M, unstated_position_std_m
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.measurements import FixStatistics
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, PositionFixes
 from icrtool.records.tables import RobotLog
-
-LARGEST_SANE_GNSS_STD_M = 100.0
-"""A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""
 
 REFERENCE = 0
 CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED_FIX: "fixed"}
@@ -88,7 +86,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
     variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
     raised: list[str] = []
     if changes:
-        variance, raised = _at_least_white(variance, kinds, white, config.filter.gnss_std_m)
+        variance, raised = _at_least_white(variance, kinds, white, unstated_position_std_m(config.filter))
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     if raised or down.any():

@@ -107,6 +107,7 @@ def read_measurements(
             events=tuple(SlipEvent(*(event[name] for name in SlipEvent._fields)) for event in events),
             icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
             heading_is_estimated=facts["heading_is_estimated"],
+            heading_is_measured=facts.get("heading_is_measured", False),
             attitude=_attitude(columns) if "attitude_stamp_ns" in columns else None,
         )
         outcomes = [
